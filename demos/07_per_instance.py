@@ -19,7 +19,6 @@ from mdnum.ball import (
     SemiImplicitEuler,
     World,
 )
-from mdnum.gradients.ball import scaled
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
@@ -73,13 +72,13 @@ def run() -> Demo:
     for name, rule in rules().items():
         alone, joined = (batch(rule, (*BATCH, depth)) for depth in (AWAY, STRANGER))
         before, after = counts(alone.run()), counts(joined.run())
-        made = [scaled(one, ["k"]) for one in (alone, joined)]
+        made = [one.value_and_grad(["k"]) for one in (alone, joined)]
         found[name] = {
             "before": before.tolist(),
             "after": after.tolist(),
             "coupling": float(np.mean(before != after)),
-            "loss": [one.value for one in made],
-            "grad_k": [one.slopes["k"] for one in made],
+            "loss": [value for value, _ in made],
+            "grad_k": [slopes["k"] for _, slopes in made],
         }
     total, own = found["global sum"], found["per instance"]
     drift = _growth()

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
-from mdnum.gradients.ball import scaled
 from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
@@ -177,10 +176,12 @@ def run() -> Demo:
     """Gain derivatives against the tolerance; then memory and accuracy of the two ways."""
     runs = [relaxation(tol).run(keep=False) for tol in TOLERANCES]
     counts = [int(run.iterations[0]) for run in runs]
-    ran = [scaled(relaxation(tol), ["k"]) for tol in TOLERANCES]
-    unrolled = np.array([one.slopes["k"] for one in ran])
-    fixed = [scaled(relaxation(tol, FixedPointRule()), ["k"]).slopes["k"] for tol in TOLERANCES]
-    near = [scaled(relaxation(tol, FixedPointRule(at_iterate=True)), ["k"]).slopes["k"] for tol in TOLERANCES]
+    ran = [relaxation(tol).value_and_grad(["k"]) for tol in TOLERANCES]
+    unrolled = np.array([slopes["k"] for _, slopes in ran])
+    fixed, near = (
+        [relaxation(tol, rule).value_and_grad(["k"])[1]["k"] for tol in TOLERANCES]
+        for rule in (FixedPointRule(), FixedPointRule(at_iterate=True))
+    )
     said = Implicit()(relaxation(TOLERANCES[0]), ["k"])
     exact = [-DEPTH * n * (1 - ALPHA * K) ** (n - 1) * ALPHA for n in counts]
     order = np.polyfit(np.log(TOLERANCES), np.log(-unrolled), 1)[0]
@@ -232,7 +233,7 @@ def run() -> Demo:
                 "taking the stopped iterate for the fixed point lets the tolerance back in as -p/k",
                 near,
                 "-p/k to 1e-10 relative",
-                bool(np.allclose(near, [-one.value / K for one in ran], rtol=1e-10, atol=0)),
+                bool(np.allclose(near, [-value / K for value, _ in ran], rtol=1e-10, atol=0)),
             ),
             Claim(
                 "ten times the iterations: memory of the unrolled derivative",
@@ -263,7 +264,7 @@ def run() -> Demo:
                     zip(
                         TOLERANCES,
                         counts,
-                        (one.value for one in ran),
+                        (value for value, _ in ran),
                         unrolled.tolist(),
                         fixed,
                         near,

@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import mdnum.numerics  # noqa: F401 (turns on float64)
-from mdnum.plain import plain
 from mdnum.safe_path import environment, python
 
 Status = Literal["ok", "info", "unsafe"]
@@ -57,7 +56,6 @@ _R2_TOLERANCE = 1e-14
 _CRYSTAL_TOLERANCE = 1e-12
 # the promise of `mdnum check energy`
 _ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10
-_FCC = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]])
 
 
 @dataclass(frozen=True)
@@ -95,10 +93,6 @@ class Diagnosis:
         """Whether no row is unsafe."""
         return all(row.status != "unsafe" for row in self.rows)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The diagnosis for JSON."""
-        return {"ok": self.ok, **plain(self)}
-
 
 def diagnose(budget: float = 18.0) -> Diagnosis:
     """Test this installation.
@@ -111,29 +105,13 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
         A row per test. `Diagnosis.ok` is false when one is unsafe.
     """
     start = time.perf_counter()
-    other, imported = Child.start(DIGEST_CODE), Child.start(IMPORTS_CODE)
+    other, imported = Child(DIGEST_CODE), Child(IMPORTS_CODE)
 
     def left() -> float:
         return budget - (time.perf_counter() - start)
 
-    rows = [
-        jax_version(),
-        flags(),
-        devices(),
-        float64(),
-        crystal(),
-        elementwise(),
-        functions(),
-        reassociation(),
-        contraction(),
-        constant_division(),
-        subnormals(),
-        numba_works(),
-        own_forces(),
-        second_process(other, digest(), left()),
-        imports(imported, left()),
-        packages(),
-    ]
+    rows = [test() for test in TESTS]
+    rows += [second_process(other, digest(), left()), imports(imported, left()), packages()]
     return Diagnosis(tuple(rows), time.perf_counter() - start)
 
 
@@ -396,8 +374,7 @@ def subnormals() -> DoctorRow:
 
 def _fcc(cells: int) -> np.ndarray:
     """Atoms of an fcc crystal in units of its lattice constant, (4 cells³, 3)."""
-    grid = np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1).reshape(-1, 1, 3)
-    return (grid + _FCC).reshape(-1, 3)
+    return np.array([place for place in np.ndindex((2 * cells,) * 3) if sum(place) % 2 == 0]) / 2
 
 
 def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -514,44 +491,31 @@ def digest(steps: int = 50) -> str:
 
 def own_forces() -> DoctorRow:
     """mdnum's energy and forces of argon/tilted-500, neighbor search included, against plain numpy."""
-    name = "mdnum's forces"
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
         remedy = "python3 -m pip install --force-reinstall mdnum, in a new environment if that does not help"
-        return DoctorRow(name, "unsafe", _short(error), remedy)
+        return DoctorRow("mdnum's forces", "unsafe", _short(error), remedy)
+    right = energy <= _ENERGY_TOLERANCE and force <= _FORCE_TOLERANCE
+    seen = f"argon/tilted-500 against plain numpy: energy {energy:.1e} relative, forces {force:.1e}"
     return _decided(
-        name,
-        energy <= _ENERGY_TOLERANCE and force <= _FORCE_TOLERANCE,
-        f"argon/tilted-500 against plain numpy: energy {energy:.1e} relative, forces {force:.1e}",
-        "See the rows above; else install another jax and another numba",
+        "mdnum's forces", right, seen, "See the rows above; else install another jax and another numba"
     )
 
 
-def worst_errors(name: str = "argon/tilted-500") -> tuple[float, float]:
-    """Relative energy difference, and the largest force difference over the largest force.
-
-    Args:
-        name: a system of Lennard-Jones atoms with one hard cutoff in a periodic box.
-    """
+def worst_errors() -> tuple[float, float]:
+    """Relative energy difference, and the largest force difference over the largest force."""
     from mdnum.systems import build, load
 
-    system = load(name)
+    system = load("argon/tilted-500")
+    ours, cell = build(system).evaluate(), system.atoms.cell.array
     potential, cutoff = system.spec.potential, system.spec.cutoff
-    if cutoff is None or cutoff.kind != "hard" or potential.kind != "lennard-jones":
-        raise ValueError(f"{name} is not a hard-cutoff Lennard-Jones system")
-    evaluation = build(system).evaluate()
+    assert cutoff is not None and potential.sigma and potential.epsilon and cutoff.radius
     energy, forces = _lennard_jones(
-        system.atoms.get_positions(),
-        system.atoms.cell.array,
-        float(potential.sigma or math.nan),
-        float(potential.epsilon or math.nan),
-        float(cutoff.radius or math.nan),
+        system.atoms.get_positions(), cell, potential.sigma, potential.epsilon, cutoff.radius
     )
-    return (
-        abs(evaluation.energy - energy) / abs(energy),
-        float(np.max(np.abs(evaluation.forces - forces)) / np.max(np.abs(forces))),
-    )
+    force = float(np.max(np.abs(ours.forces - forces)) / np.max(np.abs(forces)))
+    return abs(ours.energy - energy) / abs(energy), force
 
 
 def _lennard_jones(
@@ -577,18 +541,14 @@ def _lennard_jones(
 # --- other processes ---
 
 
-@dataclass(frozen=True)
 class Child:
-    """A Python process that prints one line, started early so that it costs no waiting."""
+    """A Python process that runs code and prints one line, started early so that it costs no waiting."""
 
-    process: subprocess.Popen[str]
-
-    @classmethod
-    def start(cls, code: str) -> Child:
-        """Start Python on code."""
+    def __init__(self, code: str):
         pipe: Any = subprocess.PIPE
-        command = python("-c", code)
-        return cls(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment()))
+        self.process = subprocess.Popen(
+            python("-c", code), stdout=pipe, stderr=pipe, text=True, env=environment()
+        )
 
     def answer(self, seconds: float) -> tuple[str | None, str]:
         """(what it printed, "") or (None, why not), after waiting at most so many seconds."""
@@ -597,13 +557,13 @@ class Child:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.communicate()
-            return None, "no answer in time"
-        lines = out.strip().splitlines()
-        if self.process.returncode or not lines:
+            return None, _LATE
+        if self.process.returncode or not out.strip():
             return None, (err.strip().splitlines() or ["it printed nothing"])[-1]
-        return lines[-1], ""
+        return out.strip().splitlines()[-1], ""
 
 
+_LATE = "no answer in time"
 IMPORTS_CODE = """
 import importlib, time
 seconds = []
@@ -619,26 +579,29 @@ DIGEST_CODE = "from mdnum.doctor import digest; print(digest())"
 def imports(child: Child, seconds: float) -> DoctorRow:
     """jax_md can be imported, and how long that takes."""
     answer, why = child.answer(seconds)
-    if answer is not None:
-        return DoctorRow("imports", "ok", answer)
-    if why == "no answer in time":
+    if why == _LATE:
         return DoctorRow("imports", "info", "jax_md was still being imported when time was up")
-    return DoctorRow(
-        "imports", "unsafe", why, "python3 -m pip install --upgrade jax-md, or make a new environment"
-    )  # fmt: skip
+    remedy = "python3 -m pip install --upgrade jax-md, or make a new environment"
+    return _decided("imports", answer is not None, answer or why, remedy)
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
     """A jitted rollout has the same bits in another process: what resuming a run relies on."""
-    answer, why = child.answer(seconds)
-    if answer == here:
-        return DoctorRow("second process", "ok", f"50 jitted steps have the same bits there ({here[:12]})")
-    if why == "no answer in time":
-        return DoctorRow("second process", "info", "it did not finish in time, so the bits were not compared")
-    return DoctorRow(
-        "second process",
-        "unsafe",
-        f"50 jitted steps give {here[:12]} here and {answer[:12] if answer else why} there",
+    name, (answer, why) = "second process", child.answer(seconds)
+    if why == _LATE:
+        return DoctorRow(name, "info", "it did not finish in time, so the bits were not compared")
+    return _decided(
+        name,
+        answer == here,
+        f"50 jitted steps have the same bits there ({here[:12]})",
         "A resumed run would not continue bit for bit; on a GPU set"
         " XLA_FLAGS=--xla_gpu_deterministic_ops=true",
+        f"50 jitted steps give {here[:12]} here and {answer[:12] if answer else why} there",
     )
+
+
+#: What this process tests, in the order in which it is worth reading.
+TESTS = (
+    jax_version, flags, devices, float64, crystal, elementwise, functions, reassociation, contraction,
+    constant_division, subnormals, numba_works, own_forces,
+)  # fmt: skip

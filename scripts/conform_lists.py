@@ -16,9 +16,9 @@ import numpy as np
 from _output import figure, parser, save, say, start, table
 
 from mdnum.references.conformance.case import AREAS
-from mdnum.references.conformance.loading import installed, load
+from mdnum.references.conformance.judge import Report
+from mdnum.references.conformance.peers import installed, load
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.results import Report
 from mdnum.references.conformance.suite import examine
 
 # compiles for every number of atoms
@@ -61,7 +61,7 @@ def main() -> None:
     )
     for report in reports:
         for failed in report.failed:
-            say(f"{report.tested.name}: {failed.code}, {failed.case.atoms} atoms ({failed.asked.name}): ")
+            say(f"{report.tested.name}: {failed.code}, {failed.case.atoms} atoms ({failed.case.name}): ")
             say(f"    {failed.worst.text}")
     _draw(reports, asked.output)
 

@@ -36,7 +36,7 @@ from _output import parser, say, start, table
 
 import mdnum
 from mdnum.cli import main as command
-from mdnum.report import svg
+from mdnum.report import drawing
 from mdnum.store import RunFolder
 
 OUTCOMES = ("one line", "said, rest read", "same result", "SILENT", "TRACEBACK", "OUTSIDE")
@@ -445,11 +445,11 @@ def campaign(root: Path, kinds: tuple[str, ...], damages: int, seed: int = 0) ->
         root: an empty folder to work in.
     """
     # figures are drawn, and not written: that takes most of the time, and nothing is read from them
-    written, svg.markup = svg.markup, lambda figure, name: f'<svg viewBox="0 0 1 1">{name}</svg>'
+    written, drawing.markup = drawing.markup, lambda figure, name: f'<svg viewBox="0 0 1 1">{name}</svg>'
     try:
         return _rows(Campaign(root, kinds), damages, seed)
     finally:
-        svg.markup = written
+        drawing.markup = written
 
 
 def _rows(made: Campaign, damages: int, seed: int) -> list[dict[str, object]]:

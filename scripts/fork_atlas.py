@@ -40,7 +40,7 @@ from matplotlib.colors import LogNorm
 
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks import fork
-from mdnum.forks.choices import Choice, parse, shipped, unavailable
+from mdnum.forks.choices import Choice, parse, shipped, twin_or_reason
 from mdnum.forks.worlds import varied
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.numerics.verdicts import REPEATS
@@ -154,10 +154,10 @@ def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, re
         )
 
     try:
-        reason = unavailable(choice, system)
-        if reason is not None:
-            return ended("does not apply", reason)
-        found = fork(choice.make(system), steps, repeats=repeats)
+        twin = twin_or_reason(choice, system)
+        if isinstance(twin, str):
+            return ended("does not apply", twin)
+        found = fork(twin, steps, repeats=repeats)
     except (MdnumError, ArithmeticError, RuntimeError, ValueError) as error:
         return ended("failed", str(error).splitlines()[0])
     failed = ", ".join(f"{name}: {why}" for name, why in found.failed.items())

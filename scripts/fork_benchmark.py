@@ -90,9 +90,9 @@ def single(system: System) -> Callable[[int], None]:
 
 def triple(system: System) -> Callable[[int], None]:
     """Two runs and the counterfactual, compared step by step."""
-    from mdnum.forks.choices import StartUlp
+    from mdnum.forks.choices import parse
 
-    twin = StartUlp().make(system)
+    twin = parse("start").make(system)
 
     def run(steps: int) -> None:
         for _ in twin.a.lockstep(twin.b, steps, forward=True, back=False, guard=None):
@@ -157,10 +157,11 @@ def answered(words: list[str], turns: int) -> dict[str, Any]:
 def mapped(low: float, high: float, steps: int, most: int) -> dict[str, Any]:
     """Seconds of a map along sigma, compilation and the processes that confirm it included."""
     from mdnum.forks.boundaries import boundaries
+    from mdnum.systems import load
 
     say(f"{most} boundaries along sigma")
     busy, wall, beside = time.process_time(), time.perf_counter(), children_seconds()
-    found = boundaries("argon/crystal-108", "potential.sigma", low, high, steps, most=most)
+    found = boundaries(load("argon/crystal-108"), "potential.sigma", low, high, steps, most=most)
     return {
         "boundaries": len(found.boundaries),
         "runs": found.evaluations,

@@ -19,9 +19,7 @@ from numba import njit
 from vesin import NeighborList
 
 from mdnum import units
-from mdnum.systems import ball
-from mdnum.systems.ball_system import BALL_SCHEMA
-from mdnum.systems.schema import json_schema
+from mdnum.systems.load import BALL_SCHEMA, json_schema
 from mdnum.systems.structures import to_extxyz
 
 ROOT = Path(__file__).resolve().parents[1] / "systems"
@@ -249,8 +247,8 @@ def main() -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(to_extxyz(atoms), encoding="utf-8")
         print(f"{path.relative_to(ROOT.parent)}: {len(atoms)} atoms, {path.stat().st_size / 1024:.0f} kB")
-    for file, schema in (("schema.json", json_schema()), (BALL_SCHEMA, ball.json_schema())):
-        (ROOT / file).write_text(json.dumps(schema, indent=1, ensure_ascii=False) + "\n", "utf-8")
+    for file in ("schema.json", BALL_SCHEMA):
+        (ROOT / file).write_text(json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.forks import Fork, fork
-from mdnum.forks.choices import Order, Summation, unavailable
+from mdnum.forks.choices import parse, twin_or_reason
 from mdnum.numerics import reductions
 from mdnum.systems import Simulation, System, load
 
@@ -53,13 +53,11 @@ def force_error(simulation: Simulation, exact: np.ndarray) -> float:
 
 def study(system: System, word: str, steps: int) -> Row:
     """Compare one reduction with the system's own, and with itself in another order."""
-    exact = Order(both="exact").make(system).a.simulation.evaluate().forces
-    shuffled = fork(Order(both=word).make(system), min(steps, 100), counterfactual=False)
+    exact = parse("order@exact").make(system).a.simulation.evaluate().forces
+    shuffled = fork(parse(f"order@{word}").make(system), min(steps, 100), counterfactual=False)
     own = shuffled.twin.a.simulation
-    choice = Summation(word)
-    found = None
-    if unavailable(choice, system) is None:
-        found = fork(choice.make(system), steps, counterfactual=False)
+    twin = twin_or_reason(parse(f"reduction={word}"), system)
+    found = None if isinstance(twin, str) else fork(twin, steps, counterfactual=False)
     return Row(word, force_error(own, exact), found, shuffled.dates.seed)
 
 

@@ -32,12 +32,12 @@ from mdnum.errors import InputError
 from mdnum.report import analysis
 from mdnum.store import RunFolder
 from mdnum.verbs import frame
-from mdnum.verbs.run_page import Record, load
+from mdnum.verbs.run_page import RunView
 
 CHATTER = 5
 
 
-def units_of(run: Record) -> units.Units:
+def units_of(run: RunView) -> units.Units:
     """The units of all its numbers."""
     return units.get(run.summary["units"])
 
@@ -53,7 +53,7 @@ def found_or_made(subject: str, out: Path | None, steps: int | None) -> Path:
     return mdnum.run(subject, out=out, steps=steps).folder
 
 
-def facts(run: Record) -> list[tuple[str, str]]:
+def facts(run: RunView) -> list[tuple[str, str]]:
     """The ledger in numbers."""
     total, steps = run.flips.total, max(run.steps, 1)
     atoms, summary = run.summary["atoms"], run.summary
@@ -94,7 +94,7 @@ def _median(counts: np.ndarray) -> str:
     return "no" if found is None else f"{found:.0f}"
 
 
-def draw(run: Record, path: Path) -> None:
+def draw(run: RunView, path: Path) -> None:
     """Flips per step, flips per pair, stays, and margins."""
     drawn = figure(9.0, 6.0)
     per_step, per_pair, stayed, margins = drawn.subplots(2, 2).flat
@@ -179,7 +179,7 @@ def main() -> None:
     print(f"\n{run.summary['verdict']}\n\n{folder / 'report.html'}")
 
 
-def _where(run: Record, flips: dict[str, np.ndarray], i: int, j: int) -> tuple[str, str]:
+def _where(run: RunView, flips: dict[str, np.ndarray], i: int, j: int) -> tuple[str, str]:
     mine = (flips["i"] == i) & (flips["j"] == j)
     speed = np.abs(flips["radial_speed"][mine]).max()
     return (

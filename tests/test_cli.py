@@ -482,6 +482,6 @@ def test_the_exit_code_of_a_verb_is_that_of_the_worst_it_says(
 
 
 def test_what_is_good_to_know_leaves_the_exit_code_alone():
-    found = [{"severity": severity} for severity in ("info", "warning", "error")]
+    found = [restore({"severity": severity}) for severity in ("info", "warning", "error")]
     assert [output.exit_code(found[:n]) for n in range(4)] == [0, 0, 1, 1]
     assert output.exit_code(found[:1], ok=False) == 1

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import mdnum
-from mdnum.audit.structures import load_calculator
+from mdnum.audit.record import load_calculator
 from mdnum.errors import InputError
-from mdnum.references.conformance.loading import load as load_list
+from mdnum.references.conformance.peers import load as load_list
 from mdnum.safe_path import python
 from mdnum.systems import load as load_system
 

@@ -1,32 +1,61 @@
-"""What every check of a calculator gives back, and how much it may ask."""
+"""What a check of a calculator is and gives back, how much it may ask, and what all checks add up to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
+from mdnum.audit.checks import CHECKS
 from mdnum.deadline import Deadline
+from mdnum.errors import MdnumError
 
+if TYPE_CHECKING:
+    from ase import Atoms
+
+    from mdnum.audit.subject import CalculatorSubject
+
+Item, T = TypeVar("Item"), TypeVar("T")
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
 Severity = Literal["info", "warning", "error"]
-
-#: Why something was not asked that would have been.
+Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
+#: (what, why) of what was not asked, and why something was not that would have been.
+Skipped = tuple[str, str]
 TIME_UP = "the time was up"
+
+
+def idle(done: int, total: int, info: dict[str, Any]) -> None:
+    """A progress that nobody watches."""
 
 
 class TimeUp(Exception):
     """The time that a person gave has passed: what is in progress is left."""
 
 
+class CalculatorError(MdnumError):
+    """The calculator raised, or answered with a number that is not finite.
+
+    Args:
+        structure: the file that holds what it was asked about; None where enough have been saved.
+        cause: what it raised, None where it answered.
+    """
+
+    def __init__(
+        self, message: str, *, structure: Path | None = None, cause: BaseException | None = None, **more: Any
+    ):
+        super().__init__(message, **more)
+        self.structure, self.cause = structure, cause
+
+
 @dataclass
 class Meter:
     """Calls of a calculator by all of its objects, and the time that is left for more.
 
-    Evidence is counted in calls, so that it does not depend on the load of a machine; a deadline cuts it
-    short.
+    Evidence is counted in calls, whatever the load of a machine; a deadline cuts it short.
     """
 
     calls: int = 0
@@ -34,7 +63,7 @@ class Meter:
     _limited: int = 0
 
     def count(self) -> None:
-        """Counts a call.
+        """Count a call.
 
         Raises:
             TimeUp: the deadline has passed, and what is in progress may be left.
@@ -57,18 +86,12 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """What a check found: a code, and values for its sentences in mdnum/verbs/audit.toml.
+    """What a check found: a code, and values for its sentences in mdnum/verbs/audit.toml."""
 
-    Attributes:
-        code: short stable name.
-        severity: info (nothing to do), warning (look at it), error (the numbers are wrong).
-        variants: of its sentences.
-        values: their fields; of a code without sentences `title`, `text` and `remedy`.
-    """
-
-    code: str
-    severity: Severity
-    variants: list[str] = field(default_factory=list)
+    code: str  # short stable name
+    severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
+    variants: list[str] = field(default_factory=list)  # of its sentences
+    # their fields; of a code without sentences `title`, `text` and `remedy`
     values: dict[str, Any] = field(default_factory=dict)
 
 
@@ -79,14 +102,7 @@ def finding(code: str, severity: Severity, *variants: str | None, **values: Any)
 
 @dataclass(frozen=True)
 class Chart:
-    """Something drawn against something.
-
-    Attributes:
-        x: shared by all lines.
-        lines: values by label.
-        marks: places on x by their label (a threshold, say).
-        log_y: whether y spans decades.
-    """
+    """Lines by label over a shared x, with marks (a threshold, say) on x by theirs."""
 
     title: str
     x_label: str
@@ -99,28 +115,237 @@ class Chart:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found; all of it plain values, in eV and Å.
+    """What one check found; all of it plain values, in eV and Å."""
+
+    says: tuple[list[str], dict[str, Any]]  # its summary: names of sentences, and values for all of them
+    findings: list[Observed] = field(default_factory=list)
+    tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # records by title
+    charts: list[Chart] = field(default_factory=list)
+    numbers: dict[str, Any] = field(default_factory=dict)  # figures by name
+    skipped: list[Skipped] = field(default_factory=list)  # what was not asked, and why
+    asked: int = 1  # ways of asking that were gone, those on which the calculator failed included
+    possible: int = 1  # ways that there are in all; more than asked where the time was up
+    # columns of further tables, by name of the table
+    recorded: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
+    name: str = ""  # of the check, filled in by it
+    title: str = ""  # of the check, filled in by it
+    seconds: float = 0.0  # of the check, filled in by it
+
+
+class AuditCheck:
+    """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
+
+    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are under the codes of its
+    findings in mdnum/verbs/audit.toml. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
+
+    Args:
+        timestep: of a run, internal time; None for a fraction of the fastest vibration.
+        steps: of a run; None for as many as a check thinks enough.
 
     Attributes:
-        says: its summary: names of sentences, and values for all of them.
-        tables: records by title.
-        numbers: figures by name.
-        skipped: (what, why) of what was not asked.
-        asked: ways of asking that were gone, those on which the calculator failed included.
-        possible: ways that there are in all; more than asked where the time was up.
-        recorded: columns of further tables, by name of the table.
-        name, title, seconds: of the check, filled in by it.
+        order: checks with a lower one are asked before: what tells most by a call first.
+        needed_to: answers that are not known without this check, "run" or "differentiate".
+        seed: of all that it draws.
+        structures: that show a finding, by name; those of a pair end in -before and -after.
     """
 
-    says: tuple[list[str], dict[str, Any]]
-    findings: list[Observed] = field(default_factory=list)
-    tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    charts: list[Chart] = field(default_factory=list)
-    numbers: dict[str, Any] = field(default_factory=dict)
-    skipped: list[tuple[str, str]] = field(default_factory=list)
-    asked: int = 1
-    possible: int = 1
-    recorded: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
-    name: str = ""
-    title: str = ""
-    seconds: float = 0.0
+    name: ClassVar[str]
+    title: ClassVar[str]
+    order: ClassVar[int] = 100
+    needed_to: ClassVar[tuple[str, ...]] = ()
+    seed = 0
+
+    def __init__(self, timestep: float | None = None, steps: int | None = None):
+        self.timestep, self.steps = timestep, steps
+        self.structures: dict[str, Atoms] = {}
+
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
+        """The check itself.
+
+        Raises:
+            TimeUp: the time was up before anything was found out.
+            CalculatorError: the calculator fails where the check cannot go on.
+        """
+        raise NotImplementedError
+
+    def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
+        """Ask it, with name, title and the time that it took."""
+        began = perf_counter()
+        found = self.ask(subject, progress or idle)
+        return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
+
+
+@dataclass
+class Ways:
+    """Ways of asking, of which some may be left: what every check counts."""
+
+    skipped: list[Skipped] = field(default_factory=list)
+    asked: int = 0  # those on which the calculator failed included
+    possible: int = 0
+
+    def skip(self, what: str, why: str) -> None:
+        """Take note of what was not asked, and why."""
+        self.skipped.append((what, why))
+
+    def each(
+        self,
+        subject: CalculatorSubject,
+        items: Sequence[Item],
+        name: Callable[[Item], str],
+        ask: Callable[[Item], T],
+        progress: Progress,
+        phase: str,
+        *,
+        unit: str = "ways",
+        spread: bool = False,
+        required: bool = False,
+        failed: Callable[[Item, CalculatorError], None] | None = None,
+        tolerant: bool = False,
+    ) -> dict[int, T]:
+        """The answers about many items, by their place; those that come after the deadline are skipped.
+
+        Args:
+            subject: whose deadline it is.
+            name: of an item, where it is skipped.
+            phase, unit: words for the progress.
+            spread: ask in an order in which a few answers tell of the beginning, the middle and the end.
+            required: raise `TimeUp` where none could be asked.
+            failed: called where the calculator fails; otherwise that is raised.
+            tolerant: skip those on which it fails instead.
+        """
+        found: dict[int, T] = {}
+        stride = 4 if spread else 1
+        self.possible += len(items)
+        for done, place in enumerate(k for n in range(stride) for k in range(n, len(items), stride)):
+            item = items[place]
+            progress(done, len(items), {"phase": phase, "unit": unit})
+            try:
+                with subject.meter.limited():
+                    found[place] = ask(item)
+            except TimeUp:
+                self.skip(name(item), TIME_UP)
+                continue
+            except CalculatorError as error:
+                if tolerant:
+                    self.skip(name(item), error.message)
+                elif failed is None:
+                    raise
+                else:
+                    failed(item, error)
+            self.asked += 1
+        if required and not self.asked:
+            raise TimeUp
+        return dict(sorted(found.items()))
+
+
+def in_order(names: Sequence[str]) -> list[str]:
+    """Names of checks in the order in which they are asked."""
+    return sorted(names, key=lambda name: (CHECKS[name].order, name))
+
+
+def needed_to(question: str) -> set[str]:
+    """Checks without which a question ("run", "differentiate") has no answer."""
+    return {name for name in CHECKS if question in CHECKS[name].needed_to}
+
+
+# -- what the checks add up to ---------------------------------------------------------------------
+
+#: Codes that do not bear on a question, whatever their severity: where only the force jumps a run keeps its
+#: energy, and what a run loses to its time step takes nothing from a derivative.
+_APART = {
+    "run": ("FORCE_JUMP", "CURVATURE_JUMP", "CURVATURE_JUMP_AMONG_MANY"),
+    "differentiate": ("DRIFT", "TIMESTEP"),
+}
+#: Of the ways of a check: from here on it counts as asked.
+_NEARLY = 0.9
+
+_IMAGES = (
+    "IMAGES", "LATTICE", "EXTENSIVE", "TRANSLATION", "NARROW_CELL", "FACES", "CELL_ULP", "ROTATION",
+)  # fmt: skip
+_AMONG_MANY = ("JUMP_AMONG_MANY", "CURVATURE_JUMP_AMONG_MANY")
+_RUN = (
+    "FORCES_NOT_GRADIENT", "CURL", "NET_FORCE", "NET_TORQUE", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT",
+)  # fmt: skip
+
+#: What each mistake brings about as well, the deepest first: neighbors that are lost by their place in a list
+#: make every other way of writing a structure down another structure; images that are lost have no forces; a
+#: force that is no gradient does not keep the energy of a run.
+_BRINGS: dict[str, tuple[str, ...]] = {
+    "NOT_REPEATABLE": (
+        "STALE_STATE", "STALE_DYNAMICS", "ORDER", "TOPOLOGY_BY_ORDER", *_IMAGES, "MIRROR", "DUMMY_CELL",
+        *_AMONG_MANY, *_RUN, "ENERGY_STEP", "NOISE_FLOOR", "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL",
+    ),
+    "STALE_STATE": ("STALE_DYNAMICS", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT"),
+    "NEIGHBOR_CAP_BY_ORDER": ("NEIGHBOR_CAP", "ORDER", *_IMAGES, *_AMONG_MANY, *_RUN),
+    "NEIGHBOR_CAP": ("ORDER", *_IMAGES, *_AMONG_MANY, *_RUN),
+    "ORDER": (*_IMAGES, *_AMONG_MANY, *_RUN),
+    **{code: (*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN) for k, code in enumerate(_IMAGES)},
+    "FORCES_NOT_GRADIENT": ("CURL", "NET_FORCE", "NET_TORQUE", "NOT_CONSERVED", "DRIFT"),
+    "CURL": ("NOT_CONSERVED", "DRIFT"),
+    "ENERGY_JUMP": ("FLIPS_CHANGE_ENERGY", "ENERGY_STEP"),
+    "JUMP_AMONG_MANY": ("CURVATURE_JUMP_AMONG_MANY", "HIDDEN_JUMPS"),
+}  # fmt: skip
+_SEVERITIES = ("info", "warning", "error")
+
+
+def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
+    """An answer to each question ("run", "differentiate").
+
+    Args:
+        wanted: checks that were to be made.
+    """
+    return {question: _answer(question, results, wanted) for question in _APART}
+
+
+def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]) -> Answer:
+    found = [one for result in results for one in result.findings if one.code not in _APART[question]]
+    severities = {one.severity for one in found}
+    if "error" in severities:
+        return "no"
+    if "warning" in severities:
+        return "with care"
+    needed, begun = needed_to(question), {result.name for result in results}
+    if not needed <= set(wanted) or not needed <= begun:
+        return "not asked"
+    asked = {result.name for result in results if not largely_unasked(result)}
+    return "yes" if needed <= asked else "as far as asked"
+
+
+def largely_unasked(result: CheckResult) -> bool:
+    """Whether the time was up before most ways of a check were asked."""
+    return result.asked < _NEARLY * result.possible
+
+
+def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
+    """Whether a check is left of those that make up an answer; of others, none is to come."""
+    left = set(wanted) - {result.name for result in results}
+    return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _APART))
+
+
+def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
+    """For each finding the place of the one that it goes below, its own where it is listed by itself.
+
+    It goes below the deepest mistake found that brings it about and is no less severe, and below the first
+    finding of its own code. That it has the same cause is likely and not known: correct the one above, and
+    ask again.
+
+    Args:
+        findings: code and severity of each, in the order in which they were found.
+    """
+    ranks = [_SEVERITIES.index(severity) for _, severity in findings]
+    first: dict[str, int] = {}
+    for place, (code, _) in enumerate(findings):
+        if code not in first or ranks[place] > ranks[first[code]]:
+            first[code] = place
+    found = []
+    for place, (code, _) in enumerate(findings):
+        above = (
+            first[cause]
+            for cause, brought in _BRINGS.items()
+            if cause in first and code in brought and ranks[first[cause]] >= max(ranks[place], 1)
+        )
+        found.append(next(above, first[code]))
+    # of what goes below one that goes below another, the top
+    for _ in found:
+        found = [found[place] for place in found]
+    return found

@@ -145,25 +145,20 @@ class Jump:
     """A place where the curve or one of its derivatives jumps.
 
     Attributes:
-        low: the last coordinate before it.
-        high: the first one after it; the next double after low where `exact`.
-        energy: energy after minus energy before.
-        force: the same of the force.
-        curvature: the same of the second derivative of the energy.
-        doubt: how large each of the three could look where nothing jumps.
-        order: 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt.
-        exact: whether low and high are neighbors among the doubles.
-        third: the same of the third derivative of the energy, where that is the lowest that jumps; else 0.
+        energy, force, curvature: after minus before, of the energy, the force and the energy's
+            second derivative.
     """
 
-    low: float
-    high: float
+    low: float  # the last coordinate before it
+    high: float  # the first one after it; the next double after low where `exact`
     energy: float
     force: float
     curvature: float
-    doubt: tuple[float, float, float]
+    doubt: tuple[float, float, float]  # how large each of the three could look where nothing jumps
+    # 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt
     order: int
-    exact: bool
+    exact: bool  # whether low and high are neighbors among the doubles
+    # jump of the third derivative of the energy, where that is the lowest that jumps; else 0
     third: float = 0.0
 
     @property
@@ -183,20 +178,16 @@ def find_jumps(
 ) -> tuple[list[Jump], int]:
     """Every jump of energy, force, curvature or third derivative that stands out of a scan.
 
-    How small a jump that is depends on how the curve bends; `smallest_steps` tells it of a force. Measured at
-    a spacing of 0.025 Å, 40 steps of the force of each size at random places of five laws (Lennard-Jones of
-    ε = 0.01 and 0.4 eV, Morse, Buckingham, a soft one): of 1e-3, 1e-4 and 1e-5 eV/Å all are found, of 1e-6
-    199 of 200, the other on a wall. Steps of the energy are found down to 3e-6 eV on a Lennard-Jones wall of
-    ε = 1 eV and down to 1e-8 eV on a soft one.
+    How small a jump that is depends on how the curve bends; `smallest_steps` tells it of a force. At 0.025 Å
+    of spacing, of 200 steps of the force by 1e-6 eV/Å at random places of five laws 199 are found, and all of
+    larger ones; of the energy, steps down to 3e-6 eV on a wall of ε = 1 eV, to 1e-8 eV on a soft one.
 
     Args:
         curve: must be defined a little beyond both ends.
-        low, high: where to look.
         step: spacing of the scan. Two thresholds closer together than this may be taken for one.
         most: how many places are zoomed into, those that stand out most.
         expected: places that are known to stand out and are left out.
-        calls: places at which the curve may be asked; after them only the place that stands out most is
-            zoomed into.
+        calls: places at which the curve may be asked, before all but the one that stands out most are left.
 
     Returns:
         (jumps by coordinate, how many places that stood out were left out).
@@ -208,20 +199,19 @@ def find_jumps(
     ]
     found: list[Jump] = []
     done = 0
+
+    def known(left: float, right: float, jump: Jump) -> bool:
+        # a third derivative that jumps stands out of the intervals beside its own as well
+        margin = 3 * step if jump.order == SMOOTH else 0.0
+        return jump.low >= left - margin and jump.high <= right + margin
+
     for _, left, right in suspects[:most]:
         if done and len(curve.known) > calls:
             break
         done += 1
-        # a third derivative that jumps stands out of the intervals beside its own as well
-        margins = (3 * step if jump.order == SMOOTH else 0.0 for jump in found)
-        if any(
-            jump.low >= left - margin and jump.high <= right + margin
-            for jump, margin in zip(found, margins, strict=True)
-        ):
-            continue
-        for jump in _zoom(curve, left, right):
-            if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
-                found.append(jump)
+        if not any(known(left, right, jump) for jump in found):
+            new = _zoom(curve, left, right)
+            found += [one for one in new if not any(_same(one, other) for other in found)]
     return sorted(found, key=lambda jump: jump.at), len(suspects) - done
 
 
@@ -232,7 +222,6 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
     one unlucky rounding does not decide), the curvature from one-sided differences of the force.
 
     Args:
-        low, high: the two sides.
         room: how far to either side the curve can be used, coordinate.
         exact: whether low and high are neighboring doubles.
         curved: whether the curvature is asked for too; nan if not.
@@ -252,12 +241,9 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
             curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
             if not exact:
                 doubt += (high - low) * (_bend(curve, low, -1, room) + _bend(curve, high, 1, room))
-    jumps, doubts = (*values, curvature), (*spread, doubt)
+    jumps, doubts = np.array([*values, curvature]).tolist(), np.array([*spread, doubt]).tolist()
     order = next((k for k in range(3) if abs(jumps[k]) > _SURE * doubts[k]), SMOOTH)
-    return Jump(
-        low, high, float(jumps[0]), float(jumps[1]), float(jumps[2]),
-        (float(doubts[0]), float(doubts[1]), float(doubts[2])), order, exact,
-    )  # fmt: skip
+    return Jump(low, high, jumps[0], jumps[1], jumps[2], (doubts[0], doubts[1], doubts[2]), order, exact)
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
@@ -265,7 +251,7 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
 
     Args:
         edge: where it ends, approached from below.
-        room: how far below the edge the curve has no other threshold.
+        room: without another threshold below it.
     """
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
@@ -285,14 +271,11 @@ def smallest_steps(
 ) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
     """Where `find_jumps` looked, and how large a step of the force has to be there to be found.
 
-    Args are those that `find_jumps` was given; what that asked is known to the curve.
-
     Returns:
         (middles of the intervals that are compared with others, eV/Å at each).
 
     Error:
-        A step that stands out alone is found where it is this large: of 125 planted in five laws of force,
-        125; of those a third as large, half.
+        of 125 steps of this size, planted in five laws, all are found; of those a third as large, half.
     """
     places = grid(low, high, step)
     seen = _outliers(curve, places)[1]
@@ -303,7 +286,7 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Intervals that do not join their two sides as those around them do.
+    """Intervals that do not join their two sides as those around them do, and what would stand out.
 
     Returns:
         (how far it stands out, left, right) of each, the worst first; and the smallest step of the force that
@@ -401,11 +384,10 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
 
 
 def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
-    """Neighboring doubles between which a value goes from that at left to that at right.
+    """Neighboring doubles between which a value goes from that at left to that at right, all near one jump.
 
     Args:
         row: 0 for the energy (without the work done on the way), 1 for the force.
-        left, right: two sides of a jump, so near that the value changes by little else.
     """
     level = _level(curve, row, left, right)
     middle = 0.5 * (level(left) + level(right))
@@ -470,6 +452,6 @@ def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
     return [replace(found, order=SMOOTH, third=-bent)]
 
 
-def _same(one: Jump, other: Jump) -> float:
-    """How near two places are that are one."""
-    return 1e-9 * max(abs(one.at), 1.0) if one.exact and other.exact else 2e-4
+def _same(one: Jump, other: Jump) -> bool:
+    near = 1e-9 * max(abs(one.at), 1.0) if one.exact and other.exact else 2e-4
+    return abs(one.at - other.at) <= near

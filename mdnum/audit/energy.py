@@ -9,7 +9,7 @@ a force that is not the energy's derivative.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -17,7 +17,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.nve import NveRun, at
+from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
 from mdnum.trajectories.frame import Box, Frame
@@ -43,7 +43,40 @@ _SMALL = 1e-6
 _BLOCKS = 8
 
 Steps = Float[np.ndarray, "steps"]
-Along = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class NveRun:
+    """A run at constant energy."""
+
+    start: Atoms  # its species and cell
+    timestep: float  # internal time (length * sqrt(mass / energy))
+    potential: Float[np.ndarray, "steps"]  # of every step, eV
+    kinetic: Float[np.ndarray, "steps"]  # of every step, eV
+    positions: Float[np.ndarray, "steps atoms 3"]  # never wrapped, Å
+    forces: Float[np.ndarray, "steps atoms 3"]  # of the calculator, without those of constraints, eV/Å
+    blown_up: bool  # whether it was stopped because the atoms flew apart
+
+    @property
+    def total(self) -> Float[np.ndarray, "steps"]:
+        """Energy of every step, eV."""
+        return self.potential + self.kinetic
+
+    @property
+    def time(self) -> Float[np.ndarray, "steps"]:
+        """Internal time of every step."""
+        return self.timestep * np.arange(len(self.potential))
+
+    def at(self, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
+        """The structure with its atoms somewhere else, and no constraints."""
+        there = self.start.copy()
+        there.set_constraint()
+        there.positions = positions
+        return there
+
+    def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
+        """Positions at a share of the straight way of a step."""
+        return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
 @dataclass(frozen=True)
@@ -51,26 +84,19 @@ class RunCrossing:
     """A pair that crossed a threshold between two steps.
 
     Attributes:
-        step: after it; the step before is one less.
         i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
-        entered: whether it is inside afterwards.
-        threshold: its place among the thresholds.
-        distance: at `step`, Å.
-        margin: at `step`, Å.
-        share: of the step's straight way at which the distance is the threshold's.
-        slack: of the way to stay clear of it on either side.
     """
 
-    step: int
+    step: int  # after it; the step before is one less
     i: int
     j: int
     rank: int
-    entered: bool
-    threshold: int
-    distance: float
-    margin: float
-    share: float
-    slack: float
+    entered: bool  # whether it is inside afterwards
+    threshold: PairThreshold
+    distance: float  # at `step`, Å
+    margin: float  # at `step`, Å
+    share: float  # of the step's straight way at which the distance is the threshold's
+    slack: float  # of the way to stay clear of it on either side
 
     @property
     def sign(self) -> float:
@@ -78,19 +104,14 @@ class RunCrossing:
         return 1.0 if self.entered else -1.0
 
 
-def crossings(run: NveRun, like: Atoms, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
-    """All flips of a run, in the order of steps and of their places on the way.
-
-    Args:
-        like: species and cell.
-        thresholds: any number for each pair of species.
-    """
+def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
+    """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
+    like = run.start
     box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
     species = like.get_chemical_symbols()
     found = []
     for level in _levels(thresholds, set(species)):
-        radii = {thresholds[place].species: thresholds[place].radius for place in level}
-        places = {frozenset(thresholds[place].species): place for place in level}
+        radii = {one.species: one.radius for one in level.values()}
         tracker = Tracker(SpeciesCutoffs(radii), species=species)
         for step, positions in enumerate(run.positions):
             flips = tracker.step(Frame(step, float(step), positions, box))
@@ -98,34 +119,33 @@ def crossings(run: NveRun, like: Atoms, thresholds: Sequence[PairThreshold]) -> 
             taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
             for row in range(len(flips)):
                 i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
-                place = places[frozenset((species[i], species[j]))]
-                if (i, j, entered) not in taken:
+                pair = i, j, entered
+                threshold = level[frozenset((species[i], species[j]))]
+                if pair not in taken:
                     before, after = (run.positions[n][j] - run.positions[n][i] for n in (step - 1, step))
-                    taken[i, j, entered] = _ways(before, after, entered, thresholds[place], box)
-                ways = taken[i, j, entered]
-                share, slack = ways.pop(0) if ways else (0.5, 1e-3)
+                    taken[pair] = _ways(before, after, entered, threshold, box)
+                share, slack = taken[pair].pop(0) if taken[pair] else (0.5, 1e-3)
                 found.append(
                     RunCrossing(
-                        step, i, j, int(flips.rank[row]), entered, place,
+                        step, i, j, int(flips.rank[row]), entered, threshold,
                         float(flips.distance[row]), float(flips.margin[row]), share, slack,
                     )
                 )  # fmt: skip
     return sorted(found, key=lambda one: (one.step, one.share))
 
 
-def _levels(thresholds: Sequence[PairThreshold], species: set[str]) -> list[list[int]]:
+def _levels(
+    thresholds: Sequence[PairThreshold], species: set[str]
+) -> list[dict[frozenset[str], PairThreshold]]:
     """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
-    levels: list[list[int]] = []
-    for place, one in enumerate(thresholds):
-        if not set(one.species) <= species:
-            continue
+    levels: list[dict[frozenset[str], PairThreshold]] = []
+    for one in thresholds:
         key = frozenset(one.species)
-        for level in levels:
-            if all(frozenset(thresholds[other].species) != key for other in level):
-                level.append(place)
-                break
-        else:
-            levels.append([place])
+        if key <= species:
+            level = next((level for level in levels if key not in level), None)
+            if level is None:
+                levels.append(level := {})
+            level[key] = one
     return levels
 
 
@@ -175,40 +195,31 @@ def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np
     return base + np.array(list(product(*reach)), np.float64) @ rows
 
 
-def along_step(subject: CalculatorSubject, run: NveRun, like: Atoms, step: int) -> Along:
-    """Energy, and force along the way, by the share of the straight way of a step."""
-    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
-    known: dict[float, tuple[float, float]] = {}
+def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
+    """Energy, and force along it, by the share of the straight way of a step; at its ends the run's own."""
+    way = run.positions[step] - run.positions[step - 1]
 
-    def asked(share: float) -> tuple[float, float]:
-        if share not in known:
-            there = at(like, start + share * way)
-            known[share] = subject.energy(there), float(np.sum(subject.forces(there) * way))
-        return known[share]
+    def at_share(share: float) -> tuple[float, float]:
+        energy, forces = subject.both(run.at(run.way(step, share)))
+        return energy, float(np.sum(forces * way))
 
-    return asked
+    curve = Curve(at_share)
+    for share, n in ((0.0, step - 1), (1.0, step)) if ends else ():
+        curve.known[share] = float(run.potential[n]), float(np.sum(run.forces[n] * way))
+    return curve
 
 
 def account(
-    subject: CalculatorSubject,
-    run: NveRun,
-    like: Atoms,
-    step: int,
-    crossed: Sequence[RunCrossing],
-    thresholds: Sequence[PairThreshold],
-    smooth: int = 2,
+    subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
     """Work of the forces along the straight way of a step, in pieces between its crossings.
 
     Args:
         subject: another object than the run's; asked three times for each crossing and once more.
-        like: species and cell.
         step: at its end.
         crossed: those of this step, by their share.
-        thresholds: as `crossings` was given them.
         smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
-            force's slope as it takes the fourth power of the step; or 1 where there are too many kinks of the
-            force, which are as often on one side of the middle as on the other.
+            force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
 
     Returns:
         (jump of the energy at each crossing, 0 where it does not jump; change of the energy that neither a
@@ -217,72 +228,49 @@ def account(
     Error:
         Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
     """
-    asked, way = along_step(subject, run, like, step), run.positions[step] - run.positions[step - 1]
-    left, end = (
-        (share, (float(run.potential[n]), float(np.sum(run.forces[n] * way))))
-        for share, n in ((0.0, step - 1), (1.0, step))
-    )
+    curve, left = along_step(subject, run, step, ends=True), 0.0
     jumps, rest = [], 0.0
     for one in crossed:
-        order = thresholds[one.threshold].order
+        order = one.threshold.order
         if order >= smooth:
             jumps.append(0.0)
             continue
-        below, above = max(one.share - one.slack, left[0]), min(one.share + one.slack, 1.0)
-        before = (below, asked(below)) if below > left[0] else left
-        after = (above, asked(above)) if above < 1.0 else end
-        rest += _unexplained(left, before, asked)
+        below, above = max(one.share - one.slack, left), min(one.share + one.slack, 1.0)
+        rest += _unexplained(curve, left, below)
+        (before, first), (after, last) = curve(below), curve(above)
         # what the smooth forces do between the two places is no jump
-        mean = 0.5 * (before[1][1] + after[1][1])
-        change = after[1][0] - before[1][0] + mean * (after[0] - before[0])
+        change = after - before + 0.5 * (first + last) * (above - below)
         jumps.append(change if order == 0 else 0.0)
         rest += 0.0 if order == 0 else change
-        left = after
-    return jumps, rest + _unexplained(left, end, asked)
+        left = above
+    return jumps, rest + _unexplained(curve, left, 1.0)
 
 
-def _unexplained(
-    first: tuple[float, tuple[float, float]], last: tuple[float, tuple[float, float]], asked: Along
-) -> float:
+def _unexplained(curve: Curve, low: float, high: float) -> float:
     """Energy gained plus work done between two places, by Simpson's rule; 0 if forces have this energy."""
-    width = last[0] - first[0]
-    if width <= 0:
+    if high <= low:
         return 0.0
-    middle = asked(0.5 * (first[0] + last[0]))[1]
-    work = width * (first[1][1] + 4 * middle + last[1][1]) / 6
-    return last[1][0] - first[1][0] + work
+    (before, first), (after, last) = curve(low), curve(high)
+    return after - before + (high - low) * (first + 4 * curve(0.5 * (low + high))[1] + last) / 6
 
 
 @dataclass(frozen=True)
 class HiddenJump:
-    """A place on the straight way of a step at which the energy jumps.
+    """A place on the straight way of a step at which the energy jumps."""
 
-    Attributes:
-        step: at its end.
-        share: of the way.
-        energy: after minus before, without the work done between, eV.
-        ties: (atom, k) whose k-th and next neighbors change places there.
-    """
-
-    step: int
-    share: float
-    energy: float
-    ties: tuple[tuple[int, int], ...]
+    step: int  # at its end
+    share: float  # of the way
+    energy: float  # after minus before, without the work done between, eV
+    ties: tuple[tuple[int, int], ...]  # (atom, k) whose k-th and next neighbors change places there
 
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Jumps in the steps of a run whose energy does not add up.
+    """Jumps in the steps of a run whose energy does not add up."""
 
-    Attributes:
-        jumps: found in the steps that were searched.
-        steps: those, with what they left unexplained, eV.
-        candidates: steps that leave more unexplained than noise does.
-    """
-
-    jumps: tuple[HiddenJump, ...] = ()
-    steps: Mapping[int, float] = field(default_factory=dict)
-    candidates: tuple[int, ...] = ()
+    jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
+    steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
+    candidates: tuple[int, ...] = ()  # steps that leave more unexplained than noise does
 
     @property
     def share(self) -> float:
@@ -310,12 +298,7 @@ class HiddenJumps:
 
 
 def hidden_jumps(
-    probe: CalculatorSubject,
-    run: NveRun,
-    like: Atoms,
-    rest: Steps,
-    sharp: Mapping[int, Sequence[float]],
-    noise: float,
+    probe: CalculatorSubject, run: NveRun, rest: Steps, sharp: Mapping[int, Sequence[float]], noise: float
 ) -> HiddenJumps:
     """Search the steps that leave most unexplained: is it all at single places of their way?
 
@@ -327,9 +310,7 @@ def hidden_jumps(
     """
     limit = max(40 * noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
-    candidates = [
-        int(step) for step in np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")]
-    ]
+    candidates = np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")].tolist()
     began = probe.meter.calls
     jumps: list[HiddenJump] = []
     searched: dict[int, float] = {}
@@ -337,38 +318,30 @@ def hidden_jumps(
         if searched and probe.meter.calls - began > _CALLS:
             break
         searched[step] = float(rest[step])
-        jumps += _within(probe, run, like, step, np.asarray(sharp.get(step, ()), np.float64), limit)
+        jumps += _within(probe, run, step, np.asarray(sharp.get(step, ()), np.float64), limit)
     return HiddenJumps(tuple(jumps), searched, tuple(candidates))
 
 
 def _within(
-    probe: CalculatorSubject, run: NveRun, like: Atoms, step: int, sharp: np.ndarray, limit: float
+    probe: CalculatorSubject, run: NveRun, step: int, sharp: np.ndarray, limit: float
 ) -> list[HiddenJump]:
     """The jumps on the way of one step."""
-    asked = along_step(probe, run, like, step)
-
-    def unexplained(low: float, high: float) -> float:
-        return _unexplained((low, asked(low)), (high, asked(high)), asked)
-
-    parts = [(0.0, 1.0)]
-    first = unexplained(0.0, 1.0)
+    curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
+    first = _unexplained(curve, 0.0, 1.0)
     for level in range(_LEVELS):
-        halves = [
-            half for low, high in parts for half in ((low, 0.5 * (low + high)), (0.5 * (low + high), high))
-        ]
-        sizes = [abs(unexplained(*half)) for half in halves]
+        middles = [(low, 0.5 * (low + high), high) for low, high in parts]
+        halves = [half for low, middle, high in middles for half in ((low, middle), (middle, high))]
+        sizes = [abs(_unexplained(curve, *half)) for half in halves]
         floor = max(limit, _FOLLOWED * max(max(sizes), abs(first) if level >= _SPREAD_AT else 0.0))
         parts = [half for half, size in zip(halves, sizes, strict=True) if size > floor]
         if not parts:
             return []
     found = []
-    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
     for low, high in parts:
         middle = 0.5 * (low + high)
-        if len(sharp) and np.abs(sharp - middle).min() < 1e-3:
-            continue
-        ties = _exchanged(at(like, start + low * way), at(like, start + high * way))
-        found.append(HiddenJump(step, middle, unexplained(low, high), ties))
+        if not len(sharp) or np.abs(sharp - middle).min() >= 1e-3:
+            ties = _exchanged(*(run.at(run.way(step, share)) for share in (low, high)))
+            found.append(HiddenJump(step, middle, _unexplained(curve, low, high), ties))
     return found
 
 
@@ -389,21 +362,14 @@ def _exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Where the energy of a run went, step by step.
+    """Where the energy of a run went, step by step."""
 
-    Attributes:
-        crossed: flips at thresholds.
-        jumps: energy that the flips of each step brought, measured or by the mean of those measured, eV.
-        measured: crossings whose jump was measured, by place in `crossed`, and their jumps, eV.
-        rest: what neither flips nor the work of the forces explains; nan at steps that were left out, eV.
-        hidden: jumps in it.
-    """
-
-    crossed: Sequence[RunCrossing]
-    jumps: Steps
+    crossed: Sequence[RunCrossing]  # flips at thresholds
+    jumps: Steps  # energy that the flips of each step brought, measured or by the mean of those measured, eV
+    # crossings whose jump was measured, by place in `crossed`, and their jumps, eV
     measured: Mapping[int, float]
-    rest: Steps
-    hidden: HiddenJumps = field(default_factory=HiddenJumps)
+    rest: Steps  # what neither flips nor the work of the forces explains; nan at steps that were left out, eV
+    hidden: HiddenJumps = field(default_factory=HiddenJumps)  # jumps in it
 
     @property
     def elsewhere(self) -> Steps:
@@ -417,9 +383,9 @@ class EnergyBalance:
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
-    def means(self) -> dict[int, float]:
+    def means(self) -> dict[PairThreshold, float]:
         """Jump of a pair that enters, by threshold, eV."""
-        found: dict[int, list[float]] = {}
+        found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
@@ -435,7 +401,6 @@ class EnergyBalance:
 def balance(
     probe: CalculatorSubject,
     run: NveRun,
-    like: Atoms,
     limits: Sequence[PairThreshold],
     rng: np.random.Generator,
     noise: float = 0.0,
@@ -444,42 +409,34 @@ def balance(
 
     Args:
         probe: another object than the run's.
-        like: species and cell.
         limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
         noise: of the energy, eV.
     """
-    crossed = crossings(run, like, limits)
+    crossed = crossings(run, limits)
     by_step: dict[int, list[int]] = {}
     for place, one in enumerate(crossed):
         by_step.setdefault(one.step, []).append(place)
     # a step without a crossing that needs care costs one call; of the others a sample must do
-    orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
+    orders = np.array([one.threshold.order for one in crossed], np.int64)
     sharp = int((orders < 2).sum())
     stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
     # a sample of steps is as good as all, unless it is a handful because each step has so many
     smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
-    careful = {
-        step: count for step, places in by_step.items() if (count := int((orders[places] < smooth).sum()))
-    }
-    chosen: set[int] = set()
-    afforded = 0
-    for step in rng.permutation(sorted(careful)):
-        if afforded < _MEASURED:
-            chosen.add(int(step))
-            afforded += careful[int(step)]
+    counts = {step: int((orders[places] < smooth).sum()) for step, places in by_step.items()}
+    careful = rng.permutation(sorted(step for step, count in counts.items() if count)).tolist()
+    before = np.cumsum([0, *(counts[step] for step in careful)])
+    left_out = {step for step, spent in zip(careful, before, strict=False) if spent >= _MEASURED}
     count = len(run.potential)
     rest = np.full(count, np.nan)
     rest[0] = 0.0
     measured: dict[int, float] = {}
     for step in range(1, count):
         places = by_step.get(step, [])
-        if step in careful and step not in chosen:
-            continue
-        jumped, rest[step] = account(
-            probe, run, like, step, [crossed[place] for place in places], limits, smooth
-        )
-        measured |= dict(zip(places, jumped, strict=True))
+        if step not in left_out:
+            here = [crossed[place] for place in places]
+            jumped, rest[step] = account(probe, run, step, here, smooth)
+            measured |= dict(zip(places, jumped, strict=True))
     means = EnergyBalance(crossed, rest, measured, rest).means
     jumps = np.zeros(count)
     known: dict[int, list[float]] = {}
@@ -487,7 +444,7 @@ def balance(
         jumps[one.step] += measured.get(place, one.sign * means.get(one.threshold, 0.0))
         if orders[place] == 0:
             known.setdefault(one.step, []).append(one.share)
-    hidden = hidden_jumps(probe, run, like, rest, known, noise)
+    hidden = hidden_jumps(probe, run, rest, known, noise)
     return EnergyBalance(crossed, jumps, measured, rest, hidden)
 
 
@@ -496,15 +453,10 @@ def balance(
 
 @dataclass(frozen=True)
 class Drift:
-    """How a quantity changes with time.
+    """How a quantity changes with time."""
 
-    Attributes:
-        slope: per unit of time.
-        error: standard error of it, from blocks.
-    """
-
-    slope: float
-    error: float
+    slope: float  # per unit of time
+    error: float  # standard error of it, from blocks
 
     @property
     def significant(self) -> bool:

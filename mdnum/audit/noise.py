@@ -11,8 +11,8 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Observed, finding
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding
+from mdnum.audit.base import CalculatorError, Observed, finding
+from mdnum.audit.subject import CalculatorSubject, differences, largest, no_rounding, rms
 
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
@@ -49,17 +49,11 @@ _FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision")
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """What an answer may differ by without anything being wrong.
+    """What an answer may differ by without anything being wrong."""
 
-    Attributes:
-        energy: standard deviation, eV.
-        force: standard deviation of a component, of the atom that scatters most, eV/Å.
-        typical: the same of the median component.
-    """
-
-    energy: float
-    force: float
-    typical: float = 0.0
+    energy: float  # standard deviation, eV
+    force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
+    typical: float = 0.0  # the same of the median component
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
         """The larger of two, each part by itself."""
@@ -72,7 +66,7 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
     Args:
-        atoms: where; no threshold nearby.
+        atoms: with no threshold nearby.
         rng: picks the line.
 
     Source:
@@ -80,7 +74,7 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     """
     line = direction(len(atoms), rng)
     places = [displaced(atoms, (at - _POINTS // 2) * _SPACING * line) for at in range(_POINTS)]
-    answers = [(subject.energy(place), subject.forces(place)) for place in places]
+    answers = [subject.both(place) for place in places]
     energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
     columns = np.array(forces).reshape(_POINTS, -1)
     energy = float(_scatter(energies[:, None])[0])
@@ -89,35 +83,22 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     if no_rounding(energy, energies[0], force, columns, subject.kT):
         # by chance, or by a threshold: the point that sticks out is asked again
         for at in {_odd_one(energies), _odd_one(columns[:, np.argmax(scatters)])}:
-            subject.again(places[at], float(energies[at]), forces[at])
+            subject.again(places[at], *answers[at])
     # values that round to the same number at every point still carry the rounding of one operation
-    floor = np.finfo(float).eps
-    return NoiseFloor(
-        max(energy, floor * float(np.max(np.abs(energies)))),
-        max(force, floor * float(np.max(np.abs(columns)))),
-        float(np.median(scatters)),
-    )
+    floor, typical = np.finfo(float).eps, float(np.median(scatters))
+    return NoiseFloor(max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical)
 
 
 @dataclass(frozen=True)
 class Staircase:
-    """Whether answers go in steps, along a line on which smooth ones change from point to point.
+    """Whether answers go in steps, along a line on which smooth ones change from point to point."""
 
-    Attributes:
-        energy: the size of a step, eV; 0 where there are none.
-        force: of a force component, eV/Å.
-        share: of force components that go in steps, of those that change at all.
-        length: of the line, Å.
-        energies: at its points, eV.
-        forces: at its points, eV/Å.
-    """
-
-    energy: float
-    force: float
-    share: float
-    length: float
-    energies: Float[np.ndarray, "points"]
-    forces: Float[np.ndarray, "points components"]
+    energy: float  # the size of a step, eV; 0 where there are none
+    force: float  # of a force component, eV/Å
+    share: float  # of force components that go in steps, of those that change at all
+    length: float  # of the line, Å
+    energies: Float[np.ndarray, "points"]  # at its points, eV
+    forces: Float[np.ndarray, "points components"]  # at its points, eV/Å
 
 
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
@@ -125,9 +106,6 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 
     A double, or a number of single precision, of something smooth is another one 1e-4 Å further on. Points
     at which nothing at all has changed do not count: a calculator that has kept an answer looks like that.
-
-    Args:
-        atoms: where the line begins.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -135,9 +113,9 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     line = direction(len(atoms), np.random.default_rng(len(atoms)))
     for spacing in _STEP_SPACINGS:
         there = [displaced(atoms, k * spacing * line) for k in range(_STEP_POINTS)]
-        answers = [(subject.energy(one), subject.forces(one).ravel()) for one in there]
+        answers = [subject.both(one) for one in there]
         energies = np.array([energy for energy, _ in answers])
-        forces = np.array([force for _, force in answers])
+        forces = np.array([force.ravel() for _, force in answers])
         moved = (np.diff(energies) != 0) | (np.diff(forces, axis=0) != 0).any(axis=1)
         changes = np.diff(forces, axis=0)[moved]
         alive, felt = np.any(changes != 0, axis=0), np.any(forces != 0, axis=0)
@@ -184,25 +162,22 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator, draws: int = 4
 ) -> NoiseFloor:
-    """The largest change of energy and of a force component when all atoms are moved by `size` at random.
+    """The largest change of energy and of a force component when all atoms are moved at random.
 
     Rounding coordinates of another image or of a turned structure moves atoms like this.
 
     Args:
-        atoms: where.
-        size: Å, of the order of an ulp of the largest coordinate.
-        rng: draws the moves.
+        size: of the moves, Å: of the order of an ulp of the largest coordinate.
         draws: how many are tried.
     """
-    energy, forces = subject.energy(atoms), subject.forces(atoms)
-    worst = NoiseFloor(0.0, 0.0)
+    base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(draws):
         there = displaced(atoms, size * rng.uniform(-1, 1, (len(atoms), 3)))
-        moved, felt = subject.energy(there), subject.forces(there)
-        change, force = abs(moved - energy), float(np.max(np.abs(felt - forces), initial=0.0))
+        moved = subject.both(there)
+        change, force = differences(base, moved)
         # either answer may be the one that sticks out
-        if no_rounding(change, energy, force, forces, subject.kT) and not subject.again(there, moved, felt):
-            subject.again(atoms, energy, forces)
+        if no_rounding(change, base[0], force, base[1], subject.kT) and not subject.again(there, *moved):
+            subject.again(atoms, *base)
         worst = worst.louder(NoiseFloor(change, force))
     return worst
 
@@ -217,7 +192,6 @@ def settled(
     of a few draws is taken.
 
     Args:
-        rng: draws the moves.
         tries: how many structures are tried.
         at_least: atoms; a smaller cell is repeated, where it repeats.
     """
@@ -227,19 +201,18 @@ def settled(
     if key in subject.known:
         there, noise, rng.bit_generator.state = subject.known[key]
         return there.copy(), noise
-    best: tuple[Atoms, NoiseFloor] | None = None
+    tried: list[tuple[Atoms, NoiseFloor]] = []
     for _ in range(tries):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
         noise = along_a_line(subject, there, rng)
-        if best is None or noise.energy < _QUIETER * best[1].energy:
-            best = there, noise
+        if not tried or noise.energy < _QUIETER * tried[-1][1].energy:
+            tried.append((there, noise))
         # quiet enough to be rounding; where it is not, a threshold on the line looks like noise as well
         energy = subject.energy(there)
         single = float(np.float32(energy)) == energy
         if noise.energy < (_QUIET_SINGLE if single else _QUIET) * max(1.0, abs(energy)):
             break
-    assert best is not None
-    there, noise = best
+    there, noise = tried[-1]
     if len(there) < FEW and there.pbc.any():
         # of few atoms, terms that cancel by symmetry leave no trace
         many = roomy(there, FEW)
@@ -276,15 +249,10 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """What all of some numbers share.
+    """What all of some numbers share."""
 
-    Attributes:
-        decimals: they are rounded to; None where to none.
-        bits: of their significands, at most; 53 for a double that is used in full.
-    """
-
-    decimals: int | None
-    bits: int
+    decimals: int | None  # they are rounded to; None where to none
+    bits: int  # of their significands, at most; 53 for a double that is used in full
 
     @property
     def quantum(self) -> float:
@@ -316,13 +284,9 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
 
     Whether answers go in steps is measured along a line, whatever the numbers look like: forces that were
     rounded before they were multiplied by a unit, or that come from rounded positions, are doubles in full.
-
-    Args:
-        atoms: a line through this structure is walked.
-        noise: of the answers there.
     """
     stairs = steps(subject, atoms)
-    size, typical = float(np.max(np.abs(stairs.energies))), float(np.sqrt(np.mean(stairs.forces**2)))
+    size, typical = largest(stairs.energies), rms(stairs.forces)
     if not size or not typical:
         return
     read = {"energy": digits(stairs.energies), "forces": digits(stairs.forces)}

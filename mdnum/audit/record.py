@@ -1,4 +1,4 @@
-"""What an audit keeps of its questions and answers, and the script that shows its findings without mdnum."""
+"""A calculator by its words, what an audit of it keeps, and a script that shows its findings."""
 
 from __future__ import annotations
 
@@ -13,53 +13,123 @@ from ase.io.jsonio import decode, encode
 from pydantic import Field
 
 from mdnum.audit.base import CheckResult
+from mdnum.audit.subject import LoadedCalculator
 from mdnum.audit.thresholds import PairThreshold
-from mdnum.errors import FolderError
-from mdnum.references.load import place
+from mdnum.errors import FolderError, InputError
+from mdnum.references.load import described, place
 from mdnum.store import RunFolder, expect, restoring
 from mdnum.store.answers import NAME, restored
 from mdnum.units import METAL, Units
 
+_WAYS = (
+    "Give package.module:Class(argument=value), the path of a Python file that makes a calculator, "
+    "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
+)
 #: Where structures are kept that show a finding.
 STRUCTURES = "structures"
 
 
+def load_calculator(words: str) -> LoadedCalculator:
+    """Find what words name, and make it once so that mistakes show here.
+
+    A file is run again for each calculator, so that no two share a buffer.
+
+    Args:
+        words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
+            `calculator`, `calc` or `make()` is a calculator, or `file.py:name` or `file.py:Class(a=1)`; or
+            the name or path of a system of mdnum.
+
+    Raises:
+        InputError: nothing by that name, arguments that are not literals, or making it failed; with what to
+            write instead.
+    """
+    text = words.strip()
+    if not text:
+        raise InputError("no calculator named", remedy=_WAYS)
+    spot = place(text)
+    if spot is None:
+        return _of_system(text)
+
+    def make() -> Any:
+        value = spot.find(("calculator", "calc", "make"), anew=True)
+        if (isinstance(value, type) or not _is_calculator(value)) and callable(value):
+            try:
+                value = value()
+            except Exception as error:  # whatever a constructor raises
+                remedy = "Give the arguments it needs: Class(argument=value)"
+                raise InputError(
+                    f"making it failed: {described(error)}", where=text, remedy=remedy
+                ) from error
+        return value
+
+    made = make()
+    if isinstance(made, type) or not _is_calculator(made):
+        raise InputError(
+            f"that is a {type(made).__name__}, not an ASE calculator (an object with get_potential_energy "
+            "and get_forces)",
+            where=text,
+            remedy=_WAYS,
+        )
+    return LoadedCalculator(text, Path(spot.home).stem if spot.is_file else spot.name, make)
+
+
+def _is_calculator(value: Any) -> bool:
+    # atoms pass the question on to their calculator
+    methods = ("get_potential_energy", "get_forces")
+    return all(hasattr(value, one) for one in methods) and not hasattr(value, "get_positions")
+
+
+def _of_system(text: str) -> LoadedCalculator:
+    from mdnum import systems
+
+    try:
+        system = systems.load(text, None, world="md")
+    except InputError as error:
+        if "." in text and "/" not in text and not text.endswith(".toml"):
+            module, _, last = text.rpartition(".")
+            raise InputError(
+                f"{text!r} is no system of mdnum",
+                remedy=f"For a class, put a colon before its name: {module}:{last}",
+            ) from error
+        raise InputError(
+            f"{error.message}; nor is it a class or a Python file",
+            where=error.where,
+            remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
+        ) from error
+
+    def make() -> Any:
+        from mdnum.references.ase_models import MdnumCalculator
+
+        return MdnumCalculator(system)
+
+    temperature = getattr(system.spec.dynamics, "temperature", None)
+    kT = float(temperature) * system.units.k_B if temperature else None
+    stem = Path(text).stem.removesuffix(".toml")
+    return LoadedCalculator(text, stem, make, system.atoms.copy(), kT, system.units)
+
+
 @dataclass
 class AuditState:
-    """An audit as far as it has come.
+    """An audit as far as it has come."""
 
-    Attributes:
-        name: of the calculator.
-        named: whether it was named in words, and is found again by them.
-        structure: as ASE's JSON.
-        kT: energy, in the calculator's unit.
-        units: their name.
-        checks: that are wanted, in their order; temperature, timestep and steps: as they were asked for.
-        results: of the checks that are done.
-        cut: of the check that a deadline cut short and that is asked again, as far as it was asked.
-        during: check that was not finished, None if all are done.
-        why: it was not: "stopped", or the time was up; empty for an audit that goes on, or was killed.
-        failed: files of structures on which the calculator failed.
-        thresholds: None if no check has searched for them.
-        seconds: that the audit took.
-    """
-
-    name: str
-    named: bool
-    structure: str
-    kT: float
-    units: Annotated[str, Field(pattern="^(metal|lj)$")]
+    name: str  # of the calculator
+    named: bool  # whether it was named in words, and is found again by them
+    structure: str  # as ASE's JSON
+    kT: float  # energy, in the calculator's unit
+    units: Annotated[str, Field(pattern="^(metal|lj)$")]  # their name
+    # that are wanted, in their order; temperature, timestep and steps: as they were asked for
     checks: list[str]
     temperature: float | None
     timestep: float | None
     steps: int | None
-    results: list[CheckResult] = field(default_factory=list)
+    results: list[CheckResult] = field(default_factory=list)  # of the checks that are done
+    # of the check that a deadline cut short and that is asked again, as far as it was asked
     cut: CheckResult | None = None
-    during: str | None = None
-    why: str = ""
-    failed: list[str] = field(default_factory=list)
-    thresholds: list[PairThreshold] | None = None
-    seconds: float = 0.0
+    during: str | None = None  # check that was not finished, None if all are done
+    why: str = ""  # it was not: "stopped", or the time was up; empty for an audit that goes on, or was killed
+    failed: list[str] = field(default_factory=list)  # files of structures on which the calculator failed
+    thresholds: list[PairThreshold] | None = None  # None if no check has searched for them
+    seconds: float = 0.0  # that the audit took
 
     @property
     def left(self) -> list[str]:

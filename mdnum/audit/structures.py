@@ -1,28 +1,25 @@
-"""What is asked about: a calculator by its words, and a structure from a file or built for the calculator."""
+"""What is asked about: a structure from a file or built for the calculator, two particles on a line."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from ase import Atoms
+from jaxtyping import Float
 
-from mdnum.audit.pairs import FARTHEST, Pair, pairs
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
-from mdnum.audit.thresholds import rough
+from mdnum.audit.base import CalculatorError, Skipped
+from mdnum.audit.curve import Curve
+from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
 from mdnum.errors import InputError
-from mdnum.references.load import described, place
-from mdnum.units import METAL, Units
+from mdnum.references.load import described
 
-_WAYS = (
-    "Give package.module:Class(argument=value), the path of a Python file that makes a calculator, "
-    "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
-)
 #: Tried in this order, and then every other element: argon where anything goes.
 _FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
 _LAST_ELEMENT = 95
@@ -39,104 +36,12 @@ _SLOW = 0.15
 _RATTLE = 0.02
 
 
-@dataclass(frozen=True)
-class LoadedCalculator:
-    """A calculator by name.
-
-    Attributes:
-        name: what the person wrote.
-        stem: a short word for a folder's name.
-        make: makes a calculator object that remembers nothing of another.
-        atoms: the structure that comes with it (a system of mdnum has one), or None.
-        kT: energy of its temperature where it has one, eV; None otherwise.
-        units: of its lengths and energies: those of ASE, or reduced ones for some systems of mdnum.
-    """
-
-    name: str
-    stem: str
-    make: Callable[[], Any]
-    atoms: Atoms | None = None
-    kT: float | None = None
-    units: Units = METAL
-
-
-def load_calculator(words: str) -> LoadedCalculator:
-    """Find what words name, and make it once so that mistakes show here.
-
-    A file is run again for each calculator, so that no two share a buffer.
-
-    Args:
-        words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
-            `calculator`, `calc` or `make()` is a calculator, or `file.py:name` or `file.py:Class(a=1)`; or
-            the name or path of a system of mdnum.
-
-    Raises:
-        InputError: nothing by that name, arguments that are not literals, or making it failed; with what to
-            write instead.
-    """
-    text = words.strip()
-    if not text:
-        raise InputError("no calculator named", remedy=_WAYS)
-    spot = place(text)
-    if spot is None:
-        return _of_system(text)
-
-    def make() -> Any:
-        value = spot.find(("calculator", "calc", "make"), anew=True)
-        if (isinstance(value, type) or not _is_calculator(value)) and callable(value):
-            try:
-                value = value()
-            except Exception as error:  # whatever a constructor raises
-                remedy = "Give the arguments it needs: Class(argument=value)"
-                raise InputError(
-                    f"making it failed: {described(error)}", where=text, remedy=remedy
-                ) from error
-        return value
-
-    made = make()
-    if isinstance(made, type) or not _is_calculator(made):
-        raise InputError(
-            f"that is a {type(made).__name__}, not an ASE calculator (an object with get_potential_energy "
-            "and get_forces)",
-            where=text,
-            remedy=_WAYS,
-        )
-    return LoadedCalculator(text, Path(spot.home).stem if spot.is_file else spot.name, make)
-
-
-def _is_calculator(value: Any) -> bool:
-    # atoms pass the question on to their calculator
-    methods = ("get_potential_energy", "get_forces")
-    return all(hasattr(value, one) for one in methods) and not hasattr(value, "get_positions")
-
-
-def _of_system(text: str) -> LoadedCalculator:
-    from mdnum import systems
-
-    try:
-        system = systems.load(text, None, world="md")
-    except InputError as error:
-        if "." in text and "/" not in text and not text.endswith(".toml"):
-            module, _, last = text.rpartition(".")
-            raise InputError(
-                f"{text!r} is no system of mdnum",
-                remedy=f"For a class, put a colon before its name: {module}:{last}",
-            ) from error
-        raise InputError(
-            f"{error.message}; nor is it a class or a Python file",
-            where=error.where,
-            remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
-        ) from error
-
-    def make() -> Any:
-        from mdnum.references.calculator import MdnumCalculator
-
-        return MdnumCalculator(system)
-
-    temperature = getattr(system.spec.dynamics, "temperature", None)
-    kT = float(temperature) * system.units.k_B if temperature else None
-    stem = Path(text).stem.removesuffix(".toml")
-    return LoadedCalculator(text, stem, make, system.atoms.copy(), kT, system.units)
+#: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
+_SURROUNDINGS = ((False, False), (True, False), (True, True))
+#: A scan does not go further apart than this, in the unit of length.
+FARTHEST = 30.0
+#: Distances are walked from the first.
+_NEAREST = 0.3
 
 
 def read_structure(words: str | Path) -> Atoms:
@@ -215,29 +120,28 @@ def default_structure(loaded: LoadedCalculator) -> Atoms:
             why, saved = error.message, error.structure
         else:
             return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
-    made = made or _first_crystal(about, others)
     # after water, since a calculator of molecules may take any atoms in threes for them
-    made = made or _first_crystal(about, likely, paired=False)
-    if made is not None:
-        return made
-    raise InputError(
-        f"the calculator answers neither for atoms of any element nor for water ({why}; saved in {saved})",
-        where=loaded.name,
-        remedy="Give a structure that it is made for: --structure FILE",
-    )
+    made = made or _first_crystal(about, others) or _first_crystal(about, likely, paired=False)
+    if made is None:
+        raise InputError(
+            "the calculator answers neither for atoms of any element nor for water "
+            f"({why}; saved in {saved})",
+            where=loaded.name,
+            remedy="Give a structure that it is made for: --structure FILE",
+        )
+    return made
 
 
 def _first_crystal(
     about: Callable[[Atoms], CalculatorSubject], symbols: Sequence[str], paired: bool = True
 ) -> Atoms | None:
-    """The crystal of the first element that is answered for, two atoms first unless they are not asked."""
+    """The crystal of the first element that is answered for, two atoms of it first where they are asked."""
     for symbol in symbols:
         subject = about(Atoms(symbol, [(0, 0, 0)]))
-        with only_trying(subject):
-            found = pairs(subject)[0][:1] if paired else [None]
-            made = [_crystal(subject, pair, symbol) for pair in found]
-        if made and made[0] is not None:
-            return made[0]
+        with subject.trying():
+            for pair in pairs(subject)[0][:1] if paired else [None]:
+                if (made := _crystal(subject, pair, symbol)) is not None:
+                    return made
     return None
 
 
@@ -288,12 +192,12 @@ def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atom
     if start is None:
         return None
     scale, relaxed = _least_energy(subject, cell, least, start)
-    for factor, at_least in ((scale, relaxed), (start, False)):
-        made = _filled(cell, lattice, factor, at_least, cutoff, symbol)
+    for how in ((scale, relaxed, cutoff), (start, False, cutoff)):
+        made = _filled(cell, f"{symbol}, {lattice}", *how)
         if not _answers(subject, made):
             continue
         took = _processor_time(subject, made)
-        small = _filled(cell, lattice, factor, at_least, cutoff, symbol, few=True)
+        small = _filled(cell, f"{symbol}, {lattice}", *how, few=True)
         # it is asked hundreds of times; narrower than two cutoffs, which not every calculator takes
         if took <= _SLOW or len(small) >= len(made) or not _answers(subject, small):
             return made
@@ -318,8 +222,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
         atoms = atoms.copy()
         atoms.positions[0, 0] += 1e-4
         began = clock()
-        subject.energy(atoms)
-        subject.forces(atoms)
+        subject.both(atoms)
         took.append(clock() - began)
     return min(took)
 
@@ -343,32 +246,26 @@ def _answers(subject: CalculatorSubject, atoms: Atoms) -> bool:
 
 
 def _filled(
-    cell: Atoms,
-    lattice: str,
-    scale: float,
-    relaxed: bool,
-    cutoff: float | None,
-    symbol: str,
-    few: bool = False,
+    cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None, few: bool = False
 ) -> Atoms:
     """The crystal with its lattice scaled, repeated to two cutoffs or a few atoms, and displaced a little."""
     cell = cell.copy()
     tabulated = "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")
     at = "at the calculator's own least energy" if relaxed else tabulated
-    if cutoff and scale * _nearest_distance(cell) > _BARELY * cutoff:
+    if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
-        scale, at = _PRESSED * cutoff / _nearest_distance(cell), "nothing binds it, so pressed together"
+        scale, at = _PRESSED * cutoff / _least_distance(cell), "nothing binds it, so pressed together"
     cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
     wanted = 0.0 if few else 2.05 * cutoff if cutoff else 12.0
     edge = float(np.asarray(cell.cell).diagonal().min())
     repeat = max(int(np.ceil(wanted / edge)), int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))))
     repeat = max(min(repeat, int((_MOST_ATOMS / len(cell)) ** (1 / 3))), 1)
     atoms = cell.repeat(repeat)
-    nearest = _nearest_distance(cell)
+    nearest = _least_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
     return _labeled(
         atoms,
-        f"{len(atoms)} atoms of {symbol}, {lattice}, nearest distance {nearest:.4g} Å ({at}), "
+        f"{len(atoms)} atoms of {kind}, nearest distance {nearest:.4g} Å ({at}), "
         f"displaced by {_RATTLE * nearest:.2g} Å",
     )
 
@@ -385,10 +282,9 @@ def _unit_cell(symbol: str) -> tuple[Atoms, str]:
     return bulk(symbol, "fcc", a=nearest * np.sqrt(2), cubic=True), "fcc"
 
 
-def _nearest_distance(cell: Atoms) -> float:
+def _least_distance(cell: Atoms) -> float:
     """Smallest distance between two atoms of a crystal, images included."""
-    distances = cell.repeat(2).get_all_distances(mic=True)
-    return float(distances[distances > 1e-6].min())
+    return nearest_distance(cell.repeat(2))
 
 
 def _least_energy(
@@ -403,7 +299,7 @@ def _least_energy(
             return np.inf
 
     if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
-        start = least / _nearest_distance(cell)  # too far apart to feel one another: start at two atoms' own
+        start = least / _least_distance(cell)  # too far apart to feel one another: start at two atoms' own
     scale, here = start, energy(start)
     for direction in (1.03, 1 / 1.03):
         for _ in range(60):
@@ -420,3 +316,194 @@ def _small(cell: Atoms, scale: float) -> Atoms:
     small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
     small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
     return small
+
+
+# -- two particles on a line, in which a calculator shows where its pair interaction changes -------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two particles, single atoms or whole molecules, that can be put at any distance."""
+
+    species: tuple[str, str]  # symbols of the two reference atoms; molecules by the heaviest of their atoms
+    first: Atoms  # the particle that stays, its reference atom at the origin
+    second: Atoms  # the particle that moves along x, its reference atom at the origin
+    box: float  # edge of the cubic cell around them, 0 for none
+    periodic: bool  # whether the cell repeats
+    name: str  # formulas of the two
+    # what such a particle is in the structure, an atom or a molecule
+    moves: Literal["atom", "molecule"] = "atom"
+
+    def at(self, distance: float) -> Atoms:
+        """The two at a distance (of the reference atoms), which is exact in the last bit."""
+        moved = self.second.copy()
+        moved.positions[:, 0] += distance
+        both = self.first + moved
+        if self.box:
+            both.set_cell([self.box] * 3)
+        both.pbc = self.periodic
+        return both
+
+    def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
+        """Distances between the two of all atoms but the reference atoms, at a distance of those."""
+        moved = self.second.positions[None] + [distance, 0.0, 0.0]
+        return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
+
+    def curve(self, subject: CalculatorSubject) -> Curve:
+        """Energy against distance, and the force that drives the second away from the first."""
+
+        def at(distance: float) -> tuple[float, float]:
+            energy, forces = subject.both(self.at(distance))
+            return energy, float(forces[len(self.first) :, 0].sum())
+
+        return Curve(at)
+
+
+def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
+    """Two of each species of the structure that the calculator answers for, the most frequent first.
+
+    Single atoms where it takes them as near as they come in the structure; where it does not (a bond order
+    may divide by the number of neighbors), each with two companions behind it; where it takes no such atoms
+    at all (rigid water), molecules of the structure.
+
+    Returns:
+        (pairs, what was left out and why).
+    """
+    symbols = subject.atoms.get_chemical_symbols()
+    species = sorted(set(symbols), key=lambda one: (-symbols.count(one), one))
+    wanted = list(combinations_with_replacement(species, 2))
+    wanted.sort(key=lambda two: -symbols.count(two[0]) * symbols.count(two[1]))
+    nearest = nearest_distance(subject.atoms)
+    found: list[Pair] = []
+    skipped: list[Skipped] = []
+    for one, other in wanted[:most]:
+        single, another = (Atoms(symbol, [(0, 0, 0)]) for symbol in (one, other))
+        pair, why = _answered(subject, (one, other), single, another, nearest)
+        if pair is None:
+            skipped.append((f"two atoms {one}-{other} by themselves", why))
+            if nearest:
+                trios = trio(one, nearest, -1.0), trio(other, nearest, 1.0)
+                pair, _ = _answered(subject, (one, other), *trios, nearest)
+        if pair is not None:
+            found.append(pair)
+    why = f"the {most} most frequent pairs were walked"
+    skipped += [(f"pair {one}-{other}", why) for one, other in wanted[most:]]
+    return found or _molecules(subject), skipped
+
+
+def nearest_distance(atoms: Atoms) -> float:
+    """Smallest distance of two atoms of a structure, of the first 500 of many; 0 where there is one atom."""
+    if len(atoms) < 2:
+        return 0.0
+    distances = atoms[: min(len(atoms), 500)].get_all_distances(mic=bool(atoms.pbc.any()))
+    return float(distances[~np.eye(len(distances), dtype=bool)].min())
+
+
+def trio(symbol: str, side: float, way: float) -> Atoms:
+    """An atom at the origin with two companions behind it."""
+    depth = way * side * np.sqrt(0.75)
+    return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
+
+
+def molecules(atoms: Atoms) -> list[np.ndarray]:
+    """Indices of the atoms of each molecule: those that bonds connect, by covalent radii."""
+    from ase.neighborlist import natural_cutoffs, neighbor_list
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = neighbor_list("ij", atoms, [1.1 * radius for radius in natural_cutoffs(atoms)])
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(atoms), len(atoms)))
+    count, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+
+
+def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    """One molecule in one piece, its heaviest atom at the origin; no cell."""
+    part = _part(atoms, indices)
+    lead = int(np.argmax(part.get_masses()))
+    offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
+    return Atoms(part.get_chemical_symbols(), offsets)
+
+
+def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    part = atoms[indices]
+    assert isinstance(part, Atoms)
+    return part
+
+
+def _molecules(subject: CalculatorSubject) -> list[Pair]:
+    """Two molecules of the structure, where it consists of several; alike if there are two alike."""
+    atoms, groups = subject.atoms, molecules(subject.atoms)
+    if not 2 <= len(groups) <= len(atoms) / 2:
+        return []
+    formulas = [_part(atoms, group).get_chemical_formula() for group in groups]
+    second = next((k for k in range(1, len(groups)) if formulas[k] == formulas[0]), 1)
+    one, other = whole(atoms, groups[0]), whole(atoms, groups[second])
+    leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
+    pair, _ = _answered(subject, (leads[0], leads[1]), one, other, 0.0)
+    return [replace(pair, moves="molecule")] if pair else []
+
+
+def _answered(
+    subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
+) -> tuple[Pair | None, str]:
+    """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
+    why = ""
+    for cell, periodic in _SURROUNDINGS:
+        name = "-".join(part.get_chemical_formula() for part in (first, second))
+        pair = Pair(species, first, second, 2.5 * FARTHEST if cell else 0.0, periodic, name)
+        for distance in filter(None, (nearest, 3.0, 6.0)):
+            if isinstance(answer := subject.try_both(pair.at(distance)), CalculatorError):
+                why = why or answer.message
+                break
+        else:
+            return pair, ""
+    return None, why
+
+
+def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
+    """Distances from where the calculator first answers to the farthest."""
+    places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
+    first = len(places)
+    for k in range(len(places) - 1, -1, -1):
+        try:
+            with subject.trying():
+                curve(float(places[k]))
+        except CalculatorError:
+            break
+        first = k
+    if first > len(places) - 4:
+        curve(float(places[-4]))  # says why
+    return places[first:], float(places[-1])
+
+
+def rough(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
+    """(where a pair stops interacting, where its energy is least), to within a coarse scan; None if never."""
+    curve = pair.curve(subject)
+    coarse, far = coarse_scan(subject, curve)
+    energies, forces = curve.many(coarse)
+    energies = energies - curve(far)[0]
+    felt = np.flatnonzero((np.abs(energies) > 1e-12) | (np.abs(forces) > 1e-12))
+    cutoff = None if len(felt) == 0 or felt[-1] >= len(coarse) - 2 else float(coarse[felt[-1] + 1])
+    lowest = int(np.argmin(energies[coarse > 0.8])) + int((coarse <= 0.8).sum())
+    least = float(coarse[lowest]) if energies[lowest] < -1e-9 and lowest > 0 else None
+    return cutoff, least
+
+
+def group(atoms: Atoms) -> int | None:
+    """Atoms in a molecule, where the structure is molecules of several species, one after another; else None.
+
+    That species repeat in groups is not enough: so they do in a crystal of salt. Atoms of a group must be
+    bonded, by their covalent radii, and to no others.
+    """
+    numbers = atoms.numbers
+    for size in range(2, len(atoms) // 2 + 1):
+        if len(atoms) % size == 0 and np.array_equal(numbers[size:], numbers[:-size]):
+            if len(set(numbers[:size])) == 1:
+                return None
+            expected = np.arange(len(atoms)).reshape(-1, size)
+            found = sorted(molecules(atoms), key=lambda one: one[0])
+            alike = len(found) == len(expected) and all(map(np.array_equal, found, expected))
+            return size if alike else None
+    return None

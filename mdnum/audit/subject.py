@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import itertools
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Meter, Observed, finding
-from mdnum.errors import MdnumError
+from mdnum.audit.base import CalculatorError, Meter, Observed, finding
 from mdnum.store.files import write_text
+from mdnum.systems.structures import to_extxyz
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
@@ -37,60 +39,29 @@ _objects = itertools.count()
 Forces = Float[np.ndarray, "atoms 3"]
 #: Energy, eV, and forces, eV/Å; None where they were not asked for.
 EnergyForces = tuple[float, Forces | None]
-
-
-class CalculatorError(MdnumError):
-    """The calculator raised, or answered with a number that is not finite.
-
-    Args:
-        structure: the file that holds what it was asked about; None where enough have been saved.
-        cause: what it raised, None where it answered.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        remedy: str | None = None,
-        where: str | None = None,
-        structure: Path | None = None,
-        cause: BaseException | None = None,
-    ):
-        super().__init__(message, remedy=remedy, where=where)
-        self.structure, self.cause = structure, cause
+#: Energy and forces, or why there are none.
+Answered = tuple[float, Forces] | CalculatorError
 
 
 @dataclass
 class RepeatCounts:
-    """Questions that were asked more than once, to the last bit of the structure.
+    """Questions that were asked more than once, to the last bit of the structure."""
 
-    Attributes:
-        times: answers that could be compared with an earlier one.
-        differ: of them, those that are not the same to the last bit.
-        energy: the largest difference, eV.
-        force: the largest difference of all forces together (a norm, estimated from one projection), eV/Å.
-        typical: root mean square force where forces were compared last, eV/Å.
-    """
-
-    times: int = 0
-    differ: int = 0
-    energy: float = 0.0
+    times: int = 0  # answers that could be compared with an earlier one
+    differ: int = 0  # of them, those that are not the same to the last bit
+    energy: float = 0.0  # the largest difference, eV
+    # the largest difference of all forces together (a norm, estimated from one projection), eV/Å
     force: float = 0.0
-    typical: float = 0.0
+    typical: float = 0.0  # root mean square force where forces were compared last, eV/Å
 
 
 @dataclass
 class EnergyOffset:
-    """By how much the two energies of a calculator differ for one composition.
-
-    Attributes:
-        first: energy minus free energy where it was asked for first, eV.
-        change: the largest change of it that rounding does not explain, eV; signed.
-    """
+    """By how much the two energies of a calculator differ for one composition."""
 
     formula: str
-    first: float
-    change: float = 0.0
+    first: float  # energy minus free energy where it was asked for first, eV
+    change: float = 0.0  # the largest change of it that rounding does not explain, eV; signed
 
 
 class Repeats:
@@ -106,16 +77,10 @@ class Repeats:
     def __init__(self):
         self.new, self.chance = RepeatCounts(), RepeatCounts()
         self.offsets: dict[bytes, EnergyOffset] = {}
-        self._known: dict[tuple[bytes, str], tuple[float, tuple[int, int]]] = {}
-        self._projections: dict[int, np.ndarray] = {}
+        self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
-    def energy(
-        self, atoms: Atoms, value: float, other: float | None, question: tuple[int, int], new: bool
-    ) -> None:
-        """Takes note of the energy that forces belong to, and of the one that a run logs."""
-        self._compare(atoms, "energy", value, question, new)
-        if other is None:
-            return
+    def offset(self, atoms: Atoms, value: float, other: float) -> None:
+        """Take note of the energy that forces belong to, and of the one that a run logs."""
         key = np.sort(atoms.numbers).tobytes()
         kept = self.offsets.setdefault(key, EnergyOffset(atoms.get_chemical_formula(), other - value))
         single = float(np.float32(value)) == value and float(np.float32(other)) == other
@@ -124,28 +89,19 @@ class Repeats:
         if abs(change) > max(rounding, abs(kept.change)):
             kept.change = change
 
-    def forces(self, atoms: Atoms, values: Forces, question: tuple[int, int], new: bool) -> None:
-        """Takes note of forces."""
-        if values.size not in self._projections:
-            self._projections[values.size] = np.random.default_rng(values.size).standard_normal(values.size)
-        if new:
-            self.new.typical = rms(values)
-        along = float(np.sum(self._projections[values.size] * values.ravel()))
-        self._compare(atoms, "forces", along, question, new)
+    def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
+        """Take note of what a new object (its number `which`) answered to its first question."""
+        bits = hashlib.blake2b(b"|".join(array.tobytes() for array in _bits(atoms)), digest_size=16)
+        before, first = self._known.setdefault((bits.digest(), what), (value, which))
+        self.new.times += first != which
+        if first != which and value != before:
+            self.new.differ += 1
+            setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     @property
     def asks_again(self) -> bool:
         """Whether one more answer that sticks out is to be asked for again: few are, and one is enough."""
         return self.chance.times < _MOST_AGAIN and not self.chance.differ
-
-    def note(self, before: EnergyForces, now: EnergyForces) -> None:
-        """Takes note of two answers of one object to one question, where the one before stood alone."""
-        chance = self.chance
-        chance.differ += 1
-        chance.energy = max(chance.energy, abs(now[0] - before[0]))
-        if before[1] is not None and now[1] is not None:
-            chance.force = max(chance.force, float(np.max(np.abs(now[1] - before[1]), initial=0.0)))
-            chance.typical = rms(now[1])
 
     def findings(self, kT: float) -> list[Observed]:
         """That one question has two answers, where that has come up and is no rounding."""
@@ -158,22 +114,6 @@ class Repeats:
                 # what differs in a last bit is told where repeats are the question
                 return [told] if told.severity == "error" else []
         return []
-
-    def _compare(self, atoms: Atoms, what: str, value: float, question: tuple[int, int], new: bool) -> None:
-        if not new:
-            return
-        bits = hashlib.blake2b(digest_size=16)
-        for array in _bits(atoms):
-            bits.update(np.ascontiguousarray(array).tobytes())
-            bits.update(b"|")
-        before, asked = self._known.setdefault((bits.digest(), what), (value, question))
-        if asked == question:
-            return
-        self.new.times += 1
-        if value != before:
-            self.new.differ += 1
-            size = max(abs(value - before), getattr(self.new, "energy" if what == "energy" else "force"))
-            setattr(self.new, "energy" if what == "energy" else "force", size)
 
 
 def no_rounding(change: float, energy: float, force: float, forces: np.ndarray | None, kT: float) -> bool:
@@ -189,11 +129,10 @@ def no_rounding(change: float, energy: float, force: float, forces: np.ndarray |
     )
 
 
-def _differ(before: EnergyForces, now: EnergyForces, kT: float) -> bool:
-    force = 0.0
-    if before[1] is not None and now[1] is not None:
-        force = float(np.max(np.abs(now[1] - before[1]), initial=0.0))
-    return no_rounding(abs(now[0] - before[0]), before[0], force, before[1], kT)
+def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
+    """By how much two energies, and the force component that differs most, differ; 0 without forces."""
+    forces = None if one[1] is None or other[1] is None else other[1] - one[1]
+    return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 
 
 def not_repeatable(
@@ -211,6 +150,19 @@ def not_repeatable(
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
         return finding("NOT_REPEATABLE", "error", how, **values)
     return finding("NOT_BIT_IDENTICAL", "warning", how, **values)
+
+
+@dataclass(frozen=True)
+class LoadedCalculator:
+    """A calculator by name."""
+
+    name: str  # what the person wrote
+    stem: str  # a short word for a folder's name
+    make: Callable[[], Any]  # makes a calculator object that remembers nothing of another
+    atoms: Atoms | None = None  # the structure that comes with it (a system of mdnum has one), or None
+    kT: float | None = None  # energy of its temperature where it has one, eV; None otherwise
+    # of its lengths and energies: those of ASE, or reduced ones for some systems of mdnum
+    units: Units = METAL
 
 
 class CalculatorSubject:
@@ -272,11 +224,9 @@ class CalculatorSubject:
 
     def fresh(self) -> CalculatorSubject:
         """The same with a calculator object of its own, which remembers nothing."""
-        other = CalculatorSubject(
-            self.name, self._make, self.atoms, kT=self.kT, folder=self.folder, units=self.units
-        )
-        other._saved, other.saving, other.known = self._saved, self.saving, self.known
-        other.meter, other.repeats = self.meter, self.repeats
+        other = copy.copy(self)
+        other.forgets = other.renews = True
+        other._calculator = other._last = None
         return other
 
     def used(self) -> CalculatorSubject:
@@ -315,7 +265,10 @@ class CalculatorSubject:
         both = self._answer(lambda: self._energies(asked), asked, "energy")
         energy, other = (value if value is None else self._number(value, asked) for value in both)
         assert energy is not None
-        self.repeats.energy(asked, energy, other, (self._object, self._seen), self._seen == 1)
+        if self._seen == 1:
+            self.repeats.compare(asked, self._object, "energy", energy)
+        if other is not None:
+            self.repeats.offset(asked, energy, other)
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
@@ -325,8 +278,7 @@ class CalculatorSubject:
             CalculatorError: as for `energy`, or forces of another shape than the positions.
         """
         asked = self._ask(atoms)
-        value = self._answer(lambda: asked.get_forces(), asked, "forces")
-        forces = np.array(value, dtype=np.float64)
+        forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
             raise self._failed(asked, f"gave forces of shape {forces.shape} for {len(asked)} atoms")
         bad = ~np.isfinite(forces).all(axis=1)
@@ -335,16 +287,32 @@ class CalculatorSubject:
             raise self._failed(
                 asked, f"gave a force of {forces[first].tolist()} on atom {first} ({asked.symbols[first]})"
             )
-        self.repeats.forces(asked, forces, (self._object, self._seen), self._seen == 1)
+        if self._seen == 1:
+            self.repeats.new.typical = rms(forces)
+            along = float(np.sum(_projection(forces.size) * forces.ravel()))
+            self.repeats.compare(asked, self._object, "force", along)
         return forces
 
-    def try_both(self, atoms: Atoms) -> tuple[float, Forces] | CalculatorError:
+    def both(self, atoms: Atoms) -> tuple[float, Forces]:
+        """Energy and forces."""
+        return self.energy(atoms), self.forces(atoms)
+
+    def try_both(self, atoms: Atoms) -> Answered:
         """Energy and forces, or why there are none, where either is of interest; no structure is saved."""
         try:
-            with only_trying(self):
-                return self.energy(atoms), self.forces(atoms)
+            with self.trying():
+                return self.both(atoms)
         except CalculatorError as error:
             return error
+
+    @contextmanager
+    def trying(self) -> Iterator[None]:
+        """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
+        before, self.saving = self.saving, False
+        try:
+            yield
+        finally:
+            self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Asks this object a question that it has answered, of which `repeats` takes note.
@@ -363,19 +331,28 @@ class CalculatorSubject:
         Raises:
             CalculatorError: as for `energy`.
         """
-        if not self.repeats.asks_again:
+        repeats, chance = self.repeats, self.repeats.chance
+        if not repeats.asks_again:
             return False
         self.forget()
         now = self.energy(atoms), None if forces is None else self.forces(atoms)
         before = now[0] if energy is None else energy, forces
-        self.repeats.chance.times += 1
-        if not _differ(before, now, self.kT):
+        chance.times += 1
+        if not self._differ(before, now):
             return False
         new = self.fresh()
-        if _differ(now, (new.energy(atoms), None if forces is None else new.forces(atoms)), self.kT):
+        if self._differ(now, (new.energy(atoms), None if forces is None else new.forces(atoms))):
             return False
-        self.repeats.note(before, now)
+        change, force = differences(before, now)
+        chance.differ += 1
+        chance.energy, chance.force = max(chance.energy, change), max(chance.force, force)
+        if now[1] is not None:
+            chance.typical = rms(now[1])
         return True
+
+    def _differ(self, before: EnergyForces, now: EnergyForces) -> bool:
+        change, force = differences(before, now)
+        return no_rounding(change, before[0], force, before[1], self.kT)
 
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
@@ -386,7 +363,7 @@ class CalculatorSubject:
         self.forget()
         asked = self._ask(atoms)
         self._answer(lambda: self._energies(asked), asked, "energy")
-        self._answer(lambda: asked.get_forces(), asked, "forces")
+        self._answer(asked.get_forces, asked, "forces")
         both = zip(("positions", "numbers", "cell", "periods"), _bits(atoms), _bits(asked), strict=True)
         return [word for word, before, after in both if before.tobytes() != after.tobytes()]
 
@@ -476,34 +453,19 @@ class CalculatorSubject:
         return path
 
 
-@contextmanager
-def only_trying(subject: CalculatorSubject) -> Iterator[None]:
-    """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
-    before, subject.saving = subject.saving, False
-    try:
-        yield
-    finally:
-        subject.saving = before
-
-
 def exact_extxyz(atoms: Atoms) -> str:
-    """A structure as extended XYZ without losing a bit (ASE's own writer keeps eight decimals).
+    """A structure as text without losing a bit: symbols, positions, initial charges and magnetic moments."""
+    return to_extxyz(atoms, ("initial_charges", "initial_magmoms"))
 
-    Args:
-        atoms: any; of its arrays, symbols, positions, initial charges and initial magnetic moments are kept.
-    """
-    columns, arrays = ["species:S:1", "pos:R:3"], [atoms.positions]
-    for name in ("initial_charges", "initial_magmoms"):
-        if name in atoms.arrays:
-            arrays.append(np.asarray(atoms.arrays[name], np.float64).reshape(len(atoms), -1))
-            columns.append(f"{name}:R:{arrays[-1].shape[1]}")
-    lattice = " ".join(repr(float(x)) for x in atoms.cell.array.ravel())
-    periodic = " ".join("T" if yes else "F" for yes in atoms.pbc)
-    cell = f'Lattice="{lattice}" ' if atoms.cell.array.any() else ""
-    lines = [str(len(atoms)), f'{cell}Properties={":".join(columns)} pbc="{periodic}"']
-    for symbol, row in zip(atoms.get_chemical_symbols(), np.hstack(arrays), strict=True):
-        lines.append(" ".join([symbol, *(repr(float(x)) for x in row)]))
-    return "\n".join(lines) + "\n"
+
+@cache
+def _projection(size: int) -> np.ndarray:
+    return np.random.default_rng(size).standard_normal(size)
+
+
+def largest(values: np.ndarray) -> float:
+    """The largest absolute value; 0 of none."""
+    return float(np.max(np.abs(values), initial=0.0))
 
 
 def rms(forces: np.ndarray) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
-from mdnum.audit.base import TIME_UP, Progress, TimeUp
+from mdnum.audit.base import CalculatorError, Progress, Ways, idle
 from mdnum.audit.curve import (
     SMOOTH,
     Curve,
@@ -30,8 +30,8 @@ from mdnum.audit.curve import (
     smallest_steps,
 )
 from mdnum.audit.noise import digits
-from mdnum.audit.pairs import FARTHEST, Pair, pairs
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
+from mdnum.audit.structures import FARTHEST, Pair, coarse_scan, pairs
+from mdnum.audit.subject import CalculatorSubject
 
 #: Spacing of a scan, in the unit of length. Two thresholds closer than this may be taken for one.
 STEP = 0.025
@@ -40,8 +40,8 @@ STEP = 0.025
 _CALLS, _FEWEST_CALLS = 20_000, 1500
 #: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
 STEPS = 2.5
-#: Distances are walked from the first down to where two particles cost so many kT.
-_NEAREST, _COSTLY = 0.3, 1000.0
+#: Distances are walked down to where two particles cost so many kT.
+_COSTLY = 1000.0
 #: So near to a threshold that was found a second one may be hidden, length: what a scan compares with.
 BESIDE = 0.35
 #: Of the energy of two particles of several atoms, and of all forces on them: what rounding may change.
@@ -70,31 +70,19 @@ _NOTHING = 1e-7
 
 @dataclass(frozen=True)
 class PairThreshold:
-    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left.
+    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left."""
 
-    Attributes:
-        radius: the distance, length.
-        species: of the two atoms (of the reference atoms of two molecules).
-        order: the lowest derivative of the energy that jumps: 0 the energy, 1 the force, 2 the curvature, 3
-            the third derivative, and so on; 6 stands for 6 or smoother.
-        jumps: of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before.
-        doubt: how large each of them could look where nothing jumps.
-        inside: the last distance before it that gives another answer.
-        outside: the first one beyond it; the next double where a value jumps.
-        dies: whether the two do not interact beyond it.
-        located: error of radius, length.
-        third: jump of the third derivative, eV/Å³, where that is the lowest and was measured; else 0.
-    """
-
-    radius: float
-    species: tuple[str, str]
-    order: int
+    radius: float  # the distance, length
+    species: tuple[str, str]  # of the two atoms (of the reference atoms of two molecules)
+    order: int  # the lowest derivative of the energy that jumps, 0 for the energy itself; 6 or smoother is 6
+    # of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before
     jumps: tuple[float, float, float]
-    doubt: tuple[float, float, float]
-    inside: float
-    outside: float
-    dies: bool
-    located: float
+    doubt: tuple[float, float, float]  # how large each of them could look where nothing jumps
+    inside: float  # the last distance before it that gives another answer
+    outside: float  # the first one beyond it; the next double where a value jumps
+    dies: bool  # whether the two do not interact beyond it
+    located: float  # error of radius, length
+    # jump of the third derivative, eV/Å³, where that is the lowest and was measured; else 0
     third: float = 0.0
 
 
@@ -103,81 +91,55 @@ class Beyond:
     """What was found past the scan.
 
     Attributes:
-        thresholds: changes and the end, by distance.
-        edge: (last distance at which the two feel one another, next one), None without an end.
-        reached: the farthest distance that was asked about, length.
-        force: there, eV/Å.
-        left: energy that is lost beyond it, as it decays there, eV; inf where it does not decay.
-        nodes: distances asked about in all intervals.
         energies, forces: there, eV and eV/Å.
     """
 
-    thresholds: tuple[PairThreshold, ...]
+    thresholds: tuple[PairThreshold, ...]  # changes and the end, by distance
+    # (last distance at which the two feel one another, next one), None without an end
     edge: tuple[float, float] | None
-    reached: float
-    force: float
-    left: float
-    nodes: Float[np.ndarray, "nodes"]
+    reached: float  # the farthest distance that was asked about, length
+    force: float  # there, eV/Å
+    left: float  # energy that is lost beyond it, as it decays there, eV; inf where it does not decay
+    nodes: Float[np.ndarray, "nodes"]  # distances asked about in all intervals
     energies: Float[np.ndarray, "nodes"]
     forces: Float[np.ndarray, "nodes"]
 
 
 @dataclass(frozen=True)
 class PairWalk:
-    """Two particles brought from far apart to as near as they come.
-
-    Attributes:
-        thresholds: by distance.
-        distance: those of the scan, length.
-        energy: against far apart, eV.
-        force: that drives them apart, eV/Å.
-        cutoff: distance beyond which they do not interact; None if they still do at the farthest.
-        left_out: places that stood out of the scan and were not zoomed into.
-        calls: places at which the calculator was asked.
-        quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
-            jump below a few of them is reported.
-        knots: places at which the third derivative jumps, where they are so many that they are no thresholds
-            (a table with cubic splines between its points); else 0.
-        steps: (from, to, half, all) of the scan within the range: between these distances, length, but not
-            beside thresholds, a step of the force above `all`, eV/Å, is found, and one above `half` at half
-            of them; None without a scan.
-        further: what was found past the scan, where the two still feel one another at its end.
-        scanned: the farthest distance of the scan, length.
-    """
+    """Two particles brought from far apart to as near as they come."""
 
     pair: Pair
-    thresholds: tuple[PairThreshold, ...]
-    distance: Float[np.ndarray, "points"]
-    energy: Float[np.ndarray, "points"]
-    force: Float[np.ndarray, "points"]
-    cutoff: float | None
-    left_out: int
-    calls: int
+    thresholds: tuple[PairThreshold, ...]  # by distance
+    distance: Float[np.ndarray, "points"]  # those of the scan, length
+    energy: Float[np.ndarray, "points"]  # against far apart, eV
+    force: Float[np.ndarray, "points"]  # that drives them apart, eV/Å
+    cutoff: float | None  # distance beyond which they do not interact; None if they still do at the farthest
+    left_out: int  # places that stood out of the scan and were not zoomed into
+    calls: int  # places at which the calculator was asked
+    # of energies (eV) and forces (eV/Å) that are rounded to decimals, else 0; no jump below a few of them is
+    # reported
     quantum: tuple[float, float] = (0.0, 0.0)
+    # places at which the third derivative jumps, where they are too many for thresholds (a table with cubic
+    # splines between its points); else 0
     knots: int = 0
+    # (from, to, half, all): between these distances, length, but not beside thresholds, a step of the force
+    # above `all`, eV/Å, is found, and one above `half` at half of them; None without a scan
     steps: tuple[float, float, float, float] | None = None
+    # what was found past the scan, where the two still feel one another at its end
     further: Beyond | None = None
-    scanned: float = FARTHEST
+    scanned: float = FARTHEST  # the farthest distance of the scan, length
 
 
 @dataclass(frozen=True)
 class PairWalks:
-    """What walking pairs found.
+    """What walking pairs found."""
 
-    Attributes:
-        walks: one for each pair that was walked.
-        skipped: what was left out, and why.
-        not_walked: pairs of species of the structure without a walk of their own, "Cu-Zr" say; none where
-            whole molecules were walked, whose atoms are not asked about one by one.
-        possible: pairs that there are to walk.
-        left: those that were not, because the time was up or there are too many.
-    """
-
-    walks: tuple[PairWalk, ...]
-    skipped: tuple[tuple[str, str], ...]
+    walks: tuple[PairWalk, ...]  # one for each pair that was walked
+    ways: Ways  # all pairs that there are to walk, and what was left out
+    # pairs of species of the structure without a walk of their own, "Cu-Zr" say; none where whole molecules
+    # were walked, whose atoms are not asked about one by one
     not_walked: tuple[str, ...] = ()
-    possible: int = 0
-    left: int = 0
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
@@ -191,68 +153,38 @@ def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
     return subject.known["thresholds"]
 
 
-def walk_pairs(subject: CalculatorSubject, progress: Progress | None = None) -> PairWalks:
+def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
     """Walk every pair of species through its distances; remembered for the subject."""
     if "walks" in subject.known:
         return subject.known["walks"]
     found, skipped = pairs(subject)
-    walks: list[PairWalk] = []
     # those beyond the most frequent ones are skipped already
-    calls, left = _CALLS, sum(what.startswith("pair ") for what, _ in skipped)
-    possible = len(found) + left
-    for k, pair in enumerate(found):
-        share = max(calls // (len(found) - k), _FEWEST_CALLS)
+    ways = Ways(skipped, possible=sum(what.startswith("pair ") for what, _ in skipped))
+    calls = _CALLS
+
+    def walked(numbered: tuple[int, Pair]) -> PairWalk | None:
+        nonlocal calls
+        k, pair = numbered
         if calls < _FEWEST_CALLS:
-            left += 1
-            skipped.append((f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs"))
-            continue
-        if progress:
-            progress(k, len(found), {"phase": f"walking {pair.name}", "unit": "pairs"})
-        try:
-            with subject.meter.limited():
-                walks.append(walk(subject, pair, calls=share))
-            calls -= walks[-1].calls
-        except CalculatorError as error:
-            skipped.append((f"pair {pair.name}", error.message))
-        except TimeUp:
-            skipped.append((f"pair {pair.name}", TIME_UP))
-            left += 1
-    walked = {frozenset(one.pair.species) for one in walks}
+            ways.skip(f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs")
+            ways.asked -= 1
+            return None
+        made = walk(subject, pair, calls=max(calls // (len(found) - k), _FEWEST_CALLS))
+        calls -= made.calls
+        return made
+
+    asked = ways.each(
+        subject, list(enumerate(found)), lambda numbered: f"pair {numbered[1].name}", walked, progress,
+        "walking pairs", unit="pairs", tolerant=True,
+    )  # fmt: skip
+    walks = [one for one in asked.values() if one is not None]
+    known = {frozenset(one.pair.species) for one in walks}
     species = combinations_with_replacement(sorted(set(subject.atoms.get_chemical_symbols())), 2)
-    not_walked = tuple("-".join(two) for two in species if frozenset(two) not in walked)
+    not_walked = tuple("-".join(two) for two in species if frozenset(two) not in known)
     if any(one.pair.moves == "molecule" for one in walks):
         not_walked = ()
-    subject.known["walks"] = PairWalks(tuple(walks), tuple(skipped), not_walked, possible, left)
+    subject.known["walks"] = PairWalks(tuple(walks), ways, not_walked)
     return subject.known["walks"]
-
-
-def _coarse(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Distances from where the calculator first answers to the farthest."""
-    places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
-    first = len(places)
-    for k in range(len(places) - 1, -1, -1):
-        try:
-            with only_trying(subject):
-                curve(float(places[k]))
-        except CalculatorError:
-            break
-        first = k
-    if first > len(places) - 4:
-        curve(float(places[-4]))  # says why
-    return places[first:], float(places[-1])
-
-
-def rough(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """(where a pair stops interacting, where its energy is least), to within a coarse scan; None if never."""
-    curve = pair.curve(subject)
-    coarse, far = _coarse(subject, curve)
-    energies, forces = curve.many(coarse)
-    energies = energies - curve(far)[0]
-    felt = np.flatnonzero((np.abs(energies) > 1e-12) | (np.abs(forces) > 1e-12))
-    cutoff = None if len(felt) == 0 or felt[-1] >= len(coarse) - 2 else float(coarse[felt[-1] + 1])
-    lowest = int(np.argmin(energies[coarse > 0.8])) + int((coarse <= 0.8).sum())
-    least = float(coarse[lowest]) if energies[lowest] < -1e-9 and lowest > 0 else None
-    return cutoff, least
 
 
 def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
@@ -266,7 +198,7 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         CalculatorError: the calculator fails at distances at which it had answered before.
     """
     curve, kT = pair.curve(subject), subject.kT
-    coarse, far = _coarse(subject, curve)
+    coarse, far = coarse_scan(subject, curve)
     energy_far = curve(far)[0]
     noise = 8 * scatter(curve, far, far, 1.0)[0]
     if len(pair.second) > 1:
@@ -295,8 +227,8 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         smallest = smallest_steps(curve, near + margin, end + margin, step)
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
-    thirds = sum(one.order == SMOOTH for one in thresholds)
-    knots = thirds if thirds > _KNOTS else 0
+    knots = sum(one.order == SMOOTH for one in thresholds)
+    knots = knots if knots > _KNOTS else 0
     if knots:
         thresholds, left_out = [one for one in thresholds if one.order < SMOOTH], 0
     if edge is not None:
@@ -306,9 +238,8 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         further = _beyond(subject, pair, end + margin, noise, step, calls)
     if further:
         thresholds += further.thresholds
-    thresholds = [
-        one for one in thresholds if pair.moves == "molecule" or not _of_others(pair, one, thresholds)
-    ]
+    if pair.moves == "atom":
+        thresholds = [one for one in thresholds if not _of_others(pair, one, thresholds)]
     values = curve.many(distance)
     reach = distance[-1]
     if further:
@@ -370,7 +301,7 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
     """Whether it is companions of the two that pass another threshold there."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
-    return any(np.abs(others - radius).min() < 1e-5 for radius in radii) if len(others) else False
+    return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
 
 
 # -- the end of an interaction ---------------------------------------------------------------------
@@ -422,14 +353,13 @@ def _with_end(
     located = max(radius - edge[0], edge[1] - edge[0])
     # what the scan took for a threshold of its own there is this one
     same = [one for one in found if abs(one.radius - edge[1]) <= 1e-3]
+    # of a third derivative that jumps it knows the place better: the force was lost in rounding before
+    better = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
     third = 0.0
-    if order >= SMOOTH:
-        # of a third derivative that jumps it knows the place better: the force was lost in rounding before
-        better = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
+    if order >= SMOOTH and better:
         same += better
-        if better:
-            order, third = SMOOTH, better[-1].third
-        if better and better[-1].radius - edge[1] > better[-1].located:
+        order, third = SMOOTH, better[-1].third
+        if better[-1].radius - edge[1] > better[-1].located:
             radius, located = better[-1].radius, better[-1].located
     last = PairThreshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
     return [one for one in found if one not in same] + [last]
@@ -480,7 +410,7 @@ def _beyond(
         high = low * _RATIO
         nodes = _at(low, high)
         try:
-            with only_trying(subject):
+            with subject.trying():
                 forces = curve.many(nodes)[1]
                 gone = curve(_RATIO * high)[0]
 

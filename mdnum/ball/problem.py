@@ -13,8 +13,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
+from mdnum.numerics.formats import check_scale, scaled_gradient
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.
 START = ("y0", "v0")
@@ -117,32 +118,49 @@ class BallProblem:
 
     def value(self, overrides: Mapping[str, Any] | None = None) -> float:
         """The loss."""
-        return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
+        return float(_loss(self.bare, self.world, *self.start_arrays, dict(overrides or {}), None))
+
+    def origin(self, names: Sequence[str]) -> dict[str, Array]:
+        """Where it is, as `loss_at` takes it: parameters by value, the start by how far it is moved, 0.
+
+        Raises:
+            InputError: there is no parameter of a name.
+        """
+        return {
+            name: jnp.zeros((), jnp.float64) if name in START else jnp.asarray(self.world.value(name))
+            for name in names
+        }
 
     def value_and_grad(
-        self, names: Sequence[str], imposed: BallDecisions | None = None
+        self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
         """Loss and derivative along each named parameter, through the iterations that ran.
 
         Args:
             names: a batch moves as a whole along y0 and v0.
             imposed: decisions of every step to act on instead of its own, leading axis steps.
+            scale: of the loss in the reverse pass (`mdnum.numerics.formats`), a power of two.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
-        values = {name: jnp.zeros((), jnp.float64) for name in names if name in START}
-        values |= {name: jnp.asarray(self.world.value(name)) for name in names if name not in START}
-        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), imposed)
-        return float(loss), {name: float(slope) for name, slope in slopes.items()}
+        check_scale(scale)
+        made = _value_and_grad(
+            self.bare, self.origin(names), self.world, *self.start_arrays, imposed, jnp.asarray(scale)
+        )
+        return float(made.value), {name: float(made.gradient[name]) for name in names}
 
     def run(self, **options: Any) -> BallRun:
         """Simulate it; see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
-    def _bare(self) -> tuple[int, BallLoss]:
+    @property
+    def bare(self) -> tuple[int, BallLoss]:
+        """Number of steps, and loss."""
         return self.steps, self.loss
 
-    def _start(self) -> tuple[Array, Array]:
+    @property
+    def start_arrays(self) -> tuple[Array, Array]:
+        """Heights and velocities of the start as floating arrays, shapes (balls,) and () or (balls,)."""
         y = jnp.atleast_1d(jnp.asarray(self.y0))
         y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
         return y, jnp.asarray(self.v0).astype(y.dtype)
@@ -176,7 +194,13 @@ def loss_of(
     return loss.end(state, steps, total)
 
 
-def _apply(bare, world, y0, v0, values, imposed, shifts=False):
+def loss_at(bare, world, y0, v0, values, imposed, shifts=False):
+    """`loss_of` with parameters set, everything an argument, so that no fence is folded.
+
+    Args:
+        bare: number of steps, and loss.
+        values: by name; with `shifts` those of the start are how far it is moved (`BallProblem.origin`).
+    """
     steps, loss = bare
     rest = {name: value for name, value in values.items() if name not in START}
     world = world.with_values(rest)
@@ -191,12 +215,14 @@ def _apply(bare, world, y0, v0, values, imposed, shifts=False):
 
 @eqx.filter_jit
 def _loss(bare, world, y0, v0, values, imposed):
-    return _apply(bare, world, y0, v0, values, imposed)
+    return loss_at(bare, world, y0, v0, values, imposed)
 
 
 @eqx.filter_jit
-def _value_and_grad(bare, values, world, y0, v0, imposed):
-    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, imposed, shifts=True))(values)
+def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
+    return scaled_gradient(
+        lambda given: loss_at(bare, world, y0, v0, given, imposed, shifts=True), scale, values
+    )
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:

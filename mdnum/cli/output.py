@@ -16,6 +16,7 @@ from mdnum.plain import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mdnum.report.finding import Finding
     from mdnum.report.section import Table
     from mdnum.verbs.frame import Outcome
 
@@ -33,6 +34,7 @@ _MOST_ROWS = 12
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
 
 JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
+NO_REPORT_OPTION = typer.Option(False, "--no-report", help="Do not write report.html.")
 SET_OPTION = typer.Option(
     None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
 )
@@ -65,9 +67,71 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
     return overrides
 
 
-def print_json(document: Mapping[str, Any]) -> None:
-    """The one JSON document of a verb, to stdout."""
+def refuse_beside_resume(given: Mapping[str, Any], what: str) -> None:
+    """Refuses what a folder that is resumed has already.
+
+    Args:
+        given: what was typed, by option; None where nothing was.
+        what: is resumed.
+
+    Raises:
+        InputError: something was typed.
+    """
+    from mdnum.verbs.frame import refuse
+
+    asked = {name: value is not None for name, value in given.items()}
+    refuse(asked, f"of a new {what}", "Leave it out beside --resume, or begin in a new folder")
+
+
+def answered(
+    verb: Callable[..., Outcome],
+    *words: Any,
+    no_report: bool,
+    as_json: bool,
+    remedy: Callable[[], str | None] | None = None,
+    **options: Any,
+) -> int:
+    """Calls a verb beside a progress bar and prints its answer; returns the exit code.
+
+    Args:
+        remedy: asked what to do after control-C.
+        words, options: of the verb.
+
+    Raises:
+        Stopped: control-C ended it without an answer.
+    """
+    from mdnum.cli.progress import watched
+    from mdnum.store import RunFolder
+
+    resumed = options.get("resume")
+    # looked at before the folder is listed anew, and said where nothing is worse
+    notes = RunFolder.open(resumed).noted() if resumed is not None and resumed.is_dir() else []
+    stopped = False
+    with watched(remedy) as progress:
+        try:
+            outcome = verb(*words, report=not no_report, progress=progress, **options)
+        except KeyboardInterrupt as stop:
+            # what was found until then may be an answer
+            if (outcome := getattr(stop, "outcome", None)) is None:
+                raise
+            stopped = True
+    print_lines(notes)
+    code = print_outcome(outcome, as_json=as_json)
+    return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
+
+
+def print_json(document: Mapping[str, Any]) -> int:
+    """The one JSON document of a verb, to stdout; returns the exit code of one that is fine."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
+    return EXIT_FINE
+
+
+def print_document(document: Mapping[str, Any], text: str, as_json: bool) -> int:
+    """A document as JSON, or what it comes to in words; returns the exit code of one that is fine."""
+    if as_json:
+        return print_json(document)
+    say(text)
+    return EXIT_FINE
 
 
 def say(text: str, *, err: bool = False) -> None:
@@ -98,16 +162,6 @@ def print_notes(*folders: str | Path) -> None:
 
     for folder in dict.fromkeys(map(Path, folders)):
         print_lines(RunFolder.open(folder).noted())
-
-
-def noted(folder: Path | None) -> list[str]:
-    """What is not as it was written in a folder that is gone on with: said when nothing worse was found.
-
-    It is looked at before the folder goes on and is listed anew.
-    """
-    from mdnum.store import RunFolder
-
-    return RunFolder.open(folder).noted() if folder is not None and folder.is_dir() else []
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -170,30 +224,22 @@ def show(cell: Any) -> str:
     return str(cell)
 
 
-def field(finding: Any, name: str) -> str:
-    """A part of a finding, which is a mapping when read from a folder and a dataclass otherwise."""
-    value = finding.get(name) if isinstance(finding, Mapping) else getattr(finding, name, None)
-    return "" if value is None else str(value)
-
-
-def print_findings(findings: Iterable[Any]) -> None:
+def print_findings(findings: Iterable[Finding]) -> None:
     """Each finding as a title line, what was seen, and what to do."""
     from rich.text import Text
 
     out = console()
     for finding in findings:
-        severity = field(finding, "severity")
-        line = Text(severity, style=_STYLE.get(severity, ""))
-        line.append(f": {field(finding, 'title')}", style="bold")
+        line = Text(finding.severity, style=_STYLE.get(finding.severity, ""))
+        line.append(f": {finding.title}", style="bold")
         out.print(line)
-        for name in ("text", "remedy"):
-            if text := field(finding, name):
-                out.print(Text(f"  {text}"))
+        for text in filter(None, (finding.text, finding.remedy)):
+            out.print(Text(f"  {text}"))
 
 
-def exit_code(findings: Iterable[Any], *, ok: bool = True) -> int:
+def exit_code(findings: Iterable[Finding], *, ok: bool = True) -> int:
     """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
-    matters = any(field(finding, "severity") in ("warning", "error") for finding in findings)
+    matters = any(finding.severity in ("warning", "error") for finding in findings)
     return EXIT_FINDINGS if matters or not ok else EXIT_FINE
 
 
@@ -236,31 +282,3 @@ def _print_part(table: Table) -> None:
     print_table(table.title, table.columns, rows)
     if len(table.rows) > shown:
         console().print(f"  and {len(table.rows) - shown} more, which report.html shows", markup=False)
-
-
-def answer(
-    folder: Path,
-    summary: Mapping[str, Any],
-    print_rows: Callable[[Mapping[str, Any]], None],
-    *,
-    as_json: bool,
-) -> int:
-    """What a folder says, as JSON or for people; returns the exit code.
-
-    Args:
-        print_rows: prints what stands between the headline and the findings.
-    """
-    findings = summary.get("findings", ())
-    code = exit_code(findings, ok=summary.get("status", "complete") == "complete")
-    if as_json:
-        print_json({"folder": folder, **summary})
-        return code
-    out = console()
-    # a comparison has a headline beside the word of its verdict, a run a verdict in words
-    if head := summary.get("headline") or summary.get("verdict"):
-        out.print(head, style="bold", markup=False)
-    print_rows(summary)
-    print_findings(findings)
-    report = folder / "report.html"
-    out.print(f"wrote {report if report.exists() else folder}", markup=False)
-    return code

@@ -28,6 +28,42 @@ from mdnum.systems.build import Simulation
 _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}
 
 
+@dataclass(frozen=True)
+class ReorderedSimulation(Simulation):
+    """A simulation whose lists hold their pairs in another order.
+
+    Attributes:
+        order: a format, or the seed of a shuffle.
+    """
+
+    order: str | int = 0
+
+    @classmethod
+    def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
+        """A simulation with such lists, and the sums that go with a format unless they have no order."""
+        same = _fields(Simulation, simulation)
+        if isinstance(order, str) and simulation.reduction == Sequential():
+            same["reduction"] = _SUMS[order]
+        return cls(**same, order=order)
+
+    @property
+    def lists(self):
+        """Lists of another order are other lists."""
+        return (*super().lists, self.order)
+
+    def verlet_list(self, skin: float | None = None) -> VerletList:
+        """As the simulation's own, in the other order."""
+        made = super().verlet_list(skin)
+        if isinstance(self.order, str):
+            return FormattedList(**_fields(VerletList, made), format=self.order)
+        made.builder = ShuffledBuilder(made.builder, self.order)
+        return made
+
+
+def _fields(kind: type, value: object) -> dict:
+    return {one.name: getattr(value, one.name) for one in fields(kind)}
+
+
 @dataclass
 class FormattedList(VerletList):
     """A list whose slots are in the order in which a format adds.
@@ -76,42 +112,12 @@ def _first(
 
 
 @dataclass(frozen=True)
-class FormattedSimulation(Simulation):
-    """A simulation that adds pair terms in the order of a list's format.
-
-    Attributes:
-        format: of the list.
-    """
-
-    format: str = "sparse"
-
-    @classmethod
-    def of(cls, simulation: Simulation, word: str) -> FormattedSimulation:
-        """A simulation with lists of a format, and the sums that go with it unless they have no order."""
-        same = {field.name: getattr(simulation, field.name) for field in fields(Simulation)}
-        if simulation.reduction == Sequential():
-            same["reduction"] = _SUMS[word]
-        return cls(**same, format=word)
-
-    @property
-    def lists(self):
-        """Lists of another format are other lists."""
-        return (*super().lists, self.format)
-
-    def verlet_list(self, skin: float | None = None) -> VerletList:
-        """As the simulation's own, in the order of the format."""
-        made = super().verlet_list(skin)
-        same = {field.name: getattr(made, field.name) for field in fields(VerletList)}
-        return FormattedList(**same, format=self.format)
-
-
-@dataclass(frozen=True)
 class ShuffledBuilder:
     """A neighbor search whose rows are shuffled, each atom's in its own way.
 
     Attributes:
         inner: who searches.
-        seed: of the shuffle; every list of a run is shuffled with it anew.
+        seed: of the shuffle; every list of a run is shuffled with it again.
     """
 
     inner: ListBuilder
@@ -129,31 +135,3 @@ class ShuffledBuilder:
         keys = np.random.default_rng(self.seed).random(table.shape)
         keys[table == atoms] = 2.0
         return np.take_along_axis(table, np.argsort(keys, axis=0, kind="stable"), axis=0), order, most
-
-
-@dataclass(frozen=True)
-class ShuffledSimulation(Simulation):
-    """A simulation whose lists hold their pairs in another order.
-
-    Attributes:
-        shuffle: seed of that order.
-    """
-
-    shuffle: int = 0
-
-    @classmethod
-    def of(cls, simulation: Simulation, seed: int) -> ShuffledSimulation:
-        """A simulation with shuffled lists."""
-        same = {field.name: getattr(simulation, field.name) for field in fields(Simulation)}
-        return cls(**same, shuffle=seed)
-
-    @property
-    def lists(self):
-        """Shuffled lists are other lists."""
-        return (*super().lists, self.shuffle)
-
-    def verlet_list(self, skin: float | None = None) -> VerletList:
-        """As the simulation's own, shuffled."""
-        made = super().verlet_list(skin)
-        made.builder = ShuffledBuilder(made.builder, self.shuffle)
-        return made

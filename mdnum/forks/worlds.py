@@ -17,6 +17,11 @@ from mdnum.errors import InputError
 from mdnum.program import Program, Twin
 from mdnum.systems import BallSystem, System
 
+#: What has a dtype of its own, by world.
+ROLES = {
+    "md": ("state", "force", "decision", "accumulate"),
+    "ball": ("state", "arithmetic", "decision", "accumulate"),
+}
 #: Of a system file, tables that do not enter a step.
 _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
@@ -31,7 +36,7 @@ def program_of(system: System | BallSystem, steps: int | None = None) -> Program
         from mdnum.ball.program import BallProgram
         from mdnum.systems.build_ball import problem
 
-        return BallProgram(problem(system.spec, steps, where=system.name), system.name)
+        return BallProgram(problem(system.spec, steps, where=system.name))
     from mdnum.rollout.program import MdProgram
     from mdnum.systems.build import build
 
@@ -50,18 +55,16 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
         InputError: a value that the file could not have.
     """
     if isinstance(system, BallSystem):
-        from mdnum.systems.ball_system import vary
+        from mdnum.systems.load import vary
 
         name = name or ", ".join(values)
         return replace(system, spec=vary(name, values, system.spec, f"--vary {name}").spec, variants=())
     from mdnum.systems import structures, toml
-    from mdnum.systems.grammar import apply_overrides
-    from mdnum.systems.load import GRAMMAR
     from mdnum.systems.schema import SystemSpec
 
     data = system.spec.model_dump(mode="python", exclude_none=True)
     keys = {toml.dotted(key): value for key, value in values.items()}
-    apply_overrides(data, keys, GRAMMAR)
+    toml.apply_overrides(data, keys, SystemSpec)
     try:
         spec = SystemSpec.model_validate(data)
     except ValidationError as error:
@@ -88,23 +91,10 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
     }
 
 
-def not_possible(system: Any, values: Mapping[str, Any], name: str) -> str | None:
-    """Why a system cannot have other values of some keys; None where it can."""
-    try:
-        program_of(varied(system, values, name))
-    except InputError as error:
-        # the choice is named where this is printed
-        return error.message.removeprefix(f"variant {name!r}: ")
-    return None
-
-
 def floats(system: Any) -> dict[str, float]:
     """The numbers of a system file that are floats and enter a step, by their dotted keys."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
-        if system.spec.start.boundary is not None:
-            # the other keys of the table hold their defaults and mean nothing
-            del data["start"]
     else:
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"})
     return {key: value for key, value in flat(data).items() if isinstance(value, float)}

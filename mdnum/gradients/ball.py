@@ -1,12 +1,15 @@
 """Derivatives of a ball's rollout: a program with decisions has several, and each is a method of its own.
 
 Of the operations that ran (unrolled), with every decision pinned (frozen), of the mean loss over random
-parameters (randomized); those of other contacts are in `ball_contacts`, that of the motion in `ball_motion`.
+parameters (randomized); those that change what a contact is are in `ball_contacts`.
+
+JAX has no `requires_grad`: a parameter that a run never used has the derivative 0.0, and so has one whose
+derivative underflowed or was clamped away. `dependence` tells them apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,17 +17,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.interpreters import partial_eval
 
-from mdnum.ball.contacts import Projection
-from mdnum.ball.problem import START, BallLoss, BallProblem, loss_of
+from mdnum.ball.problem import BallLoss, BallProblem, loss_at
 from mdnum.ball.rollout import BallRun
-from mdnum.ball.state import BallDecisions
-from mdnum.ball.world import World
+from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
-from mdnum.gradients.dependence import dependence, follow
 from mdnum.gradients.problem import Gradient, Kind
-from mdnum.numerics.scaling import check_scale, scaled_gradient
 from mdnum.registry import Registry
+
+
+class Use(NamedTuple):
+    """Whether the run used a parameter on the way to the loss, and the answer in words."""
+
+    depends: bool
+    note: str
 
 
 class BallMethod:
@@ -47,19 +55,20 @@ class BallMethod:
         """
         raise NotImplementedError
 
-    def result(self, value: float, slopes: dict[str, float], used: Used, details: dict[str, Any]) -> Gradient:
+    def result(
+        self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
+    ) -> Gradient:
         """A gradient of this method."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
-        return Gradient(
-            self.name, self.description, value, gradient, used.notes, details, self.kind, used.depends
-        )
+        notes, depends = ({name: one[k] for name, one in use.items()} for k in (1, 0))
+        return Gradient(self.name, self.description, value, gradient, notes, details, self.kind, depends)
 
 
 #: Methods by the names that system files give them; names take the options of the classes.
 BALL_METHODS: Registry[BallMethod] = Registry("gradient", "mdnum.ball_gradient_methods", BallMethod)
 for _name, _class in {
     "unrolled": "ball:ThroughIterations", "frozen": "ball:Frozen", "implicit": "ball_contacts:Implicit",
-    "event-aware": "ball_motion:ThroughContacts", "smoothed": "ball_contacts:SoftFloor",
+    "event-aware": "ball_contacts:ThroughContacts", "smoothed": "ball_contacts:SoftFloor",
     "randomized": "ball:RandomizedSmoothing",
 }.items():  # fmt: skip
     BALL_METHODS.add(_name, f"mdnum.gradients.{_class}")
@@ -95,121 +104,153 @@ def compare(
     """
     problem.values(names)
     asked = BALL_METHODS if methods is None else methods
-    chosen = [BALL_METHODS.parse(one) if isinstance(one, str) else one for one in asked]
     gradients, refused = [], {}
-    for one in chosen:
+    for method in [BALL_METHODS.parse(one) if isinstance(one, str) else one for one in asked]:
         try:
-            gradients.append(one(problem, names))
+            gradients.append(method(problem, names))
         except MdnumError as error:
-            refused[one.name] = str(error)
+            refused[method.name] = str(error)
     return BallGradients(tuple(gradients), refused)
 
 
-class Used(NamedTuple):
-    """Whether the run used each parameter on the way to the loss, and the answer in words."""
-
-    depends: dict[str, bool]
-    notes: dict[str, str]
+# --- whether a loss depends on a parameter ------------------------------------------------------------
 
 
-def origin(problem: BallProblem, names: Sequence[str]) -> dict[str, jax.Array]:
-    """Where a problem is, for `moved_loss`: parameters by value, the start by how far it is moved (0)."""
-    problem.values(names)
-    dtype = problem.world.policy.dtype("arithmetic")
+class Dependence(NamedTuple):
+    """Whether any path of a program leads from a parameter to the loss, and whether one that ran does."""
+
+    written: bool
+    used: bool
+
+
+def dependence(
+    function: Callable[..., jax.Array],
+    values: Mapping[str, Any],
+    names: Sequence[str] | None = None,
+    rest: tuple[Any, ...] = (),
+) -> dict[str, Dependence]:
+    """Whether a scalar loss depends on its parameters, in the branches and iterations that ran.
+
+    A tangent that is no number stays none through everything that carries a derivative, whatever it is
+    multiplied by, and goes nowhere else.
+
+    Args:
+        function: from a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
+            it is the same object (or an equal `eqx.Module`).
+        values: the parameters, floating point, of any shape. names: those asked about, all by default.
+        rest: further arguments. What must not become a constant of the compiled program is passed here.
+
+    Error: a slope that is infinite where it is multiplied by the tangent 0 of another element counts as used.
+    """
+    given = {name: jnp.asarray(value) for name, value in values.items()}
+    names = tuple(given if names is None else names)
+    used = np.asarray(_used(function, given, rest, names)).tolist()
+    # what the run used is written; the text is read for the others only
     return {
-        name: jnp.zeros((), np.float64)
-        if name in START
-        else jnp.asarray(problem.world.value(name)).astype(np.float64 if name in ("tol", "enter") else dtype)
-        for name in names
+        name: Dependence(mark or _written(function, given, rest, name), mark)
+        for name, mark in zip(names, used, strict=True)
     }
 
 
-def moved_loss(
-    values: Mapping[str, Any],
-    world: World,
-    y0: jax.Array,
-    v0: jax.Array,
-    decisions: BallDecisions | None,
-    steps: int,
-    loss: BallLoss,
-) -> jax.Array:
-    """The loss with parameters set and the start moved, everything an argument, so that no fence is folded.
+@eqx.filter_jit
+def _used(function: Any, values: dict[str, jax.Array], rest: tuple, names: tuple[str, ...]):
+    program = _plain(jax.make_jaxpr(function)(values, *rest))
+    order, others = sorted(values), jax.tree.leaves(rest)
+    at = tuple(values[name] for name in order)
 
-    Args:
-        values: as from `origin`.
-        decisions: of every step, or None for the world's own.
-    """
-    rest = {name: value for name, value in values.items() if name not in START}
-    y, v = (
-        start + jnp.asarray(values[name]).astype(start.dtype) if name in values else start
-        for name, start in zip(START, (y0, v0), strict=True)
-    )
-    return loss_of(world.with_values(rest), y, v, steps, loss, decisions)
+    def one(which):
+        along = tuple(
+            jnp.where(on, jnp.nan, 0.0).astype(leaf.dtype) * jnp.ones_like(leaf)
+            for on, leaf in zip(which, at, strict=True)
+        )
+        return jnp.isnan(jax.jvp(lambda *given: jaxpr_as_fun(program)(*given, *others)[0], at, along)[1])
+
+    return jax.vmap(one)(jnp.array([[key == name for key in order] for name in names]))
 
 
-def start_of(problem: BallProblem) -> tuple[jax.Array, jax.Array]:
-    """Heights and velocities at the start as floating arrays, shapes (balls,) and () or (balls,)."""
-    y = jnp.atleast_1d(jnp.asarray(problem.y0))
-    y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
-    return y, jnp.asarray(problem.v0).astype(y.dtype)
+def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str) -> bool:
+    """Whether the text of the derivative has the tangent in it, through any branch and round."""
+
+    def slope(tangent):
+        return jax.jvp(lambda q: function(values | {name: q}, *rest), (values[name],), (tangent,))[1]
+
+    program = jax.make_jaxpr(slope)(values[name])
+    return partial_eval.dce_jaxpr(program.jaxpr, [True])[1][0]
+
+
+def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with the loops of `stopping.elementwise` in it instead of their rule, which multiplies by
+    a Jacobian: its zeros would not tell a flat loop from one that did not run."""
+
+    def run(*inputs):
+        jaxpr = program.jaxpr
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *inputs], strict=True))
+
+        def value(atom: Any) -> Any:
+            return atom.val if isinstance(atom, Literal) else known[atom]
+
+        for equation in jaxpr.eqns:
+            given, params = [value(atom) for atom in equation.invars], equation.params
+            if params.get("symbolic_zeros"):
+                made = jaxpr_as_fun(_plain(params["call_jaxpr"]))(*given)
+            else:
+                params = jax.tree.map(
+                    lambda part: _plain(part) if isinstance(part, ClosedJaxpr) else part,
+                    params, is_leaf=lambda part: not isinstance(part, dict | tuple),
+                )  # fmt: skip
+                made = equation.primitive.bind(*given, **equation.primitive.get_bind_params(params))
+            made = made if equation.primitive.multiple_results else [made]
+            known.update(zip(equation.outvars, made, strict=True))
+        return [value(atom) for atom in jaxpr.outvars]
+
+    shapes = [jax.ShapeDtypeStruct(one.shape, one.dtype, weak_type=one.weak_type) for one in program.in_avals]
+    return jax.make_jaxpr(run)(*shapes)
 
 
 class _Rollout(eqx.Module):
-    """`moved_loss` of so many steps: equal for equal problems, so that it is compiled once."""
+    """The loss of so many steps: equal for equal problems, so that it is compiled once."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss
 
-    def __call__(self, values, world, y0, v0, decisions):
-        return moved_loss(values, world, y0, v0, decisions, self.steps, self.loss)
-
-
-@eqx.filter_jit
-def evaluate(values, world, y0, v0, decisions, steps, loss):
-    """`moved_loss`, compiled."""
-    return moved_loss(values, world, y0, v0, decisions, steps, loss)
-
-
-@eqx.filter_jit
-def differentiate(values, world, y0, v0, decisions, steps, loss, names, scale):
-    """Loss and reverse-mode derivative under loss scaling, and what the run used, as one compiled program."""
-    function, rest = _Rollout(steps, loss), (world, y0, v0, decisions)
-    made = scaled_gradient(lambda values: function(values, *rest), scale, values)
-    return made, follow(function, values, rest, names)
+    def __call__(self, values, world, y0, v0):
+        return loss_at((self.steps, self.loss), world, y0, v0, values, None, shifts=True)
 
 
 def used(
-    problem: BallProblem,
-    names: Sequence[str],
-    slopes: Mapping[str, float],
-    run: BallRun | None = None,
-    marks: Any = None,
-) -> Used:
+    problem: BallProblem, names: Sequence[str], slopes: Mapping[str, float], run: BallRun | None = None
+) -> dict[str, Use]:
     """Whether the run used each parameter on the way to the loss.
 
     Args:
         slopes: derivatives already known.
         run: of this problem, made here when None.
-        marks: what `follow` gave for the names, where it was asked already.
     """
     run = problem.run(keep=False) if run is None else run
-    answers = dependence(
-        _Rollout(problem.steps, problem.loss), origin(problem, names), names,
-        (problem.world, *start_of(problem), None), gradient=slopes, marks=marks,
-        why_unused=_why(problem.world, run),
-    )  # fmt: skip
-    return Used(
-        {name: answer.used for name, answer in answers.items()},
-        {name: answer.message for name, answer in answers.items()},
-    )
+    rollout, rest = _Rollout(problem.steps, problem.loss), (problem.world, *problem.start_arrays)
+    found = dependence(rollout, problem.origin(names), names, rest)
+    return {name: Use(one.used, _note(name, one, slopes[name], problem, run)) for name, one in found.items()}
 
 
-def _why(world: World, run: BallRun) -> str:
-    if not run.contact.any():
-        return "no ball touched the floor, and nothing else used {name}"
-    if isinstance(world.contact, Projection) and not run.iterations.any():
-        return "the loop ended before {name} was used"
-    return "nothing that ran used {name}"
+def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run: BallRun) -> str:
+    if not found.written:
+        return f"the program has no path from {name} to the loss: the loss does not depend on {name}"
+    if not found.used:
+        why = f"nothing that ran used {name}"
+        if not run.contact.any():
+            why = f"no ball touched the floor, and nothing else used {name}"
+        elif isinstance(problem.world.contact, Projection) and not run.iterations.any():
+            why = f"the loop ended before {name} was used"
+        return f"{why}: the loss does not depend on {name}"
+    if slope == 0.0:
+        return (
+            f"the loss depends on {name}, but its derivative comes out as exactly zero "
+            "(a flat piece, a cancellation or an underflow)"
+        )
+    return f"the loss depends on {name}"
+
+
+# --- methods ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -217,9 +258,7 @@ class ThroughIterations(BallMethod):
     """The derivative of the operations that ran, iteration by iteration.
 
     Attributes:
-        loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
-            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.scaling`); a power of
-            two.
+        loss_scale: the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two.
     """
 
     loss_scale: float = 1.0
@@ -238,10 +277,9 @@ class ThroughIterations(BallMethod):
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
         run = problem.run(keep=False) if run is None else run
-        value, slopes, marks = scaled(problem, names, None, self.loss_scale)
-        depends, why = used(problem, names, slopes, run, marks)
+        value, slopes = problem.value_and_grad(names, scale=self.loss_scale)
         details = {"iterations": int(run.iterations.sum()), "loss_scale": self.loss_scale}
-        return self.result(value, slopes, Used(depends, why), details)
+        return self.result(value, slopes, used(problem, names, slopes, run), details)
 
 
 @dataclass(frozen=True)
@@ -250,12 +288,7 @@ class Frozen(BallMethod):
 
     The pinned program has no branches left, so finite differences of it exist; in float64 they are taken as
     a check.
-
-    Attributes:
-        check: whether to take them.
     """
-
-    check: bool = True
 
     name = "frozen"
     description = (
@@ -270,75 +303,42 @@ class Frozen(BallMethod):
         run = problem.run(keep=False)
         decisions = run.decisions()
         decisions = type(decisions)(jnp.asarray(decisions.contact), jnp.asarray(decisions.iterations))
-        value, slopes, marks = scaled(problem, names, decisions)
+        value, slopes = problem.value_and_grad(names, decisions)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
-        if self.check and problem.world.policy.arithmetic == "float64":
-            details["finite_difference"] = pinned_differences(problem, names, decisions)
-        depends, why = used(problem, names, slopes, run, marks)
-        return self.result(value, slopes, Used(depends, why), details)
+        if problem.world.policy.arithmetic == "float64":
+            at = problem.origin(names)
+            widths = {name: 6e-6 * size for name, size in _sizes(problem, names).items()}
+
+            def loss(name: str, shift: float) -> float:
+                values = at | {name: at[name] + shift}
+                rest = (problem.world, *problem.start_arrays, values, decisions)
+                return float(_evaluated(problem.bare, *rest, True))
+
+            details["finite_difference"] = {
+                name: (loss(name, width) - loss(name, -width)) / (2 * width) for name, width in widths.items()
+            }
+        return self.result(value, slopes, used(problem, names, slopes, run), details)
 
 
-class Scaled(NamedTuple):
-    """A loss, its derivative by name, and whether the run used each name."""
-
-    value: float
-    slopes: dict[str, float]
-    marks: np.ndarray
+_evaluated = eqx.filter_jit(loss_at)
 
 
-def scaled(
-    problem: BallProblem, names: Sequence[str], decisions: BallDecisions | None = None, scale: float = 1.0
-) -> Scaled:
-    """Loss and reverse-mode derivative under loss scaling.
-
-    Args:
-        decisions: to act on, or None.
-        scale: a power of two.
-
-    Raises:
-        InputError: it is not.
-    """
-    values, start = origin(problem, names), start_of(problem)
-    check_scale(scale)
-    factor = jnp.asarray(scale, jnp.float64)
-    made, marks = differentiate(
-        values, problem.world, *start, decisions, problem.steps, problem.loss, tuple(names), factor
-    )
-    slopes = {name: float(made.gradient[name]) for name in names}
-    return Scaled(float(made.value), slopes, np.asarray(marks))
-
-
-def pinned_differences(problem: BallProblem, names: Sequence[str], decisions) -> dict[str, float]:
-    """Central differences of the loss with all decisions imposed.
-
-    Error: about u^(2/3), relative to the loss over the size of the parameter.
-    """
-    at, start = origin(problem, names), start_of(problem)
-    found = {}
-    for name in names:
-        size = float(np.max(np.abs(getattr(problem, name)))) if name in START else abs(float(at[name]))
-        width = 6e-6 * (size or 1.0)
-
-        def loss(shift: float, name: str = name) -> float:
-            values = at | {name: at[name] + shift}
-            return float(evaluate(values, problem.world, *start, decisions, problem.steps, problem.loss))
-
-        found[name] = (loss(width) - loss(-width)) / (2 * width)
-    return found
+def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
+    """Sizes of parameters, 1 for those that are 0."""
+    at = problem.values(names)
+    return {name: float(np.max(np.abs(np.asarray(value, np.float64)))) or 1.0 for name, value in at.items()}
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(BallMethod):
     """The derivative of E[loss(parameters + width * noise)], estimated from values alone.
 
-    It needs no derivative of the program, sees through jumps (of iteration counts, of contacts), and is that
-    of a smoother loss; the same seed gives the same bits. Each sample is used with its mirror image, which
-    removes the value of the loss from the variance.
+    It sees through jumps (of iteration counts, of contacts), and is that of a smoother loss; the same seed
+    gives the same bits. Each sample is used with its mirror image, which removes the value from the variance.
 
     Attributes:
         width: standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0).
-        samples: pairs of mirrored samples.
-        seed: of the noise.
+        samples: pairs of mirrored samples. seed: of the noise.
     """
 
     width: float = 1e-2
@@ -367,42 +367,30 @@ class RandomizedSmoothing(BallMethod):
                 f"width is {self.width} and samples {self.samples}",
                 remedy="Choose a width above 0 and at least 2 samples.",
             )
-        at, start = origin(problem, names), start_of(problem)
-        sizes = {
-            name: float(np.max(np.abs(getattr(problem, name)))) if name in START else abs(float(at[name]))
-            for name in names
-        }
-        widths = {name: self.width * (size or 1.0) for name, size in sizes.items()}
-        noise = np.asarray(
-            jax.random.normal(jax.random.key(self.seed), (self.samples, len(names)), jnp.float64)
-        )
-        shifts = {name: noise[:, column] * widths[name] for column, name in enumerate(names)}
-        both = {name: np.concatenate([shift, -shift]) for name, shift in shifts.items()}
-        values = {name: np.asarray(at[name], np.float64) + both[name] for name in names}
-        losses = np.asarray(
-            _many(
-                {name: jnp.asarray(value).astype(at[name].dtype) for name, value in values.items()},
-                problem.world, *start, problem.steps, problem.loss,
-            ),
-            np.float64,
-        )  # fmt: skip
+        at = problem.origin(names)
+        widths = {name: self.width * size for name, size in _sizes(problem, names).items()}
+        shape = (self.samples, len(names))
+        noise = np.asarray(jax.random.normal(jax.random.key(self.seed), shape, jnp.float64))
+        values = {}
+        for column, name in enumerate(names):
+            shift = noise[:, column] * widths[name]
+            moved = np.asarray(at[name], np.float64) + np.concatenate([shift, -shift])
+            values[name] = jnp.asarray(moved).astype(at[name].dtype)
+        losses = np.asarray(_many(values, problem.bare, problem.world, *problem.start_arrays), np.float64)
         half = (losses[: self.samples] - losses[self.samples :]) / 2
         slopes, errors = {}, {}
         for column, name in enumerate(names):
             each = half * noise[:, column] / widths[name]
             slopes[name] = float(np.mean(each))
             errors[name] = float(np.std(each, ddof=1) / np.sqrt(self.samples))
-        depends, why = used(problem, names, slopes)
+        use = used(problem, names, slopes)
         for name in names:
-            if np.any(half) and not depends[name]:
-                depends[name], why[name] = (
-                    True,
-                    f"the loss jumps with {name}, which the run itself did not use",
-                )
+            if np.any(half) and not use[name].depends:
+                use[name] = Use(True, f"the loss jumps with {name}, which the run itself did not use")
         details = {"standard_error": errors, "width": widths, "samples": self.samples, "seed": self.seed}
-        return self.result(float(np.mean(losses)), slopes, Used(depends, why), details)
+        return self.result(float(np.mean(losses)), slopes, use, details)
 
 
 @eqx.filter_jit
-def _many(values, world, y0, v0, steps, loss):
-    return jax.vmap(lambda one: moved_loss(one, world, y0, v0, None, steps, loss))(values)
+def _many(values, bare, world, y0, v0):
+    return jax.vmap(lambda one: loss_at(bare, world, y0, v0, one, None, shifts=True))(values)

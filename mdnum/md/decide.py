@@ -90,10 +90,9 @@ class PairDecider:
         """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
 
         The exact margin is that of the state's positions in the system's own box and against its own
-        threshold, both doubles: narrowing any of them is rounding like any other (error analysis:
-        precision.bounds). Evaluated a thousandth beyond r_cut, it holds for every pair up to there; a pair
-        that is further away is decided rightly, or its computed margin is within the bound. It is that of
-        atoms within the reach; where they may have left it, ask `bounds_at`.
+        threshold, both doubles (error analysis: numerics.rounding). Evaluated a thousandth beyond r_cut, it
+        holds for every pair up to there; one further away is decided rightly, or its margin is within the
+        bound. It is that of atoms within the reach; where they may have left it, ask `bounds_at`.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -248,8 +247,18 @@ class SlotJudge:
             nearest = jnp.minimum(nearest, margin[k])
         return bits, nearest
 
-    @staticmethod
-    def finish(nearest, halves) -> Decisions:
+    def decide(self, tables: Tables) -> Decisions:
+        """The decisions of a whole list, without forces."""
+
+        def block(nearest, listed):
+            _, quantity, inside, threshold = self.group(*listed)
+            bits, nearest = self.tally(nearest, quantity, inside, threshold)
+            return nearest, bits
+
+        nearest, halves = lax.scan(block, self.start(), tables.groups())
+        return self.finish(nearest, halves)
+
+    def finish(self, nearest, halves) -> Decisions:
         """The pass's decisions, two groups to a byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
@@ -257,18 +266,3 @@ class SlotJudge:
 def displacements(components, cell: Cell, j):
     """Nearest images of x_j - x_i, per component; indices of padding are clamped into range by XLA."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
-
-
-def decide_table(
-    decider: PairDecider, cell: Cell, zero: jax.Array, positions: Float[Array, "3 atoms"], tables: Tables
-) -> Decisions:
-    """The decisions of a whole list at given positions, without forces."""
-    judge = SlotJudge(decider, cell, zero, positions)
-
-    def block(nearest, listed):
-        _, quantity, inside, threshold = judge.group(*listed)
-        bits, nearest = judge.tally(nearest, quantity, inside, threshold)
-        return nearest, bits
-
-    nearest, halves = lax.scan(block, judge.start(), tables.groups())
-    return judge.finish(nearest, halves)

@@ -1,4 +1,4 @@
-"""Minimum-image displacement in real coordinates, orthorhombic or triclinic, periodic per axis."""
+"""The one door to jax-md: displacement, neighbor lists, pair search and FIRE, with its traps held off."""
 
 from __future__ import annotations
 
@@ -13,28 +13,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 import mdnum.numerics  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import CapacityError, InputError, NumericalError
-from mdnum.md.cell import complete
+from mdnum.md.cell import Cell, complete
+
+if TYPE_CHECKING:
+    from jax_md.partition import NeighborList
+else:
+    # annotations are looked at when the tests run, and must not cost the import
+    NeighborList = Any
 
 Displacement = Callable[..., Array]
-
-
-def widths(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Perpendicular widths of the cell along each axis, infinite where it is not periodic.
-
-    Raises:
-        InputError: the periodic vectors do not span a volume.
-    """
-    full = complete(cell, pbc)
-    volume = abs(np.linalg.det(full))
-    if not np.isfinite(volume) or volume < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
-        raise InputError(
-            "the periodic cell vectors are linearly dependent", remedy="give three independent vectors"
-        )
-    return np.where(np.asarray(pbc, bool), 1.0 / np.linalg.norm(np.linalg.inv(full), axis=0), np.inf)
+Format = Literal["dense", "sparse", "ordered-sparse"]
 
 
 def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
@@ -106,29 +98,6 @@ def neighbor_vectors(
     return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
 
 
-# --- the one door to jax-md: displacement, neighbor lists and pair search, with its traps held off ----
-
-if TYPE_CHECKING:
-    from jax_md.partition import NeighborList
-else:
-    # annotations are looked at when the tests run, and must not cost the import
-    NeighborList = Any
-
-__all__ = [
-    "Displacement",
-    "Format",
-    "NeighborList",
-    "PairSearch",
-    "as_neighbor_list",
-    "dense_pairs",
-    "displacement",
-    "scalar",
-    "standard_promotion",
-    "upstream",
-]
-
-Format = Literal["dense", "sparse", "ordered-sparse"]
-
 # jax-md keeps the box of a list in float32, so its cells can come out 6e-8 too small and lose pairs that
 # span one; searching a little further and filtering in float64 makes the result exact
 _SEARCH_MARGIN = 1e-6
@@ -177,23 +146,16 @@ def as_neighbor_list(
     idx_dense: Int[Array, "atoms slots"] | np.ndarray,
     reference_position: Float[Array, "atoms 3"] | np.ndarray,
     format: Format = "dense",
-    *,
-    capacity: int | None = None,
 ) -> NeighborList:
     """jax-md's NeighborList around a list that somebody else built, so that any jax-md energy runs on it.
 
-    Works inside jit as well, where padding stays where it is; host arrays are packed to the front, as
-    jax-md does it.
+    Works inside jit as well; padding stays where it is.
 
     Args:
         idx_dense: neighbors of each atom, both directions, padded with the number of atoms. Entries that
             name the atom itself become padding: jax-md's EAM would count them as density at r = 0.
         reference_position: positions at which the list was built, length.
-        format: dense (atoms, slots); sparse (2, capacity), both directions; ordered-sparse, each pair once.
-        capacity: slots of a sparse list; as many as the dense one has if not given.
-
-    Raises:
-        CapacityError: a sparse list would not fit its capacity (host arrays only).
+        format: dense (atoms, slots); sparse (2, atoms slots), both ways; ordered-sparse, each pair once.
     """
     partition = upstream().partition
     formats = {
@@ -203,32 +165,18 @@ def as_neighbor_list(
     }
     if format not in formats:
         raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(formats)}")
-    on_host = isinstance(idx_dense, np.ndarray)
-    xp: Any = np if on_host else jnp
-    atoms, slots = idx_dense.shape
-    own = xp.arange(atoms, dtype=np.int32)[:, None]
-    idx = xp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(np.int32)
+    atoms = idx_dense.shape[0]
+    own = jnp.arange(atoms, dtype=jnp.int32)[:, None]
+    idx = jnp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(jnp.int32)
     if format != "dense":
         receiver = idx.reshape(-1)
-        sender = xp.broadcast_to(own, idx.shape).reshape(-1)
+        sender = jnp.broadcast_to(own, idx.shape).reshape(-1)
         real = receiver < atoms
         if format == "ordered-sparse":
             real = real & (receiver < sender)
-        idx = xp.stack([xp.where(real, receiver, atoms), xp.where(real, sender, atoms)]).astype(np.int32)
-        if on_host:
-            room = atoms * slots if capacity is None else capacity
-            count = int(real.sum())
-            if count > room:
-                raise CapacityError(
-                    f"{count} neighbors in a list with {room} slots", remedy="give the list a larger capacity"
-                )
-            packed = np.full((2, room), atoms, np.int32)
-            packed[:, :count] = idx[:, real]
-            idx = packed
-        elif capacity is not None and capacity < atoms * slots:
-            raise InputError("a list built inside jit cannot be packed", remedy="leave capacity out")
+        idx = jnp.stack([jnp.where(real, receiver, atoms), jnp.where(real, sender, atoms)]).astype(jnp.int32)
     return partition.NeighborList(
-        idx=jnp.asarray(idx),
+        idx=idx,
         reference_position=jnp.asarray(reference_position),
         error=partition.PartitionError(jnp.zeros((), jnp.uint8)),
         cell_list_capacity=None,
@@ -262,10 +210,9 @@ class PairSearch:
         cell: Float[np.ndarray, "3 3"],
         pbc: tuple[bool, bool, bool],
         r_list: float,
-        *,
         capacity_multiplier: float = 1.25,
     ):
-        narrowest = float(np.min(widths(cell, np.asarray(pbc))))
+        narrowest = float(np.min(Cell.create(cell, pbc).widths))
         # a hair beyond half the width is the room that callers add for rounding, not another image
         if not 0 < r_list <= narrowest / 2 * (1 + 1e-9):
             raise InputError(
@@ -361,18 +308,15 @@ def dense_pairs(
     cell: Float[np.ndarray, "3 3"],
     pbc: tuple[bool, bool, bool],
     r_list: float,
-    *,
-    capacity_multiplier: float = 1.25,
 ) -> Int[np.ndarray, "atoms slots"]:
     """Neighbors within r_list found by jax-md; as PairSearch, whose last few compiled searches are kept."""
     rows = np.ascontiguousarray(cell, np.float64)
-    return _kept_search(rows.tobytes(), pbc, float(r_list), capacity_multiplier)(np.asarray(positions))
+    return _kept_search(rows.tobytes(), pbc, float(r_list))(np.asarray(positions))
 
 
 @lru_cache(maxsize=4)
-def _kept_search(rows: bytes, pbc: tuple[bool, bool, bool], r_list: float, multiplier: float) -> PairSearch:
-    cell = np.frombuffer(rows, np.float64).reshape(3, 3)
-    return PairSearch(cell, pbc, r_list, capacity_multiplier=multiplier)
+def _kept_search(rows: bytes, pbc: tuple[bool, bool, bool], r_list: float) -> PairSearch:
+    return PairSearch(np.frombuffer(rows, np.float64).reshape(3, 3), pbc, r_list)
 
 
 # --- going downhill to the nearest minimum with jax-md's FIRE, for preparing systems ------------------

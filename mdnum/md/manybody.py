@@ -1,11 +1,12 @@
-"""What every many-body potential offers: an energy over a neighbor list, and what follows from it."""
+"""Many-body potentials: an energy over a neighbor list, and what follows from it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,41 +34,31 @@ class Smoothness:
     force_jump: float
 
 
-class Described(Protocol):
-    """The attributes of every potential here, beside the methods of ManyBody.
-
-    A protocol and not abstract fields, because some are computed from the constants.
-
-    Attributes:
-        name: as in a system file.
-        r_cut: longest interaction radius, length.
-        format: the neighbor list format that energy takes.
-        pbc: which axes are periodic.
-        smoothness: at r_cut.
-        sources: papers of the form and its constants.
-    """
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def r_cut(self) -> float: ...
-    @property
-    def format(self) -> Format: ...
-    @property
-    def pbc(self) -> tuple[bool, bool, bool]: ...
-    @property
-    def smoothness(self) -> Smoothness: ...
-    @property
-    def sources(self) -> tuple[str, ...]: ...
+#: Nothing is promised.
+_UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 
 
 class ManyBody(eqx.Module):
-    """A potential whose energy is not a sum over pairs; it has the attributes of Described.
+    """A potential whose energy is not a sum over pairs.
 
-    Decisions are made outside: the list handed in holds the pairs that count, and an entry replaced by the
+    Decisions are made outside: the list given holds the pairs that count, and an entry replaced by the
     number of atoms is a pair that does not. Every potential also tests r < r_cut itself, so that a list with
     a skin gives the same energy.
+
+    Attributes:
+        pbc: which axes are periodic.
+        name: as in a system file.
+        format: the neighbor list format that energy takes.
+        smoothness: at r_cut.
+        sources: papers of the form and its constants.
+        r_cut: longest interaction radius, length; a field, or computed from the constants.
     """
+
+    pbc: tuple[bool, bool, bool] = eqx.field(static=True, kw_only=True, default=(True, True, True))
+    name: str = eqx.field(static=True, kw_only=True, default="")
+    format: Format = eqx.field(static=True, kw_only=True, default="dense")
+    smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=_UNKNOWN)
+    sources: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
 
     def energy(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
@@ -110,12 +101,11 @@ class ManyBody(eqx.Module):
 
 # --- stillinger and Weber's silicon, through jax-md's energy function ---------------------------------
 
-# jax_md.quantity adds 1e-7 to both lengths before it divides by them, which bends every cosine by 1e-7 and
-# the forces of rattled silicon by 3e-7. The 1e-7 is a length, so it shrinks with the unit of length: in
-# units of 2^-24 Å it is 6e-15 Å, below rounding, and a power of two costs no digit anywhere else. (Not
-# more: jax-md also takes two neighbors closer than 1e-5 of that unit for one.) In float32 the offset is
-# about one rounding, and 2^4 puts it below.
-_UNIT = {"float64": 2.0**24, "float32": 2.0**4}
+# jax_md.quantity adds a length of 1e-7 to both lengths before it divides by them, which bends every cosine by
+# 1e-7 and the forces of rattled silicon by 3e-7. In units of 2^-24 Å it is 6e-15 Å, below rounding, and a
+# power of two costs no digit. (Not more: jax-md also takes two neighbors closer than 1e-5 of that unit for
+# one.)
+_UNIT = 2.0**24
 
 
 class StillingerWeber(ManyBody):
@@ -142,12 +132,10 @@ class StillingerWeber(ManyBody):
     B: float = eqx.field(static=True, default=0.6022245584)
     strength: float = eqx.field(static=True, default=21.0)
     gamma: float = eqx.field(static=True, default=1.20)
-    pbc: tuple[bool, bool, bool] = eqx.field(static=True, default=(True, True, True))
-    name: str = eqx.field(static=True, default="stillinger-weber")
-    format: Format = eqx.field(static=True, default="dense")
-    smoothness: Smoothness = eqx.field(static=True, default=Smoothness(math.inf, 0.0, 0.0))
+    name: str = eqx.field(static=True, kw_only=True, default="stillinger-weber")
+    smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=Smoothness(math.inf, 0.0, 0.0))
     sources: tuple[str, ...] = eqx.field(
-        static=True, default=("F. H. Stillinger and T. A. Weber, Phys. Rev. B 31, 5262 (1985)",)
+        static=True, kw_only=True, default=("F. H. Stillinger and T. A. Weber, Phys. Rev. B 31, 5262 (1985)",)
     )
 
     @property
@@ -155,30 +143,26 @@ class StillingerWeber(ManyBody):
         """a sigma, length."""
         return self.a * self.sigma
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, energy units of epsilon; see ManyBody.energy."""
-        unit = _UNIT[str(jnp.dtype(positions.dtype))]
+    def energy(self, positions, neighbor, cell):
         vector = displacement(cell, self.pbc)
 
         def apart(Ra, Rb, **_):
             # a padded slot may be the atom itself; at distance zero jax-md's derivatives by sigma, A and B
             # are NaN, and its mask comes after
-            d = vector(Ra, Rb) * unit
-            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * unit, d)
+            d = vector(Ra, Rb) * _UNIT
+            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * _UNIT, d)
 
         # numbers stay Python floats here: nothing on this path downcasts them, and they take R's dtype
         _, total = upstream().energy.stillinger_weber_neighbor_list(
             apart,
             1.0,
-            sigma=self.sigma * unit,
+            sigma=self.sigma * _UNIT,
             A=self.A,
             B=self.B,
             lam=self.strength,
             gamma=self.gamma,
             epsilon=self.epsilon,
-            cutoff=self.r_cut * unit,
+            cutoff=self.r_cut * _UNIT,
             neighbor_list_fn=lambda *_, **__: None,
         )
         # jax-md mixes dtypes; the result has the dtype of the positions all the same
@@ -225,12 +209,10 @@ class Tersoff(ManyBody):
     gamma: float = eqx.field(static=True, default=1.0)
     R: float = eqx.field(static=True, default=2.85)
     D: float = eqx.field(static=True, default=0.15)
-    pbc: tuple[bool, bool, bool] = eqx.field(static=True, default=(True, True, True))
-    name: str = eqx.field(static=True, default="tersoff")
-    format: Format = eqx.field(static=True, default="dense")
-    smoothness: Smoothness = eqx.field(static=True, default=Smoothness(1, 0.0, 0.0))
+    name: str = eqx.field(static=True, kw_only=True, default="tersoff")
+    smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=Smoothness(1, 0.0, 0.0))
     sources: tuple[str, ...] = eqx.field(
-        static=True, default=("J. Tersoff, Phys. Rev. B 38, 9902 (1988), set Si(C)",)
+        static=True, kw_only=True, default=("J. Tersoff, Phys. Rev. B 38, 9902 (1988), set Si(C)",)
     )
 
     def __post_init__(self) -> None:
@@ -248,10 +230,7 @@ class Tersoff(ManyBody):
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, eV for the default constants; see ManyBody.energy."""
+    def energy(self, positions, neighbor, cell):
         idx = neighbor.idx
         vectors = neighbor_vectors(positions, idx, cell, self.pbc)
         # the argument is masked, not the result: a padded slot gets a harmless vector before any root
@@ -286,83 +265,34 @@ class Tersoff(ManyBody):
         return 0.5 * jnp.sum(weight * (repulsion - order * attraction))
 
 
-def silicon_1989(pbc: tuple[bool, bool, bool] = (True, True, True)) -> Tersoff:
-    """Silicon of the multicomponent paper: lambda3 = 0 and three constants rounded otherwise.
+# --- any energy function over a neighbor list, jax-md's too -------------------------------------------
 
-    Source: Tersoff, Phys. Rev. B 39, 5566 (1989), table I.
+
+class EnergyFunction(ManyBody):
+    """An energy with parameters in any pytree, over a neighbor list of jax-md.
+
+    Attributes:
+        parameters: a pytree of arrays; each is a parameter `potential.parameters...` by its path.
+        function: (parameters, positions (atoms, 3), neighbor, cell (3, 3)) to energy, length and energy units
+            of the system. It must test r < r_cut itself.
     """
-    return Tersoff(
-        lambda3=0.0,
-        beta=1.1000e-6,
-        d=16.217,
-        h=-0.59825,
-        pbc=pbc,
-        sources=("J. Tersoff, Phys. Rev. B 39, 5566 (1989), silicon",),
-    )
 
-
-# --- any jax-md energy function over a neighbor list, as a many-body potential ------------------------
-
-
-class Wrapped(ManyBody):
-    """A jax-md energy function with the attributes that mdnum needs beside it."""
-
-    energy_fn: Callable[..., Array] = eqx.field(static=True)
+    parameters: Any
+    function: Callable[..., Array] = eqx.field(static=True)
     r_cut: float = eqx.field(static=True)
-    format: Format = eqx.field(static=True)
-    pbc: tuple[bool, bool, bool] = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    smoothness: Smoothness = eqx.field(static=True)
-    sources: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True, kw_only=True, default="energy function")
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, in the units of the function wrapped; see ManyBody.energy."""
-        return self.energy_fn(positions, neighbor, cell=cell)
-
-    def check_cell(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> None:
-        """Raise if the function does not follow the cell it is given.
-
-        jax_md.space's own displacements swallow the keyword and keep the box they were made with: energies
-        look right and stresses are silently wrong. Shifting one atom by a lattice vector of a slightly
-        larger cell must not change the energy in that cell.
-
-        Raises:
-            InputError: it does not.
-        """
-        larger = cell * 1.03125
-        axis = next((axis for axis in range(3) if self.pbc[axis]), None)
-        if axis is None:
-            return
-        points = np.asarray(positions)
-        moved = points.copy()
-        moved[0] += np.asarray(larger)[axis]
-        here = float(self.energy(jnp.asarray(points), neighbor, larger))
-        there = float(self.energy(jnp.asarray(moved), neighbor, larger))
-        if not abs(here - there) <= 1e-6 * max(abs(here), 1.0):
-            raise InputError(
-                f"{self.name}: the energy function ignores the cell it is given (a move by a lattice vector "
-                f"changes the energy from {here:g} to {there:g})",
-                remedy="build it on mdnum.md.jaxmd.displacement instead of a space of jax_md.space",
-            )
+    def energy(self, positions, neighbor, cell):
+        return self.function(self.parameters, positions, neighbor, cell)
 
 
 def from_jax_md(
-    energy_fn: Callable[..., Array],
-    r_cut: float,
-    format: Format = "dense",
-    *,
-    pbc: tuple[bool, bool, bool] = (True, True, True),
-    name: str = "jax-md",
-    smoothness: Smoothness | None = None,
-    sources: tuple[str, ...] = (),
-) -> Wrapped:
+    energy_fn: Callable[..., Array], r_cut: float, format: Format = "dense", **declared: Any
+) -> EnergyFunction:
     """Wrap a jax-md energy function `energy_fn(positions, neighbor, cell=...)`.
 
-    Build it on `mdnum.md.jaxmd.displacement(cell, pbc)` and hand its constants in as
+    Build it on `mdnum.md.jaxmd.displacement(cell, pbc)` (a space of jax_md.space ignores the cell it is
+    given: energies look right, stresses are silently wrong) and hand its constants in as
     `mdnum.md.jaxmd.scalar(...)`: anything else becomes float32 in silence. The function must test r < r_cut
     itself, or its energy depends on when the list was built.
 
@@ -370,36 +300,40 @@ def from_jax_md(
         energy_fn: the second of the pair that jax-md's `*_neighbor_list` functions return.
         r_cut: longest interaction radius, length.
         format: neighbor list format that it takes.
-        smoothness: at r_cut; if not given, nothing is promised (order -1, jumps unknown: NaN).
+        declared: other attributes of ManyBody; of a smoothness not given nothing is promised.
     """
     if not (np.isfinite(r_cut) and r_cut > 0):
         raise InputError(f"an interaction radius above 0 is needed; got {r_cut}")
-    unknown = Smoothness(-1, float("nan"), float("nan"))
-    return Wrapped(
-        energy_fn=jax.named_call(energy_fn, name=name),
-        r_cut=float(r_cut),
-        format=format,
-        pbc=pbc,
-        name=name,
-        smoothness=unknown if smoothness is None else smoothness,
-        sources=sources,
-    )
+    declared = {"name": "jax-md"} | declared
+    named = jax.named_call(energy_fn, name=declared["name"])
+    function = lambda _, positions, neighbor, cell: named(positions, neighbor, cell=cell)  # noqa: E731
+    return EnergyFunction((), function, float(r_cut), format=format, **declared)
 
 
-# --- potentials that are no sum over pairs: Stillinger-Weber, Tersoff, embedded atom ------------------
+# --- named sets of constants: a system file's `parameters` --------------------------------------------
 
 _PERIODIC = (True, True, True)
+_STILLINGER_WEBER: dict[str, dict[str, Any]] = {"Si": {}}
+_TERSOFF: dict[str, dict[str, Any]] = {
+    "Si": {},
+    # silicon of the multicomponent paper: lambda3 = 0 and three constants rounded otherwise
+    "Si-1989": {
+        "lambda3": 0.0,
+        "beta": 1.1000e-6,
+        "d": 16.217,
+        "h": -0.59825,
+        "sources": ("J. Tersoff, Phys. Rev. B 39, 5566 (1989), table I, silicon",),
+    },
+}
 
 
 def stillinger_weber(parameters: str = "Si", pbc: tuple[bool, bool, bool] = _PERIODIC) -> StillingerWeber:
-    """Stillinger-Weber with a named set of constants (a system file's `parameters`).
+    """Stillinger-Weber with a named set of constants.
 
     Raises:
         InputError: no such set.
     """
-    if parameters != "Si":
-        raise InputError(f"no Stillinger-Weber constants called {parameters!r}; known is Si")
-    return StillingerWeber(pbc=pbc)
+    return StillingerWeber(**_constants("Stillinger-Weber", _STILLINGER_WEBER, parameters), pbc=pbc)
 
 
 def tersoff(parameters: str = "Si", pbc: tuple[bool, bool, bool] = _PERIODIC) -> Tersoff:
@@ -408,8 +342,249 @@ def tersoff(parameters: str = "Si", pbc: tuple[bool, bool, bool] = _PERIODIC) ->
     Raises:
         InputError: no such set.
     """
-    if parameters == "Si":
-        return Tersoff(pbc=pbc)
-    if parameters == "Si-1989":
-        return silicon_1989(pbc)
-    raise InputError(f"no Tersoff constants called {parameters!r}; known are Si and Si-1989")
+    return Tersoff(**_constants("Tersoff", _TERSOFF, parameters), pbc=pbc)
+
+
+def _constants(noun: str, sets: dict[str, dict[str, Any]], name: str) -> dict[str, Any]:
+    if name not in sets:
+        are = "are" if len(sets) > 1 else "is"
+        raise InputError(f"no {noun} constants called {name!r}; known {are} {' and '.join(sets)}")
+    return sets[name]
+
+
+# --- the embedded-atom method from a single-element setfl table (.eam.alloy), every digit of it ---------
+
+
+@dataclass(frozen=True)
+class Setfl:
+    """An embedded-atom table as the file has it.
+
+    Attributes:
+        element: chemical symbol.
+        comment: the three lines at the head of the file.
+        drho, dr: grid spacings of the density and of the distance (length).
+        r_cut: cutoff, length.
+        embedding: F on 0, drho, 2 drho, ...; energy.
+        density: rho on 0, dr, 2 dr, ...
+        r_pair: r phi(r) on 0, dr, 2 dr, ...; length times energy.
+    """
+
+    element: str
+    comment: tuple[str, ...]
+    drho: float
+    dr: float
+    r_cut: float
+    embedding: Float[np.ndarray, "densities"]
+    density: Float[np.ndarray, "radii"]
+    r_pair: Float[np.ndarray, "radii"]
+
+
+def read_setfl(path: Path) -> Setfl:
+    """Read a table; numbers may be broken into lines in any way, and keep every digit.
+
+    jax-md's own reader rounds everything to float32, which costs the forces of copper 4e-4 eV/Å.
+
+    Raises:
+        InputError: unreadable, not a setfl table, more than one element, numbers that are missing, left
+            over or not finite, or a table that ends before its cutoff.
+
+    Source: the DYNAMO setfl format as LAMMPS documents it (pair_style eam/alloy).
+    """
+    where = str(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise InputError("no such potential table", where=where, remedy="Correct potential.file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the potential table cannot be read ({error})", where=where) from error
+    try:
+        count, *elements = lines[3].split()
+        if int(count) != len(elements):
+            raise ValueError(f"{count} elements announced, {len(elements)} named")
+        first, drho, second, dr, r_cut = (float(word) for word in lines[4].split())
+        n_rho, n_r = int(first), int(second)
+    except (IndexError, ValueError) as error:
+        raise InputError(
+            f"this is no setfl table: lines 4 and 5 should name the elements and the grids ({error})",
+            where=where,
+            remedy="Give a file in LAMMPS's eam/alloy format",
+        ) from error
+    if len(elements) != 1:
+        raise InputError(
+            f"a table for {len(elements)} elements ({', '.join(elements)}); one is supported",
+            where=where,
+            remedy="Give a table of a single element",
+        )
+    # the line of the element: atomic number, mass, lattice constant, lattice; not needed
+    words = " ".join(lines[6:]).split()
+    expected = n_rho + 2 * n_r
+    if len(words) != expected:
+        raise InputError(f"{len(words)} numbers after the element's line, expected {expected}", where=where)
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(f"a number of the table cannot be read ({error})", where=where) from error
+    if not np.isfinite(numbers).all() or min(drho, dr, r_cut) <= 0 or min(n_rho, n_r) < 5:
+        raise InputError("the table has numbers that are not finite, or grids that are empty", where=where)
+    # many files end one step before their cutoff: the last cubic is carried on, as ASE does it
+    if r_cut > n_r * dr * (1 + 1e-9):
+        raise InputError(
+            f"the table ends at {(n_r - 1) * dr:g}, its cutoff is {r_cut:g}",
+            where=where,
+            remedy="Lower the cutoff in line 5 or extend the table",
+        )
+    embedding, density, r_pair = np.split(numbers, [n_rho, n_rho + n_r])
+    return Setfl(elements[0], tuple(lines[:3]), drho, dr, r_cut, embedding, density, r_pair)
+
+
+# --- A cubic spline on an even grid, with the coefficients of scipy and the evaluation of jax ---------
+
+
+class Spline(eqx.Module):
+    """Piecewise cubic through a table, twice continuously differentiable ("not-a-knot" ends).
+
+    The interpolant of scipy's InterpolatedUnivariateSpline(k=3), hence of ASE's EAM. Outside the table the
+    first and last cubic are carried on; see `inside`.
+
+    Attributes:
+        coefficients: of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals).
+        start, step: of the grid.
+        intervals: how many.
+    """
+
+    coefficients: Float[Array, "4 intervals"]
+    start: float = eqx.field(static=True)
+    step: float = eqx.field(static=True)
+    intervals: int = eqx.field(static=True)
+
+    @classmethod
+    def through(cls, values: Float[np.ndarray, "points"], step: float, start: float = 0.0) -> Spline:
+        """The spline through values at start, start + step, ..."""
+        from scipy.interpolate import CubicSpline
+
+        # fitted on the whole numbers: knots like i * step are rounded, and their differences more so
+        fitted = CubicSpline(np.arange(len(values), dtype=np.float64), values, bc_type="not-a-knot")
+        powers = np.asarray(step, np.float64) ** np.arange(4)[:, None]
+        return cls(jnp.asarray(fitted.c[::-1] / powers), float(start), float(step), len(values) - 1)
+
+    @property
+    def end(self) -> float:
+        """The last point of the table."""
+        return self.start + self.intervals * self.step
+
+    def __call__(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Value at x; differentiable."""
+        offset = x - self.start
+        which = jnp.clip(jnp.floor(offset / self.step), 0, self.intervals - 1)
+        t = offset - which * self.step
+        c0, c1, c2, c3 = self.coefficients.astype(x.dtype)[:, which.astype(jnp.int32)]
+        return c0 + t * (c1 + t * (c2 + t * c3))
+
+    def inside(self, x: Float[Array, "..."]) -> Array:
+        """Whether x lies on the table, a rounding's breadth included."""
+        slack = 1e-9 * self.step
+        return (x >= self.start - slack) & (x <= self.end + slack)
+
+
+# --- the embedded-atom method from a table, through jax-md's energy function and float64 splines ------
+
+
+class EmbeddedAtom(ManyBody):
+    """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
+
+    jax-md's sums are right once it gets a list without self entries; its own list has them and counts every
+    atom's density at r = 0, and its splines round the table to float32 and return 0 beyond it.
+
+    Attributes:
+        pair, density, embedding: phi, density and F as splines.
+
+    Error: a density off the embedding table makes the energy NaN, forces too. The spline's own error against
+    the form it tabulates is the table's, not counted here.
+
+    Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984); checked against ase.calculators.eam and a plain
+    evaluation in extended precision (tests/oracles_manybody.py).
+    """
+
+    pair: Spline
+    density: Spline
+    embedding: Spline
+    r_cut: float = eqx.field(static=True)
+    name: str = eqx.field(static=True, kw_only=True, default="eam")
+
+    def charge(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Density of an atom at distance r; 0 at r = 0 (the atom itself) and from r_cut on."""
+        counts = (r > 0) & (r < self.r_cut)
+        return jnp.where(counts, self.density(jnp.where(counts, r, 1.0)), 0.0)
+
+    def phi(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Pair energy at distance r; 0 at r = 0 and from r_cut on."""
+        counts = (r > 0) & (r < self.r_cut)
+        return jnp.where(counts, self.pair(jnp.where(counts, r, 1.0)), 0.0)
+
+    def embed(self, rho: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Energy of an atom in a density; NaN off the table."""
+        # a factor and not a selection: it makes the slope NaN too, and forces with it
+        on = self.embedding.inside(rho)
+        return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))
+
+    def energy(self, positions, neighbor, cell):
+        _, total = upstream().energy.eam_neighbor_list(
+            displacement(cell, self.pbc),
+            1.0,
+            charge_fn=self.charge,
+            embedding_fn=self.embed,
+            pairwise_fn=self.phi,
+            cutoff=self.r_cut,
+            neighbor_list_fn=lambda *_, **__: None,
+        )
+        # jax-md mixes dtypes; the result has the dtype of the positions all the same
+        with standard_promotion():
+            return total(positions, neighbor)
+
+
+def embedded_atom(
+    path: Path | str, symbols: Sequence[str] | None = None, pbc: tuple[bool, bool, bool] = (True, True, True)
+) -> EmbeddedAtom:
+    """The embedded-atom potential of a setfl table.
+
+    Args:
+        path: a single-element .eam.alloy file.
+        symbols: of the atoms, to be compared with the table's element.
+
+    Raises:
+        InputError: the file is no such table, or it is for another element.
+    """
+    table = read_setfl(Path(path))
+    others = sorted(set(symbols or ()) - {table.element})
+    if others:
+        raise InputError(
+            f"a table for {table.element}, but the structure holds {', '.join(others)}",
+            where=str(path),
+            remedy="Correct the structure or potential.file",
+        )
+    r = table.dr * np.arange(len(table.r_pair))
+    # the file holds r phi: phi at r = 0 is unknown, so its spline starts one step later, as ASE's does
+    pair = Spline.through(table.r_pair[1:] / r[1:], table.dr, start=table.dr)
+    density = Spline.through(table.density, table.dr)
+    embedding = Spline.through(table.embedding, table.drho)
+    return EmbeddedAtom(
+        pair,
+        density,
+        embedding,
+        table.r_cut,
+        smoothness=_smoothness(table, pair, density, embedding),
+        sources=tuple(line for line in table.comment if line.strip()),
+        pbc=pbc,
+    )
+
+
+def _smoothness(table: Setfl, pair: Spline, density: Spline, embedding: Spline) -> Smoothness:
+    """Jumps at r_cut, at most: a crossing changes one pair term and the densities of two atoms."""
+    at = jnp.asarray(table.r_cut)
+    grid = jnp.asarray(table.drho * np.arange(len(table.embedding)))
+    steepest = float(jnp.max(jnp.abs(jax.vmap(jax.grad(embedding))(grid))))
+    energy = abs(float(pair(at))) + 2 * steepest * abs(float(density(at)))
+    force = abs(float(jax.grad(pair)(at))) + 2 * steepest * abs(float(jax.grad(density)(at)))
+    # a cubic spline has a second derivative to lose, and a jump below 1e-6 is a table's rounding
+    order = -1 if energy > 1e-6 else 0 if force > 1e-6 else 1
+    return Smoothness(order, energy, force)

@@ -8,6 +8,7 @@ over the whole (slots, atoms) array takes twice the time at 4,000 atoms and ten 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +26,6 @@ from mdnum.md.decide import (
     PairDecider,
     SlotJudge,
     Tables,
-    decide_table,
     displacements,
     halves_of,
     unpacked,
@@ -86,9 +86,9 @@ class PairForce(eqx.Module):
         )
 
     @property
-    def law(self) -> CutPotential | _Rounded:
+    def law(self) -> CutPotential | Guarded:
         """The potential as the policy computes it: in sixteen bits it is rounded after every operation."""
-        return _Rounded(self.model, self.zero) if self._short else self.model
+        return Guarded(self.model, self.zero, rounded) if self._short else self.model
 
     @property
     def _short(self) -> bool:
@@ -101,7 +101,7 @@ class PairForce(eqx.Module):
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions, without forces."""
-        return decide_table(self.decider, self.cell, self.zero, positions, tables)
+        return SlotJudge(self.decider, self.cell, self.zero, positions).decide(tables)
 
     def __call__(
         self,
@@ -187,12 +187,11 @@ class PairForce(eqx.Module):
             r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), geometry))
             slope = law.evaluate(self._in_force_dtype(r2), types, at)[1]
             slope = jnp.where(inside, slope, 0).astype(geometry)
-            sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in _VOIGT]
+            sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in VOIGT]
             return tuple(total + q for total, q in zip(totals, sums, strict=True)), None
 
         totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
-        xx, yy, zz, yz, xz, xy = (-jnp.sum(total, dtype=jnp.float64) for total in totals)
-        return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+        return symmetric(-jnp.sum(total, dtype=jnp.float64) for total in totals)
 
 
 def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
@@ -205,20 +204,29 @@ def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> B
     return inside ^ ((told[None, :] >> shift) & jnp.uint8(1) == 1)
 
 
-class _Rounded(eqx.Module):
-    """A cut potential whose results are rounded after every operation."""
+class Guarded(eqx.Module):
+    """A cut potential whose functions `how` changes: rounded after every operation, or reproducible."""
 
     model: CutPotential
     zero: Int[Array, ""]
+    how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        return rounded(self.model.at_cutoff, self.zero)()
+        """As the potential's."""
+        return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        return rounded(self.model.evaluate, self.zero)(r2, types, at)
+        """As the potential's."""
+        return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 
-_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
+    """The matrix of six components in Voigt's order."""
+    xx, yy, zz, yz, xz, xy = components
+    return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
 
 # --- the general path: any energy function over a neighbor list, told which pairs are inside ----------
@@ -247,7 +255,7 @@ class ManyBodyForce(eqx.Module):
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions."""
-        return decide_table(self.decider, self.cell, self.zero, positions, tables)
+        return SlotJudge(self.decider, self.cell, self.zero, positions).decide(tables)
 
     def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
         """Forces at wrapped positions; as PairForce, the whole energy counted on the first atom."""

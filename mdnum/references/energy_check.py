@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
+from ase.geometry import complete_cell
 from ase.md.verlet import VelocityVerlet
+from jaxtyping import Int
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
@@ -17,12 +20,16 @@ from mdnum.references.ase_models import Reference, evaluate, independent, refere
 from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import System, build, schema
+from mdnum.systems.build import Evaluation
 
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
 """What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
 
 SOME_STEPS = 200
 """Steps to the later of the two frames compared by default."""
+
+SAMPLED = 10_000
+"""Larger systems are compared by a sample: groups of atoms with all their neighbors."""
 
 ROUNDINGS = 5.0
 """What narrower precision must meet: this many times the rounding expected of one typical number."""
@@ -85,8 +92,9 @@ class EnergyReport:
         is_ase: whether the reference is a class of ASE.
         conversion: what was done to make the conventions equal.
         precision: "float64", or the narrowest type in use.
-        frames: one comparison per frame.
+        frames: one comparison per frame, or per group of atoms in it where a sample was compared.
         ok: every frame within tolerance.
+        sampled: atoms of each frame that were compared; None for all.
     """
 
     system: str
@@ -96,41 +104,29 @@ class EnergyReport:
     precision: str
     frames: tuple[FrameComparison, ...]
     ok: bool
+    sampled: int | None = None
 
     @property
     def worst(self) -> dict[str, Any]:
         """The worst of all frames, in the names of summary.json's `ase`."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
-        return {
-            "reference": self.reference,
-            "energy_rel": max(frame.energy_rel for frame in self.frames),
-            "force_max": max(frame.force_max for frame in self.frames),
-            "stress_max": max(stress) if stress else None,
-            "force_scale": max(frame.force_scale for frame in self.frames),
-            "ok": self.ok,
-        }
+        names = ("energy_rel", "force_max", "force_scale")
+        worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
+        worst |= {"reference": self.reference, "stress_max": max(stress) if stress else None, "ok": self.ok}
+        return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per frame."""
-        narrow = self.precision != "float64"
+        narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
+        columns = {
+            "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
+            "force, relative": "force_rel", "stress, largest": "stress_max",
+            **(narrow if self.precision != "float64" else {}),
+            "against numpy": "energy_third", "ambiguous pairs": "ambiguous", "agrees": "ok",
+        }  # fmt: skip
         return [
-            {
-                "frame": frame.frame,
-                "reference": self.reference,
-                "energy": frame.energy,
-                "energy, relative": frame.energy_rel,
-                "force, largest": frame.force_max,
-                "force, relative": frame.force_rel,
-                "stress, largest": frame.stress_max,
-                **(
-                    {"energy, roundings": frame.energy_roundings, "force, roundings": frame.force_roundings}
-                    if narrow
-                    else {}
-                ),
-                "against numpy": frame.energy_third,
-                "ambiguous pairs": frame.ambiguous,
-                "agrees": frame.ok,
-            }
+            {"frame": frame.frame, "reference": self.reference}
+            | {title: getattr(frame, name) for title, name in columns.items()}
             for frame in self.frames
         ]
 
@@ -148,6 +144,10 @@ def check_energy(
         frames: positions and cells to compare at, by name or in order; default the initial frame and the
             one after some steps, which a crystal needs to have forces at all.
         judge: instead of the reference chosen by `ase_models.reference`.
+
+    Of more than `SAMPLED` atoms with a pair potential, energies and forces of a few hundred are compared, at
+    random places by `neighborhoods`: an exact statement about those.
+
     Raises:
         InputError: the system cannot be built.
     """
@@ -157,9 +157,19 @@ def check_energy(
     third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
-    compared = tuple(
-        _compare(name, atoms, simulation, system, calculator, other) for name, atoms in named.items()
-    )
+    compared: list[FrameComparison] = []
+    sampled: set[int] | None = None
+    for name, atoms in named.items():
+        whole, mine = _evaluated(atoms, simulation)
+        if system.spec.cutoff is None or len(whole) <= SAMPLED:
+            compared.append(_compare(name, whole, mine, simulation, system, calculator, other))
+            continue
+        sampled = set()
+        for cluster, chosen in neighborhoods(whole, simulation.r_cut):
+            of = f"{name}, around atom {chosen[0]}"
+            part = _part(mine, cluster, chosen, simulation.r_cut)
+            compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
+            sampled |= set(chosen.tolist())
     precision = narrowest(system)
     return EnergyReport(
         system.name,
@@ -167,8 +177,9 @@ def check_energy(
         judge.is_ase,
         judge.conversion,
         precision,
-        compared,
+        tuple(compared),
         all(frame.ok for frame in compared),
+        None if sampled is None else len(sampled),
     )
 
 
@@ -202,21 +213,32 @@ def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any
     return {"initial": system.atoms, f"step {steps}": later}
 
 
-def _compare(
-    name: str, atoms: Atoms, simulation: Any, system: System, calculator: Any, other: Any
-) -> FrameComparison:
+def _evaluated(atoms: Atoms, simulation: Any) -> tuple[Atoms, Evaluation]:
+    """A frame as the state can hold it, and what mdnum makes of it."""
     positions = atoms.get_positions()
-    if system.spec.precision.state == "float32":
+    if simulation.system.spec.precision.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
-    mine = simulation.evaluate(positions, np.asarray(atoms.cell))
-    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=system.atoms.pbc)
-    theirs = evaluate(calculator, stored)
-    third = evaluate(other, stored) if other is not None else None
+    pbc = simulation.system.atoms.pbc
+    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=pbc)
+    return stored, simulation.evaluate(positions, np.asarray(atoms.cell))
 
+
+def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
+    """Of an evaluation of the whole, what concerns the first atoms of a cluster; pairs are the cluster's."""
+    edges = edges_of(cluster, r_cut)
+    once = edges.i < edges.j
+    pairs = edges.i[once], edges.j[once], edges.r[once]
+    energies = mine.energies[chosen]
+    return Evaluation(float(energies.sum()), mine.forces[chosen], mine.stress, energies, lambda: pairs)
+
+
+def _compare(
+    name: str, stored: Atoms, mine: Evaluation, simulation: Any, system: System, calculator: Any, other: Any
+) -> FrameComparison:
+    theirs = _of_first(evaluate(calculator, stored), len(mine.forces))
+    third = _of_first(evaluate(other, stored), len(mine.forces)) if other is not None else None
     scale = _Scales.of(system, simulation, stored, mine, theirs)
-    energy, energy_reference = float(mine.energy), theirs["energy"]
-    energy_rel = _over(abs(energy - energy_reference), max(abs(energy_reference), 1e-3 * scale.energy))
-    force_max = float(np.abs(np.asarray(mine.forces) - theirs["forces"]).max(initial=0.0))
+    energy_rel, force_max = _off(mine, theirs, scale.energy)
     stress_max = stress_rel = None
     if theirs["stress"] is not None:
         stress_max = float(np.abs(np.asarray(mine.stress) - theirs["stress"]).max())
@@ -226,29 +248,30 @@ def _compare(
         tolerance = ENERGY_PAIR if system.spec.cutoff is not None else ENERGY_MANY_BODY
         ok = energy_rel <= tolerance and force_rel <= FORCE and (stress_rel is None or stress_rel <= FORCE)
     else:
-        ok = (
-            abs(energy - energy_reference) <= ROUNDINGS * scale.energy_expected
-            and force_max <= ROUNDINGS * scale.force_expected
-        )
+        close = abs(float(mine.energy) - theirs["energy"]) <= ROUNDINGS * scale.energy_expected
+        ok = close and force_max <= ROUNDINGS * scale.force_expected
+    expected = scale.energy_expected, scale.force_expected
+    thirds = (None, None) if third is None else _off(mine, third, scale.energy)
     return FrameComparison(
-        name,
-        energy,
-        energy_reference,
-        energy_rel,
-        force_max,
-        scale.force,
-        force_rel,
-        stress_max,
-        stress_rel,
-        scale.energy_expected,
-        scale.force_expected,
-        _over(abs(energy - third["energy"]), max(abs(third["energy"]), 1e-3 * scale.energy))
-        if third
-        else None,
-        float(np.abs(np.asarray(mine.forces) - third["forces"]).max(initial=0.0)) if third else None,
-        scale.ambiguous,
-        ok,
-    )
+        name, float(mine.energy), theirs["energy"], energy_rel, force_max, scale.force, force_rel, stress_max,
+        stress_rel, *expected, *thirds, scale.ambiguous, ok,
+    )  # fmt: skip
+
+
+def _off(mine: Evaluation, other: Mapping[str, Any], scale: float) -> tuple[float, float]:
+    """(relative difference of the energies, largest of a force component)."""
+    energy, force = float(mine.energy), np.abs(np.asarray(mine.forces) - other["forces"])
+    relative = _over(abs(energy - other["energy"]), max(abs(other["energy"]), 1e-3 * scale))
+    return relative, float(force.max(initial=0.0))
+
+
+def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
+    """Energy and forces of the first atoms alone, where there are more."""
+    if len(results["forces"]) == count:
+        return results
+    energies = results["energies"][:count]
+    forces = results["forces"][:count]
+    return {"energy": float(energies.sum()), "energies": energies, "forces": forces, "stress": None}
 
 
 def _over(difference: float, scale: float) -> float:
@@ -310,14 +333,13 @@ class _Scales:
             step = 1e-4 * form.r_cut
             energies[rows], forces[rows] = np.abs(u), np.abs(du)
             stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
-        per_atom = np.zeros(len(atoms))
-        np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        summed = np.zeros(len(atoms))
-        np.add.at(summed, i, energies)
+        squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
+        per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
         energy_expected = np.sqrt(
-            ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum() + (unit * summed.sum()) ** 2
+            ((forces * shift) ** 2).sum()
+            + ((12.0 * unit * energies) ** 2).sum()
+            + (unit * energies.sum()) ** 2
         )
         force = max(largest_force, float(forces.max(initial=0.0)))
         return cls(
@@ -497,3 +519,61 @@ def _growth(position: list[float]) -> float:
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
     return float(np.exp(np.polyfit(np.arange(len(tail)), np.log(tail), 1)[0]))
+
+
+# --- a few atoms of a large system with all their neighbors: small enough to be evaluated by anybody -----
+
+#: Places at random, and atoms nearest to each whose energies and forces are compared.
+PLACES, ATOMS = 8, 32
+
+
+def neighborhoods(
+    atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
+) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
+    """Groups of atoms at random places, each with every atom within reach of one of them, as a free cluster.
+
+    What a pair potential of that reach gives the chosen atoms in the cluster is what it gives them in the
+    whole system, so a difference there is one of the whole. Found by a tree over the atoms and their images,
+    which shares nothing with mdnum's cell lists.
+
+    Args:
+        atoms: the whole, of any cell; coordinates may lie outside of it.
+        reach: no interaction is longer, length.
+        places, count: how many groups, and atoms in each at most, all within reach of its place.
+        seed: of the random places, each an atom.
+
+    Yields:
+        (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
+    """
+    x, origin = _with_images(atoms, reach)
+    tree = KDTree(x)
+    # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
+    reach = reach * (1 + 1e-9)
+    rng = np.random.default_rng(seed)
+    numbers = atoms.numbers
+    for center in rng.choice(len(atoms), size=min(places, len(atoms)), replace=False):
+        # the first rows of x are the atoms themselves
+        near = np.array(tree.query_ball_point(x[center], reach))
+        chosen = near[np.argsort(((x[near] - x[center]) ** 2).sum(axis=1), kind="stable")[:count]]
+        around = np.concatenate([np.array(rows) for rows in tree.query_ball_point(x[chosen], reach)])
+        rows = np.concatenate([chosen, np.setdiff1d(around, chosen)])
+        yield Atoms(numbers=numbers[origin[rows]], positions=x[rows]), origin[chosen]
+
+
+def _with_images(atoms: Atoms, reach: float) -> tuple[ndarray, ndarray]:
+    """Positions in the box, then their images out to twice the reach beyond its faces; whose each is."""
+    cell = complete_cell(np.where(atoms.pbc[:, None], atoms.cell, 0.0))
+    inverse = np.linalg.inv(cell)
+    x = atoms.positions
+    fractional = x @ inverse
+    x = x - np.where(atoms.pbc, np.floor(fractional), 0.0) @ cell
+    fractional = x @ inverse
+    margin = 2.001 * reach * np.linalg.norm(inverse, axis=0)
+    origin = np.arange(len(x))
+    for axis in np.flatnonzero(atoms.pbc):
+        low, high = fractional[:, axis] < margin[axis], fractional[:, axis] >= 1 - margin[axis]
+        shift = np.eye(3)[axis]
+        fractional = np.concatenate([fractional, fractional[low] + shift, fractional[high] - shift])
+        x = np.concatenate([x, x[low] + cell[axis], x[high] - cell[axis]])
+        origin = np.concatenate([origin, origin[low], origin[high]])
+    return x, origin

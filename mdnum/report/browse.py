@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -18,123 +19,135 @@ STATIC_ROWS = 20
 
 @dataclass(frozen=True)
 class Column:
-    """A column as it is shown.
+    """A column of a table that can be searched.
 
     Attributes:
-        at: where in a row its value is; it is sorted by.
-        kind: how the value is written. "pair" joins it and the next with a dash; "word" takes
-            `words`, by value.
+        name, unit: its heading.
+        values: a value for each row; a pair of them for a "pair".
+        kind: how a value is written and searched. A "count" is whole, and searched as `name:10..20`; a "pair"
+            is two subjects joined by a dash; a "word" is one of `words`, which are searched for; a "ratio" is
+            in rounding bounds, ambiguous at 1 and below; "fixed" has so many decimals, "number" digits.
         words: for "word": what values 0, 1, ... are called.
+        aliases: for "word": what else may be typed for them.
         colors: for "word": class of the cell by value.
-        missing: what stands for no value.
+        subject: whether a bare number, or the column's name and a number, is looked for in it.
     """
 
-    at: int
     name: str
+    values: Any
+    kind: Literal["count", "pair", "number", "fixed", "word", "text", "ratio"] = "number"
     unit: str = ""
-    kind: Literal["count", "pair", "number", "fixed", "word", "text"] = "number"
     digits: int = 3
     words: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()
     colors: tuple[str, ...] = ()
-    missing: str = "–"
+    subject: bool = False
 
-    def text(self, row: Sequence[Any]) -> str:
-        """What the cell of a row says."""
-        value = row[self.at]
+    @property
+    def missing(self) -> str:
+        """What stands for no value."""
+        return "∞" if self.kind == "ratio" else "–"
+
+    @property
+    def plain(self) -> list[list[Any]]:
+        """Lists of plain values, None for what is not finite."""
         if self.kind == "pair":
-            return f"{value}–{row[self.at + 1]}"
+            return [np.asarray(values).astype(int).tolist() for values in self.values]
+        values = np.asarray(self.values)
+        if self.kind in ("count", "word"):
+            return [values.astype(int).tolist()]
+        if self.kind == "text":
+            return [values.tolist()]
+        # more digits than are shown, so that rounding twice shows as rounding once
+        kept = self.digits + 3
+        return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
+
+    def text(self, row: Sequence[Any], at: int) -> str:
+        """What the cell of a row says, whose value is at a place."""
+        value = row[at]
+        if self.kind == "pair":
+            return f"{value}–{row[at + 1]}"
         if value is None:
             return self.missing
         if self.kind == "word":
             return self.words[value]
         if self.kind == "count":
             return count(value)
-        return number(value, self.digits) if self.kind == "number" else str(value)
+        return number(value, self.digits) if self.kind in ("number", "ratio") else str(value)
 
-    def color(self, row: Sequence[Any]) -> str:
-        """Class of the cell of a row."""
-        return self.colors[row[self.at]] if self.colors else ""
+
+def flipped(entered: Any) -> Column:
+    """The column that says which way decisions went."""
+    return Column("decision", entered, "word", words=("left", "entered"), aliases=("out", "in"),
+                  colors=("out", "in"))  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Browse:
-    """A table and what can be asked of it.
+    """A table that can be sorted, searched and paged in the browser, and read without a script.
 
     Attributes:
-        name: id of the table; its rows stand in `<row_id>`.
-        rows: plain values, None for what is not known.
-        words: word typed into the search box: (column, value) that a row must have.
-        ranges: "step" for `step:10..20`: column.
-        subjects: columns in which a bare number is looked for; two of them make `3-7` a pair.
-        nouns: what may stand before such a number.
-        ambiguous: column of a ratio that is ambiguous at 1 and below.
+        name: id of the table.
+        noun: what is searched, in the plural.
+        placeholder: examples of what can be searched for.
     """
 
     name: str
-    row_id: str
-    columns: tuple[Column, ...]
-    rows: Sequence[Sequence[Any]]
-    placeholder: str = ""
-    label: str = "Search"
-    words: Mapping[str, tuple[int, Any]] = field(default_factory=dict)
-    ranges: Mapping[str, int] = field(default_factory=dict)
-    subjects: tuple[int, ...] = ()
-    nouns: tuple[str, ...] = ()
-    ambiguous: int | None = None
+    noun: str
+    placeholder: str
+    columns: Sequence[Column]
 
-    @property
-    def static(self) -> Sequence[Sequence[Any]]:
-        """The rows that are there without a script."""
-        return self.rows[:STATIC_ROWS]
+    @cached_property
+    def placed(self) -> list[tuple[int, Column]]:
+        """Columns, each with where in a row its value is."""
+        places = np.cumsum([0, *(1 + (column.kind == "pair") for column in self.columns)]).tolist()
+        return list(zip(places, self.columns, strict=False))
+
+    @cached_property
+    def rows(self) -> list[list[Any]]:
+        """Plain values, None for what is not known."""
+        return [list(row) for row in zip(*(each for one in self.columns for each in one.plain), strict=True)]
 
     def is_ambiguous(self, row: Sequence[Any]) -> bool:
         """Whether a row is marked."""
-        return self.ambiguous is not None and row[self.ambiguous] is not None and row[self.ambiguous] <= 1
+        at = self.search["ambiguous"]
+        return at is not None and row[at] is not None and row[at] <= 1
+
+    @cached_property
+    def search(self) -> dict[str, Any]:
+        """What can be typed into the search box, and which value of a row it is about."""
+        found: dict[str, Any] = {"words": {}, "ranges": {}, "subjects": [], "nouns": [], "ambiguous": None}
+        for at, one in self.placed:
+            if one.kind == "word":
+                for words in (one.words, one.aliases):
+                    found["words"] |= {word.lower(): [at, value] for value, word in enumerate(words) if word}
+            if one.kind == "count":
+                found["ranges"][one.name] = at
+            if one.kind == "pair" or one.subject:
+                found["subjects"] += [at, at + 1] if one.kind == "pair" else [at]
+                found["nouns"] += ["atom", "pair"] if one.kind == "pair" else [one.name]
+            if one.kind == "ratio":
+                found["ambiguous"] = at
+        return found
 
     @property
-    def spec(self) -> str:
-        """What the script has to know."""
-        return script_safe(
+    def spec(self) -> Markup:
+        """What the script has to know, for a script element."""
+        columns = [
             {
-                "rows": self.row_id,
-                "columns": [
-                    {
-                        "at": column.at, "kind": column.kind, "digits": column.digits,
-                        "words": column.words, "colors": column.colors, "missing": column.missing,
-                    }
-                    for column in self.columns
-                ],
-                "words": {word: list(value) for word, value in self.words.items()},
-                "ranges": dict(self.ranges),
-                "subjects": self.subjects,
-                "nouns": self.nouns,
-                "ambiguous": self.ambiguous,
+                "at": at, "kind": "number" if one.kind == "ratio" else one.kind, "digits": one.digits,
+                "words": one.words, "colors": one.colors, "missing": one.missing,
             }
-        )  # fmt: skip
+            for at, one in self.placed
+        ]  # fmt: skip
+        return _script_safe({"rows": f"{self.name}-rows", "columns": columns, **self.search})
 
     @property
     def json(self) -> Markup:
         """The rows, for a script element."""
-        return script_safe(self.rows)
+        return _script_safe(self.rows)
 
 
-def script_safe(value: Any) -> Markup:
+def _script_safe(value: Any) -> Markup:
     """JSON that can stand in a script element: "</script>" inside a string would end it."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
-
-
-def plain_rows(columns: Sequence[tuple[np.ndarray, int | None]]) -> list[list[Any]]:
-    """Rows of plain values from arrays.
-
-    Args:
-        columns: (values, significant digits to keep, or None for what is whole or text).
-    """
-    lists = [
-        values.tolist() if digits is None else [_short(value, digits) for value in values.tolist()]
-        for values, digits in columns
-    ]
-    return [list(row) for row in zip(*lists, strict=True)]
-
-
-def _short(value: float, digits: int) -> float | None:
-    return float(f"{value:.{digits}g}") if np.isfinite(value) else None

@@ -1,28 +1,55 @@
-"""Plots drawn with plain matplotlib, in one style and one width that the page scales."""
+"""Plots drawn with plain matplotlib, in one style and one width, as SVG that follows the page."""
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from html import escape
 from textwrap import fill
 
+import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
-from mdnum.report import thin
 from mdnum.report.section import Figure, Plot, Region, Series
-from mdnum.report.svg import BAD, FIRST, GRID, INK, MUTED, SECOND, THIRD, style
 from mdnum.report.words import MINUS, many, typeset
 
+# colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
+COLORS = {
+    role: f"#0102{index:02x}"
+    for index, role in enumerate(("ink", "muted", "grid", "first", "second", "third", "bad", "paper"), 1)
+}
+INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, _ = COLORS.values()
+
+#: gid of text that stands on lines: it gets a rim in the color of the paper.
+HALO = "halo"
+_RIM = "paint-order: stroke; stroke: var(--paper); stroke-width: 3px; stroke-linejoin: round;"
+
+LIGHT = {
+    "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#ad5712",
+    "third": "#2c7a63", "bad": "#b3261e", "paper": "#ffffff",
+}  # fmt: skip
+DARK = {
+    "ink": "#e4e7ec", "muted": "#98a2b0", "grid": "#2b323c", "first": "#74a9e8", "second": "#e79a58",
+    "third": "#63bda1", "bad": "#f07b72", "paper": "#14181e",
+}  # fmt: skip
+FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Liberation Sans", "Helvetica Neue", Arial, sans-serif'
 #: Inches; the page scales it.
 WIDTH = 7.2
 #: Points a line is thinned to; longer ones become an envelope of smallest and largest values.
 POINTS = 600
-COLORS = {"first": FIRST, "second": SECOND, "third": THIRD, "bad": BAD, "muted": MUTED, "ink": INK}
 _MARKERS = {"first": "o", "second": "s", "third": "^", "bad": "X", "muted": "D", "ink": "o"}
 #: Colors of a region's classes, in order: as a rule all is well, look here, do not.
 _CLASSES = (THIRD, SECOND, BAD, FIRST, MUTED, INK)
+#: Bins across a figure; a screen has not many more pixels there.
+BINS = 700
+#: Markers that a figure carries; more of them make a page heavy and nothing clearer.
+MARKS = 1500
 
 
 def draw(figure: Figure | Plot) -> Canvas:
@@ -194,7 +221,7 @@ def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
     y = np.where(there, y, np.nan)
     color, label = COLORS[series.role], typeset(series.label)
-    kept = (thin.points if series.mark == "points" else thin.line)(x, y)
+    kept = (thin_points if series.mark == "points" else thin_line)(x, y)
     look: dict[str, object] = {"ls": "--" if series.dashed else "-", "lw": 1.2 + 1.8 * covered}
     if series.mark == "steps":
         look["drawstyle"] = "steps-post"
@@ -243,3 +270,154 @@ def _engineering() -> ScalarFormatter:
 def few_ticks(axes: Axes, n: int = 5) -> None:
     """At most n ticks on the vertical axis."""
     axes.yaxis.set_major_locator(MaxNLocator(n))
+
+
+# -- fewer points that look the same: lines keep every peak, points keep every place
+
+
+def thin_line(
+    x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
+) -> Int[np.ndarray, "kept"]:
+    """Which points of a line to keep: at most four a bin (first, lowest, highest, last), gaps kept.
+
+    Args:
+        x: in the space of the axis (logarithms where it is logarithmic), NaN for a gap.
+        y: likewise.
+    """
+    if len(x) <= 4 * bins:
+        return np.arange(len(x))
+    gap = ~(np.isfinite(x) & np.isfinite(y))
+    inside = x[~gap]
+    if not len(inside) or inside[-1] == inside[0] or np.any(np.diff(inside) < 0):
+        # it doubles back: only equal neighbors can go
+        return np.flatnonzero(np.r_[True, (np.diff(x) != 0) | (np.diff(y) != 0)])
+    place = np.zeros(len(x), int)
+    place[~gap] = ((inside - inside[0]) / (inside[-1] - inside[0]) * bins).astype(int)
+    # a gap, and each side of one, is a group of its own
+    key = 2 * np.cumsum(np.r_[False, gap[1:] != gap[:-1]]) * (bins + 2) + place
+    starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    ends = np.append(starts[1:], len(x))
+    filled = np.where(gap, 0.0, y)
+    chosen = [starts, ends - 1]
+    group = np.repeat(np.arange(len(starts)), ends - starts)
+    # lexsort puts the lowest of each group first and the highest last
+    order = np.lexsort((filled, group))
+    chosen += [order[starts], order[ends - 1]]
+    return np.unique(np.concatenate(chosen))
+
+
+def thin_points(
+    x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
+) -> Int[np.ndarray, "kept"]:
+    """Which points to keep: one for each place of a fine grid that has any.
+
+    Args:
+        x, y: in the space of the axes.
+    """
+    finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if len(finite) <= bins:
+        return finite
+    # which of a cell's points stays is drawn by lot, or the grid would show
+    finite = np.random.default_rng(0).permutation(finite)
+    cells = bins / 2
+    while True:
+        place = np.zeros(len(finite), np.int64)
+        for values in (x[finite], y[finite]):
+            low, span = values.min(), float(np.ptp(values))
+            place = place * (bins + 1) + ((values - low) / (span or 1.0) * cells).astype(np.int64)
+        _, first = np.unique(place, return_index=True)
+        # a curve stays a curve; a cloud that fills the figure gets a coarser grid
+        if len(first) <= MARKS:
+            return finite[np.sort(first)]
+        cells *= 0.7
+
+
+# -- as SVG
+
+
+def style() -> AbstractContextManager[None]:
+    """The settings under which figures are drawn, whatever the user's matplotlibrc says."""
+    return mpl.rc_context(
+        {
+            **mpl.rcParamsDefault,
+            "backend": mpl.get_backend(),
+            "font.family": "DejaVu Sans",
+            "font.size": 9,
+            "axes.labelsize": 9,
+            "axes.edgecolor": MUTED,
+            "axes.linewidth": 0.7,
+            "axes.labelcolor": INK,
+            "text.color": INK,
+            "xtick.color": MUTED,
+            "ytick.color": MUTED,
+            "xtick.labelcolor": INK,
+            "ytick.labelcolor": INK,
+            "xtick.labelsize": 8.5,
+            "ytick.labelsize": 8.5,
+            "axes.unicode_minus": True,
+            "axes.formatter.useoffset": False,
+            "figure.facecolor": "none",
+            "axes.facecolor": "none",
+            "savefig.facecolor": "none",
+            "path.simplify_threshold": 0.3,
+            "svg.fonttype": "none",
+        }
+    )
+
+
+def markup(figure: Canvas, name: str) -> str:
+    """A figure as an <svg> element whose colors are roles.
+
+    Args:
+        name: makes the element's ids unique on a page.
+    """
+    sink = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(sink, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = sink.getvalue()
+    text = text[text.index("<svg ") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    for role, color in COLORS.items():
+        text = text.replace(color, f"var(--{role})")
+    # the page's own font instead of the one it was measured with
+    text = text.replace("font-family: 'DejaVu Sans'; ", "")
+    text = text.replace(f' id="{HALO}"', f' class="{HALO}"')
+    text = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", text)
+    referenced = set(re.findall(r"#([\w.-]+)", text))
+    text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in referenced else "", text)
+    text = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{name}-\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
+    # a hundredth of a point is finer than any screen; what stands between the tags are the labels
+    text = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), text)
+    return re.sub(r"\n\s*\n*", "\n", text)
+
+
+def inline(text: str, title: str) -> str:
+    """An <svg> element for an HTML page that defines the colors as custom properties.
+
+    Args:
+        text: what `markup` gave.
+        title: what a screen reader says.
+    """
+    text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
+    return text.replace('role="img">', f'role="img" aria-label="{escape(title)}">', 1)
+
+
+def standalone(text: str) -> str:
+    """A whole SVG file, which carries both sets of colors and follows the viewer's preference.
+
+    Args:
+        text: what `markup` gave.
+    """
+    rules = (
+        f"svg {{ {_properties(LIGHT)} }} "
+        f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "
+        f"text {{ font-family: {FONT}; }} .{HALO} text {{ {_RIM} }}"
+    )
+    return re.sub(r"(<svg [^>]*>)", rf"\1<style>{rules}</style>", text, count=1)
+
+
+def _properties(colors: dict[str, str]) -> str:
+    return " ".join(f"--{role}: {color};" for role, color in colors.items())

@@ -4,6 +4,7 @@ Code decides (code, values); a text file beside the verb has the sentences, by c
 
     [LOST_PAIRS]
     severity = "error"
+    section = "List health"                                  # of the page, which shows more
     title = "the neighbor list lost {lost:# pair}"
     text = "{lost:# pair} inside the cutoff {lost:? was were} missing from the list in use."
     remedy = "Raise neighbors.skin."
@@ -121,7 +122,7 @@ class Texts:
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
-            severity: instead of the one in the text file.
+            severity, section: instead of those in the text file.
             values: for the fields.
 
         Raises:
@@ -140,7 +141,7 @@ class Texts:
         worst = severity or next((entry[f"severity_{v}"] for v in variants if f"severity_{v}" in entry), None)
         return Finding(
             code, worst or entry["severity"], text("title"), " ".join(filter(None, [text("text"), *more])),
-            text("remedy"), values, section, cause,
+            text("remedy"), values, section or entry.get("section", ""), cause,
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from mdnum.report import svg
-from mdnum.report.browse import Browse
-from mdnum.report.section import cell
+from mdnum.report import drawing
+from mdnum.report.browse import STATIC_ROWS, Browse
+from mdnum.report.section import Figure, Plot, cell
 from mdnum.report.words import heading, many, typeset
 from mdnum.store.files import subfolder, write_text
 
@@ -34,16 +34,13 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     Raises:
         FolderError: the folder cannot be written.
     """
-    from mdnum.report import drawing
-    from mdnum.report.section import Figure, Plot
-
     parts = [part for section in page.sections for part in section.parts]
     pictures, notes = {}, {}
     for part in parts:
         if isinstance(part, Figure | Plot):
-            image = svg.markup(drawing.draw(part), part.name)
-            write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", svg.standalone(image))
-            pictures[part.name] = Markup(svg.inline(image, typeset(part.alt)))
+            image = drawing.markup(drawing.draw(part), part.name)
+            write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", drawing.standalone(image))
+            pictures[part.name] = Markup(drawing.inline(image, typeset(part.alt)))
             notes[part.name] = drawing.notes(part)
     anchors = {section.title: _anchor(section.title) for section in page.sections}
     contents = [(each.title, anchors[each.title]) for each in page.sections if each.level == 2]
@@ -101,11 +98,12 @@ def _render(template: str, **content: Any) -> str:
     environment.filters |= {"kind": lambda part: type(part).__name__}
     environment.globals |= {
         "many": many,
+        "static": STATIC_ROWS,
         "style": Markup(_text("report.css")),
         "script": Markup(_text("report.js")),
-        "light": svg.LIGHT,
-        "dark": svg.DARK,
-        "font": Markup(svg.FONT),
+        "light": drawing.LIGHT,
+        "dark": drawing.DARK,
+        "font": Markup(drawing.FONT),
     }
     return environment.get_template(template).render(**content)
 

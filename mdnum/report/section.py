@@ -193,7 +193,7 @@ class Figure:
 
 
 #: What a section is made of; text is a paragraph.
-Part = Any  # str | Table | browse.Browse | Code | Plot | Figure
+Part = Any  # str | Table | Browse | Code | Plot | Figure
 
 
 @dataclass(frozen=True)

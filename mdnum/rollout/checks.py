@@ -57,7 +57,7 @@ class EnergyBudget:
             positions: wrapped positions at it, shape (atoms, 3).
             potential: potential energy that the run computed there.
         """
-        difference = potential - self._reference.evaluate(positions).energy
+        difference = potential - self._reference.energy(positions)
         # a reference that is the system itself has the jumps, too
         jumps = 0.0 if self._reference is self.simulation else self.jumps
         if self.start is None:
@@ -75,7 +75,7 @@ class EnergyBudget:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
         eps = 2 * unit_roundoff(self.simulation.policy.dtype("force"))
-        return 1e3 * eps * max(1.0, abs(self._reference.evaluate().energy))
+        return 1e3 * eps * max(1.0, abs(self._reference.energy()))
 
     @property
     def closes(self) -> bool:

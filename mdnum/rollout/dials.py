@@ -23,8 +23,8 @@ from mdnum.md.decide import Decisions, PairDecider, Tables
 from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import check_radius
 from mdnum.md.pairforce import Forces, PairForce
+from mdnum.registry import nearest
 from mdnum.systems.build import Simulation
-from mdnum.systems.grammar import nearest
 
 Turn = Callable[[Simulation, float], Simulation]
 _SHORT = {

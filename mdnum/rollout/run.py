@@ -25,8 +25,9 @@ from mdnum.systems.load import System, load
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
-# the budget is checked this often; each check evaluates the whole system once more
-_BUDGET_CHECKS = 20
+# the budget is checked this often; each check evaluates the whole system once more, which takes a large one
+# as long as several steps: there the steps in between are at least as many as these
+_BUDGET_CHECKS, _LARGE, _STEPS_OF_A_LARGE = 20, 10_000, 100
 _LOG_LINES = 50
 
 
@@ -113,7 +114,8 @@ class Rollout:
             FolderError: the folder cannot be written.
         """
         engine = Engine(self.simulation, self.steps, start=self.start)
-        interval = max(1, self.steps // _BUDGET_CHECKS)
+        least = _STEPS_OF_A_LARGE if self.simulation.atoms > _LARGE else 1
+        interval = max(least, self.steps // _BUDGET_CHECKS)
         blown: Segment | None = None
         if self.start is None:
             # from here on a run that is stopped can be resumed

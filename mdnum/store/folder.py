@@ -19,11 +19,12 @@ import numpy as np
 import pyarrow as pa
 
 from mdnum.errors import FolderError, MdnumError
+from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
 from mdnum.store.files import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
-from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -83,6 +84,9 @@ class RunFolder:
         self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
         self._began = time.monotonic()
         self._written = -math.inf
+        # what the last checkpoint took (s), making its state included; and when it was found due
+        self._cost = 0.0
+        self._asked: float | None = None
         # the state that came too soon after the last checkpoint, and the rows there were then
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
 
@@ -191,10 +195,13 @@ class RunFolder:
         """Whether `checkpoint` would write now.
 
         The interval is 2 s at first and 1 % of the time the run has taken later on: a kill costs at
-        most that much, and a run of days has a thousand part files, not a hundred thousand.
+        most that much, and a run of days has a thousand part files, not a hundred thousand. It is never less
+        than fifty times what the last one took.
         """
         now = time.monotonic()
-        return now - self._written >= max(2.0, 0.01 * (now - self._began))
+        due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
+        self._asked = now if due else None
+        return due
 
     def checkpoint(self, state: Mapping[str, Any], force: bool = False) -> bool:
         """Makes everything appended so far, and state, the point a killed run resumes from.
@@ -236,10 +243,6 @@ class RunFolder:
             if file is not None:
                 file.close()
         self._log = self._lock = None
-
-    def write_system(self, toml: str) -> None:
-        """Writes system.toml, the fully resolved system."""
-        write_text(self.path / "system.toml", toml)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes summary.json (NaN and infinity, which JSON does not have, become null)."""
@@ -361,7 +364,7 @@ class RunFolder:
         empty = [key for key in table.column_names if table[key].null_count]
         if empty:
             raise FolderError(f"column {empty[0]!r} of table {name!r} has gaps", where=str(self.path))
-        return {key: table[key].to_numpy() for key in table.column_names}
+        return {key: as_numpy(table[key]) for key in table.column_names}
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""
@@ -557,6 +560,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _write_checkpoint(self, state: Mapping[str, Any]) -> None:
+        began = time.monotonic()
         # parts first, then the checkpoint that counts them: a kill in between only leaves rows to drop
         for stream in self._streams.values():
             stream.flush()
@@ -572,6 +576,8 @@ class RunFolder:
             stream.written = {}
         checkpoint.write(self.path / "checkpoint.npz", state, store, written)
         self._written = time.monotonic()
+        self._cost = self._written - (began if self._asked is None else self._asked)
+        self._asked = None
         self._pending = None
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -615,7 +621,7 @@ class RunFolder:
         self._lock = lock
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
-        text = json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         write_text(self.path / name, text + "\n")
 
     def _read_json(self, name: str) -> dict[str, Any]:
@@ -705,17 +711,3 @@ def _again(path: Path) -> str:
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
         return f"Nothing of it was kept: give the `{verb}` command again"
     return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "__array__"):
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value

@@ -11,8 +11,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mdnum.systems.ball import BallSpec
-from mdnum.systems.ball_system import BallSystem
-from mdnum.systems.load import System, copy, load, names, shipped_folder
+from mdnum.systems.load import BallSystem, System, copy, load, names, shipped_folder
 from mdnum.systems.schema import SystemSpec
 
 if TYPE_CHECKING:

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, model_serializer, model_validator
 from pydantic_core import PydanticKnownError
 
-from mdnum.systems.grammar import Named, NonNegative, TomlTable
+from mdnum.ball.limits import largest, rounded, smallest, smallest_tolerance, spacing
+from mdnum.systems.toml import Key, Named, NonNegative, TomlTable, from_array, unusable
 
 Positive = Annotated[float, Field(gt=0)]
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
@@ -28,11 +30,6 @@ def _numbers(value: Any) -> Any:
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")
     return tuple(float(item) for item in value) if isinstance(value, list | tuple) else value
-
-
-def _tuple(value: Any) -> Any:
-    # TOML has arrays only; strict pydantic would refuse a list where a tuple is declared
-    return tuple(value) if isinstance(value, list) else value
 
 
 Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
@@ -70,6 +67,11 @@ class StartTable(TomlTable):
         default=None, description="instead of height: a batch whose penetrations sum to stop.tol exactly"
     )
 
+    @model_serializer(mode="wrap")
+    def _only_boundary(self, handler: Any) -> Any:
+        # the other keys hold their defaults, and would contradict it
+        return {"boundary": handler(self)["boundary"]} if self.boundary is not None else handler(self)
+
 
 class NoControl(TomlTable):
     """Nothing but gravity acts in flight."""
@@ -97,7 +99,7 @@ class ValuesControl(TomlTable):
     """An acceleration for each step, held during the step."""
 
     kind: Literal["values"]
-    values: Annotated[tuple[float, ...], BeforeValidator(_tuple)] = Field(
+    values: Annotated[tuple[float, ...], from_array] = Field(
         description="acceleration of each step, up is positive (m/s²); as many as integrator.steps"
     )
 
@@ -207,7 +209,6 @@ class FixedRule(TomlTable):
     count: int = Field(ge=1, le=_MOST, description="iterations of every solve")
 
 
-ToleranceRule = SumRule | PerInstanceRule | MaximumRule | RelativeRule
 Stop = Annotated[SumRule | PerInstanceRule | MaximumRule | RelativeRule | FixedRule, Discriminator("rule")]
 
 
@@ -259,10 +260,10 @@ class LossTable(TomlTable):
 class GradientTable(TomlTable):
     """The derivatives asked for."""
 
-    of: Annotated[tuple[ParameterName, ...], BeforeValidator(_tuple)] = Field(
+    of: Annotated[tuple[ParameterName, ...], from_array] = Field(
         default=(), description="parameters; y0 and v0 move all balls together"
     )
-    methods: Annotated[tuple[MethodName, ...], BeforeValidator(_tuple)] = Field(
+    methods: Annotated[tuple[MethodName, ...], from_array] = Field(
         default=("unrolled",), description="which derivatives; each says what it is"
     )
 
@@ -323,11 +324,284 @@ class BallSpec(TomlTable):
         description='the same system with some keys changed, such as "precision.state" = "float32"',
     )
 
+    @property
+    def balls(self) -> int:
+        """How many balls the file describes."""
+        start = self.start
+        if start.boundary is not None:
+            return start.boundary.terms + 1
+        lists = [value for value in (start.height, start.velocity) if isinstance(value, tuple)]
+        return len(lists[0]) if lists else start.balls
 
-def json_schema() -> dict[str, Any]:
-    """The JSON schema of a ball's system file, for editors (systems/ball/schema.json)."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **BallSpec.model_json_schema(),
-        "title": "mdnum system file of the ball",
+    @model_validator(mode="after")
+    def _can_be_run(self) -> BallSpec:
+        if problem := next(_problems(self), None):
+            raise unusable(*problem)
+        return self
+
+    @staticmethod
+    def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
+        """Drop what the file says of another contact or integrator than the one that is asked for."""
+        contact, integrator, gradient = (data.get(key) for key in ("contact", "integrator", "gradient"))
+        if not {("contact", "kind"), ("integrator", "kind")} & set(values):
+            return
+        if not isinstance(contact, dict) or not isinstance(integrator, dict):
+            return
+        kind = str(contact.get("kind"))
+        if not solves(kind, integrator.get("kind")) and not any(key[0] == "stop" for key in values):
+            data.pop("stop", None)
+        if isinstance(gradient, dict) and ("gradient", "of") not in values:
+            asked = gradient.get("of", ())
+            if isinstance(asked, list | tuple):
+                gradient["of"] = [name for name in asked if name in parameters(kind)]
+
+
+# --- what the tables must say together ----------------------------------------------------------------
+
+#: Parameters that a gradient can be asked for, by contact.
+_PARAMETERS = {
+    "penalty": ("k", "damping", "eps"),
+    "projection": ("k", "alpha", "restitution", "tol"),
+    "impact": ("restitution",),
+}
+#: What is wrong with a file: the key at fault, what was seen, what to do.
+Problem = tuple[str, str, str]
+
+
+def parameters(contact: str) -> tuple[str, ...]:
+    """Names of the parameters that a gradient can be asked for, where the contact is of some kind."""
+    return (*_PARAMETERS.get(contact, ()), "gravity", "h", "y0", "v0")
+
+
+def solves(contact: str | None, integrator: str | None) -> bool:
+    """Whether a step of this kind iterates: a projection, and the implicit equation of a spring."""
+    return contact == "projection" or (integrator == "implicit-midpoint" and contact == "penalty")
+
+
+def _problems(spec: BallSpec) -> Iterator[Problem]:
+    yield from _on_boundary(spec) if spec.start.boundary is not None else _starts(spec)
+    yield from _combinations(spec)
+    yield from _stops(spec)
+    yield from _unrepresentable(spec)
+    yield from _losses(spec)
+
+
+def _on_boundary(spec: BallSpec) -> Iterator[Problem]:
+    start, boundary = spec.start, spec.start.boundary
+    assert boundary is not None
+    fields = StartTable.model_fields.items()
+    given = [k for k, field in fields if k != "boundary" and getattr(start, k) != field.default]
+    if given:
+        yield (
+            f"start.{given[0]}",
+            f"[start] has boundary and {', '.join(given)}, but boundary says where every ball is",
+            f"Remove {' and '.join(given)}, or boundary",
+        )
+    if spec.stop is None or isinstance(spec.stop, FixedRule):
+        yield (
+            "start.boundary",
+            "a batch on the boundary needs a tolerance to be on the boundary of",
+            'Give a [stop] table with rule = "sum" and tol',
+        )
+        return
+    low = rounded(spec.stop.tol, boundary.format)
+    least, most = smallest(boundary.format), largest(boundary.format)
+    if not least <= low <= most:
+        yield (
+            "stop.tol",
+            f"stop.tol = {spec.stop.tol:g} is outside of what {boundary.format} can hold",
+            f"The smallest usable tolerance is {least:.3g}, the largest {most:.4g}",
+        )
+    if low != spec.stop.tol:
+        yield (
+            "stop.tol",
+            f"stop.tol = {spec.stop.tol!r} is no {boundary.format}, so no sum of them equals it",
+            f"Set it to the nearest one, tol = {low!r}",
+        )
+    share = spacing(np.nextafter(low, 0.0), boundary.format) / boundary.terms
+    if share < least:
+        yield (
+            "start.boundary.terms",
+            f"an ulp of the tolerance in {boundary.terms} parts gives {share:g}, below the smallest "
+            f"{boundary.format}, {least:.3g}",
+            "Use fewer terms or a larger stop.tol",
+        )
+
+
+def _starts(spec: BallSpec) -> Iterator[Problem]:
+    start = spec.start
+    lists = {
+        name: value for name in ("height", "velocity") if isinstance(value := getattr(start, name), tuple)
     }
+    for name, value in lists.items():
+        if not value:
+            yield f"start.{name}", f"start.{name} is an empty array", "Give one number per ball"
+        if not all(map(np.isfinite, value)):
+            yield f"start.{name}", f"start.{name} holds a number that is not finite", f"Correct {name}"
+    if len({len(value) for value in lists.values()}) > 1:
+        counts = " and ".join(f"{len(value)} in start.{name}" for name, value in lists.items())
+        yield "start.velocity", f"arrays of different length: {counts}", "Give one number per ball"
+    if lists and start.balls not in (1, spec.balls):
+        seen = f"start.balls = {start.balls}, but start.{next(iter(lists))} has {spec.balls} numbers"
+        yield "start.balls", seen, "Leave out start.balls"
+    spread = "spread" if start.spread else "spread_ulps"
+    if not (start.spread or start.spread_ulps):
+        return
+    if "height" in lists:
+        seen = f"start.{spread} has no meaning where start.height gives every ball its own"
+        yield f"start.{spread}", seen, f"Remove {spread}, or give one height and start.balls"
+    if start.spread and start.spread_ulps:
+        yield "start.spread_ulps", "start.spread and start.spread_ulps both given", "Keep one of them"
+    if spec.balls == 1:
+        yield f"start.{spread}", f"start.{spread} of a single ball", "Set start.balls to 2 or more"
+
+
+def _combinations(spec: BallSpec) -> Iterator[Problem]:
+    contact, integrator, control = spec.contact.kind, spec.integrator.kind, spec.flight.control
+    if integrator == "event-located" and contact != "impact":
+        yield (
+            "integrator.kind",
+            f"event-located finds the time of an impact, but the contact is a {contact}",
+            'Set contact.kind to "impact", or integrator.kind to "semi-implicit-euler"',
+        )
+    if contact != "penalty" and spec.contact.hysteresis is not None:
+        yield (
+            "contact.hysteresis",
+            f"contact.hysteresis has no meaning for {contact}, whose contact ends within the step",
+            'Remove it, or set contact.kind to "penalty"; a solver\'s hysteresis is stop.enter',
+        )
+    if isinstance(control, ValuesControl) and len(control.values) != spec.integrator.steps:
+        seen = f"flight.control.values has {len(control.values)} numbers for {spec.integrator.steps} steps"
+        yield "flight.control.values", seen, "Give one per step"
+    if integrator == "event-located" and control.kind not in ("none", "constant"):
+        yield (
+            "flight.control.kind",
+            f"the flight between impacts is a parabola under constant acceleration, not under {control.kind}",
+            'Set flight.control.kind to "none" or "constant", or choose another integrator',
+        )
+
+
+def _stops(spec: BallSpec) -> Iterator[Problem]:
+    stop, contact = spec.stop, spec.contact
+    needed = solves(contact.kind, spec.integrator.kind)
+    if stop is None and needed:
+        what = "a projection" if contact.kind == "projection" else "implicit-midpoint"
+        yield (
+            "stop",
+            f"table [stop] missing; {what} iterates until it is told to stop",
+            'Add for example [stop] with rule = "sum", tol = 1e-6, max_iter = 100',
+        )
+    if stop is not None and not needed:
+        yield (
+            "stop",
+            f"[stop] has no meaning here: {contact.kind} with {spec.integrator.kind} iterates nothing",
+            'Remove the table, or set contact.kind to "projection"',
+        )
+    if isinstance(stop, _Tolerance) and stop.enter is not None and stop.enter < stop.tol:
+        yield (
+            "stop.enter",
+            f"stop.enter = {stop.enter:g} is below stop.tol = {stop.tol:g}: a solve would start that is over "
+            "before it begins",
+            "Make enter at least tol",
+        )
+    if isinstance(stop, RelativeRule) and stop.tol >= 1:
+        yield (
+            "stop.tol",
+            f"stop.tol = {stop.tol:g} of the first residual is above that residual: nothing is solved",
+            "A relative tolerance is below 1",
+        )
+    if isinstance(contact, ProjectionContact) and (product := contact.alpha * contact.k) >= 2:
+        yield (
+            "contact.k",
+            f"alpha k = {contact.alpha:g} × {contact.k:g} = {product:g}: an iteration multiplies the height "
+            f"by 1 - alpha k = {1 - product:g}, so the projection cannot converge",
+            f"Make alpha k smaller than 2, with k = {contact.k:g} alpha below {2 / contact.k:.4g}; "
+            "below 1 it does not overshoot either",
+        )
+
+
+def _unrepresentable(spec: BallSpec) -> Iterator[Problem]:
+    """Numbers that the format of their role cannot hold, tolerances that no residual but 0 would be below."""
+    precision, stop = spec.precision, spec.stop
+    # every number with a role: key, value, role, the smallest that the role can use
+    held: list[tuple[str, float, str, float | None]] = []
+    if isinstance(stop, _Tolerance):
+        gain = spec.contact.alpha * spec.contact.k if isinstance(spec.contact, ProjectionContact) else 1.0
+        usable = smallest_tolerance(
+            precision, gain, stop.rule if stop.rule in ("sum", "relative") else "term"
+        )
+        strictest = sorted(usable, key=lambda role: -usable[role])
+        given = {"stop.tol": stop.tol, "stop.enter": stop.enter}
+        held += [(k, v, role, usable[role]) for k, v in given.items() if v is not None for role in strictest]
+    step = {"integrator.timestep": spec.integrator.timestep, "flight.gravity": spec.flight.gravity}
+    own = spec.contact.model_dump(exclude={"kind", "hysteresis"})
+    step |= {f"contact.{name}": value for name, value in own.items()}
+    held += [(key, value, "arithmetic", None) for key, value in step.items()]
+    for name, value in (("height", spec.start.height), ("velocity", spec.start.velocity)):
+        items = value if isinstance(value, tuple) else (value,)
+        held += [(f"start.{name}", item, "state", None) for item in items]
+    for key, value, role, least in held:
+        name, asks = getattr(precision, role), f"which precision.{role} asks for"
+        if abs(value) > largest(name):
+            yield (
+                key,
+                f"{key} = {value:g} is above the largest {name}, {largest(name):.4g}, {asks}",
+                f"Make it smaller, or precision.{role} wider",
+            )
+        if least is None and 0 < abs(value) < smallest(name):
+            yield (
+                key,
+                f"{key} = {value:g} is 0 in {name}, {asks}; the least is {smallest(name):.3g}",
+                f"Make it larger, or precision.{role} wider",
+            )
+        if least is not None and value < least:
+            yield (
+                key,
+                f"{key} = {value:g} is too small for {name}, {asks}: no residual but 0 would be below it",
+                f"The smallest usable tolerance is {least:.3g}; or make precision.{role} wider",
+            )
+
+
+def _losses(spec: BallSpec) -> Iterator[Problem]:
+    loss, contact = spec.loss, spec.contact
+    if loss.kind == "residual-penetration" and contact.kind != "projection":
+        yield (
+            "loss.kind",
+            f"residual-penetration is what a projection's solver leaves, but the contact is a {contact.kind}",
+            'Set loss.kind to "final-height"',
+        )
+    if loss.target is not None and loss.kind != "final-height":
+        seen = f"loss.target has no meaning for {loss.kind}"
+        yield "loss.target", seen, 'Remove it, or use "final-height"'
+    known = parameters(contact.kind)
+    for name in spec.gradient.of:
+        seen = f"gradient.of names {name}, "
+        if name not in known:
+            yield "gradient.of", f"{seen}which {contact.kind} does not have", f"It has {', '.join(known)}"
+        if name == "eps" and isinstance(contact, PenaltyContact) and not contact.eps:
+            seen += "but contact.eps = 0 is the sharp contact, which no width belongs to"
+            yield "gradient.of", seen, "Set contact.eps above 0"
+        if name == "tol" and not isinstance(spec.stop, _Tolerance):
+            yield "gradient.of", f"{seen}but the rule is fixed", "Remove it, or use another rule"
+
+
+def remarks(spec: BallSpec) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What runs, and is probably not what was meant: codes of findings, and the values of their sentences."""
+    stop, contact = spec.stop, spec.contact
+    if isinstance(contact, ProjectionContact):
+        # a height just below the floor is the difference of two numbers of the size of one step's fall
+        start = spec.start.height
+        height = max(map(abs, start)) if isinstance(start, tuple) else abs(start)
+        fall = float(np.sqrt(2 * spec.flight.gravity * height)) * spec.integrator.timestep
+        unit = spacing(fall, spec.precision.state) if fall else 0.0
+        absolute = isinstance(stop, SumRule | PerInstanceRule | MaximumRule)
+        if absolute and spec.start.boundary is None and stop.tol < unit:
+            state = spec.precision.state
+            yield "TOLERANCE_BELOW_ROUNDING", {"tol": stop.tol, "fall": fall, "unit": unit, "format": state}
+        product = contact.alpha * contact.k
+        if product > 1:
+            yield "PROJECTION_OVERSHOOTS", {"product": product, "above": product - 1}
+    if isinstance(contact, PenaltyContact) and spec.integrator.kind != "implicit-midpoint":
+        stiff = spec.integrator.timestep * float(np.sqrt(contact.k))
+        if stiff > 2:
+            yield "STEP_BEYOND_STABILITY", {"stiff": stiff, "timestep": float(2 / np.sqrt(contact.k))}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,8 +18,7 @@ from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider, LatticeStep, on_lattice
-from mdnum.md.latticeforce import LatticeForce
+from mdnum.md.lattice import Lattice, LatticeDecider, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
@@ -215,16 +214,20 @@ class Simulation:
         positions: Float[np.ndarray, "atoms 3"] | None = None,
         cell: Float[np.ndarray, "3 3"] | None = None,
     ) -> Evaluation:
-        """Energy, forces, stress and pairs of one configuration, with a list of its own.
+        """As `Evaluator`, for one configuration, with a list of its own."""
+        return Evaluator(self, skin=0.0)(positions, cell)
+
+    def energy(self, positions: Float[np.ndarray, "atoms 3"] | None = None) -> float:
+        """The potential energy of one configuration alone, with a list of its own.
 
         Args:
             positions: length; default the structure's.
-            cell: lattice vectors as rows; default the system's.
-
-        Raises:
-            InputError: the cutoff exceeds half the smallest perpendicular width.
         """
-        return Evaluator(self, skin=0.0)(positions, cell)
+        at = np.asarray(self.positions if positions is None else positions, np.float64)
+        wrapped, _ = wrap_positions(self.cell, at)
+        table = self.verlet_list(skin=0.0).build(wrapped, self.cell)
+        x = jnp.asarray(wrapped[table.order].T, self.policy.dtype("state"))
+        return float(_total(self.force, x, self.tables(table)))
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
@@ -255,15 +258,14 @@ def _pair_model(system: System) -> CutPotential:
 
 
 def _many_body_model(system: System):
-    from mdnum.md import embedded_atom, manybody
+    from mdnum.md import manybody
 
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
     if isinstance(potential, schema.EmbeddedAtomTable):
-        return embedded_atom.embedded_atom(
-            system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
-        )
+        symbols = system.atoms.get_chemical_symbols()
+        return manybody.embedded_atom(system.folder / potential.file, symbols, pbc)
     if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
     assert isinstance(potential, schema.StillingerWeberTable)
@@ -318,15 +320,11 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
     timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
+    integrator: Integrator = VelocityVerlet(timestep)
     if isinstance(spec.dynamics, schema.LangevinTable):
-        integrator: Integrator = Langevin(
-            timestep,
-            jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),
-            jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64),
-            jax.random.key(spec.dynamics.seed),
-        )
-    else:
-        integrator = VelocityVerlet(timestep)
+        friction = jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64)
+        kT = jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64)
+        integrator = Langevin(timestep, friction, kT, jax.random.key(spec.dynamics.seed))
     simulation = Simulation(
         system,
         cell,
@@ -394,17 +392,33 @@ class Evaluation:
         forces: shape (atoms, 3), energy/length.
         stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume.
         energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
-        i, j: pairs inside the (longest) cutoff, i < j.
-        distance: of those pairs, length.
+        find_pairs: finds the pairs inside the (longest) cutoff, i < j, and their distances, once asked for.
     """
 
     energy: float
     forces: Float[np.ndarray, "atoms 3"]
     stress: Float[np.ndarray, "3 3"]
     energies: Float[np.ndarray, "atoms"]
-    i: Int[np.ndarray, "pairs"]
-    j: Int[np.ndarray, "pairs"]
-    distance: Float[np.ndarray, "pairs"]
+    find_pairs: Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+    @cached_property
+    def _pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.find_pairs()
+
+    @property
+    def i(self) -> Int[np.ndarray, "pairs"]:
+        """First atoms of the pairs inside."""
+        return self._pairs[0]
+
+    @property
+    def j(self) -> Int[np.ndarray, "pairs"]:
+        """Second atoms of the pairs inside."""
+        return self._pairs[1]
+
+    @property
+    def distance(self) -> Float[np.ndarray, "pairs"]:
+        """Distances of the pairs inside, length."""
+        return self._pairs[2]
 
 
 class Evaluator:
@@ -449,15 +463,12 @@ class Evaluator:
         energies = np.full(here.atoms, np.nan)
         if here.pairwise:
             energies[table.order] = np.asarray(result.energy, np.float64)
-        i, j, distance = here.inside(wrapped, table, np.asarray(bits))
         return Evaluation(
             float(jnp.sum(result.energy, dtype=jnp.float64)),
             forces,
             -np.asarray(virial) / here.cell.volume,
             energies,
-            i,
-            j,
-            distance,
+            lambda: here.inside(wrapped, table, np.asarray(bits)),
         )
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
@@ -482,3 +493,8 @@ def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables):
     result = force(x, tables, decisions=True)
     assert result.decisions is not None
     return result, result.decisions.bits, force.virial_tensor(x, tables)
+
+
+@eqx.filter_jit
+def _total(force: PairForce | ManyBodyForce, x, tables: Tables):
+    return jnp.sum(force(x, tables, decisions=False).energy, dtype=jnp.float64)

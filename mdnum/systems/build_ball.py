@@ -10,21 +10,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.ball import contacts, integrators, limits, stopping
-from mdnum.ball.problem import BallLoss, BallProblem, FinalHeight, MeanHeight, ResidualPenetration
+from mdnum.ball import limits, step, stopping
+from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.numerics import neighbor, reductions
 from mdnum.numerics.roles import RolePrecision
-from mdnum.systems import ball, ball_checks
-from mdnum.systems.ball_system import BallSystem
-from mdnum.systems.load import load
+from mdnum.systems import ball
+from mdnum.systems.load import BallSystem, load
 
 _INTEGRATORS: Mapping[str, Any] = {
-    "explicit-euler": integrators.ExplicitEuler,
-    "semi-implicit-euler": integrators.SemiImplicitEuler,
-    "velocity-verlet": integrators.BallVerlet,
-    "event-located": integrators.EventLocated,
+    "explicit-euler": step.ExplicitEuler,
+    "semi-implicit-euler": step.SemiImplicitEuler,
+    "velocity-verlet": step.BallVerlet,
+    "event-located": step.EventLocated,
 }
 _RULES: Mapping[str, Any] = {
     "sum": stopping.GlobalSum,
@@ -100,38 +99,32 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
         InputError: a number that the world refuses.
     """
     steps = spec.integrator.steps if steps is None else steps
-    precision = spec.precision
-    policy = RolePrecision(
-        precision.state,
-        precision.arithmetic,
-        precision.decision,
-        precision.accumulate,
-        precision.loss,
-        precision.rounding,
-        precision.seed,
-    )
     try:
         world = World.create(
             _contact(spec),
             _integrator(spec),
             gravity=spec.flight.gravity,
-            control=control(spec.flight.control, spec.integrator.timestep, steps),
-            policy=policy,
+            control=_control(spec.flight.control, spec.integrator.timestep, steps),
+            policy=RolePrecision(**spec.precision.model_dump(exclude={"reduction"})),
             hysteresis=spec.contact.hysteresis,
         )
     except InputError as error:
         raise InputError(error.message, remedy=error.remedy, where=error.where or where) from None
     y0, v0 = start(spec)
-    return BallProblem(world, y0, v0, steps, _loss(spec.loss))
+    losses = {"mean-height": MeanHeight(), "residual-penetration": ResidualPenetration()}
+    loss = losses.get(spec.loss.kind) or FinalHeight(spec.loss.target)
+    return BallProblem(world, y0, v0, steps, loss)
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
-    """Heights (m) and velocities (m/s) of the balls at step 0, float64; numbers of the state's dtype come
-    out of the rounding that a world does.
-    """
-    given, count = spec.start, ball_checks.balls(spec)
+    """Heights (m) and velocities (m/s) of the balls at step 0, float64; a world rounds them to its dtype."""
+    given, count = spec.start, spec.balls
     if given.boundary is not None:
-        return _on_the_boundary(spec, given.boundary), np.zeros(count)
+        # one penetration an ulp short of the tolerance, and the ulp in equal parts
+        assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
+        tol, terms = spec.stop.tol, given.boundary.terms
+        below = float(np.nextafter(np.asarray(tol, limits.DTYPES[given.boundary.format]), 0))
+        return -np.array([below, *[(tol - below) / terms] * terms]), np.zeros(count)
     height = np.asarray(given.height, np.float64)
     if given.spread_ulps:
         dtype = limits.DTYPES[spec.precision.state]
@@ -142,23 +135,8 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
     return np.broadcast_to(height, count).copy(), np.broadcast_to(velocity, count).copy()
 
 
-def _on_the_boundary(spec: ball.BallSpec, boundary: ball.BoundaryTable) -> Float[np.ndarray, "balls"]:
-    """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
-    assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
-    tol = spec.stop.tol
-    below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))
-    share = (tol - below) / boundary.terms
-    return -np.array([below, *[share] * boundary.terms])
-
-
-def control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """The acceleration that is added in each step, m/s²; None for none.
-
-    Args:
-        table: of the file.
-        h: time step, s.
-        steps: how many; a longer run than the file's keeps the last value.
-    """
+def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
+    """The acceleration that is added in each step, m/s²; None for none."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)
@@ -174,11 +152,11 @@ def control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "ste
 def _contact(spec: ball.BallSpec) -> Any:
     match table := spec.contact:
         case ball.PenaltyContact():
-            return contacts.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
+            return step.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
         case ball.ProjectionContact():
-            return contacts.Projection(table.k, table.alpha, stop_rule(spec), table.restitution)
+            return step.Projection(table.k, table.alpha, _stop_rule(spec), table.restitution)
         case ball.ImpactContact():
-            return contacts.Impact(table.restitution, table.rest_speed)
+            return step.Impact(table.restitution, table.rest_speed)
 
 
 def _integrator(spec: ball.BallSpec) -> Any:
@@ -186,27 +164,17 @@ def _integrator(spec: ball.BallSpec) -> Any:
     if table.kind != "implicit-midpoint":
         return _INTEGRATORS[table.kind](table.timestep)
     if isinstance(spec.contact, ball.PenaltyContact):
-        return integrators.ImplicitMidpoint(table.timestep, stop_rule(spec))
+        return step.ImplicitMidpoint(table.timestep, _stop_rule(spec))
     # without a contact force a step is a formula, and nothing is solved
-    return integrators.ImplicitMidpoint(table.timestep)
+    return step.ImplicitMidpoint(table.timestep)
 
 
-def stop_rule(spec: ball.BallSpec) -> Any:
-    """The stopping rule of the file as an object."""
+def _stop_rule(spec: ball.BallSpec) -> Any:
     table = spec.stop
     assert table is not None
     if isinstance(table, ball.FixedRule):
         return stopping.FixedCount(table.count)
-    options = {}
-    if table.rule in ("sum", "relative"):
-        options["reduction"] = reductions.parse(spec.precision.reduction)
+    summed = isinstance(table, ball.SumRule | ball.RelativeRule)
+    options = {"reduction": reductions.parse(spec.precision.reduction)} if summed else {}
     rule = _RULES[table.rule](table.tol, table.max_iter, **options)
     return rule if table.enter is None else stopping.HysteresisStop(rule, table.enter)
-
-
-def _loss(table: ball.LossTable) -> BallLoss:
-    if table.kind == "mean-height":
-        return MeanHeight()
-    if table.kind == "residual-penetration":
-        return ResidualPenetration()
-    return FinalHeight(table.target)

@@ -1,4 +1,4 @@
-"""Where system files are: shipped ones by name, a person's own by path."""
+"""Where system files are, shipped ones by name, a person's own by path; and what comes of reading one."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ import importlib.resources
 import shutil
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from pydantic import ValidationError
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError
 from mdnum.registry import nearest
 from mdnum.store.files import disk_errors, replacing, write_text
 from mdnum.systems import pairs, schema, structures, toml
-from mdnum.systems.ball_system import BALL_SCHEMA, BallSystem, Source, kind_first
-from mdnum.systems.ball_system import make as make_ball
-from mdnum.systems.grammar import Grammar, apply_overrides, explain, read_overrides
-from mdnum.systems.toml import SYSTEM_FILE
+from mdnum.systems.ball import BallSpec, ValuesControl
+from mdnum.systems.toml import SYSTEM_FILE, Source, apply_overrides, checked, read_overrides
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+STRUCTURE_FILE = "structure.extxyz"
+BALL_SCHEMA = "ball-schema.json"
 
 
 def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
@@ -96,12 +99,12 @@ def shown(path: Path) -> str:
         return str(path)
 
 
-if TYPE_CHECKING:
-    from ase import Atoms
-
-STRUCTURE_FILE = "structure.extxyz"
-
-GRAMMAR = Grammar(schema.SystemSpec)
+def _made(folder: str | Path) -> Path:
+    """A folder, made where it is missing."""
+    target = Path(folder)
+    with disk_errors(target):
+        target.mkdir(parents=True, exist_ok=True)
+    return target
 
 
 @dataclass(frozen=True)
@@ -171,18 +174,17 @@ class System:
             for table in (structure, spec["potential"]):
                 if "file" in table:
                     table["file"] = str((self.folder / table["file"]).resolve())
-            return toml.dump({"name": self.name, **kind_first(spec)})
+            return toml.dump({"name": self.name, **spec})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
         if isinstance(self.spec.potential, schema.EmbeddedAtomTable):
             spec["potential"]["file"] = Path(self.spec.potential.file).name
-        return toml.dump({"name": self.name, **kind_first(spec)})
+        return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
         """Write system.toml, structure.extxyz and the potential's tables; returns the TOML file's path."""
-        target = Path(folder)
+        target = _made(folder)
         with disk_errors(target):
-            target.mkdir(parents=True, exist_ok=True)
             for table in self.tables:
                 if table.resolve() != (target / table.name).resolve():
                     with replacing(target / table.name) as file:
@@ -191,6 +193,129 @@ class System:
         write_text(target / STRUCTURE_FILE, structures.to_extxyz(self.atoms))
         write_text(path, self.to_toml())
         return path
+
+
+@dataclass(frozen=True)
+class VariantSpec:
+    """The same system with some keys changed.
+
+    Attributes:
+        name: what to call it.
+        changes: dotted keys to values.
+        spec: what comes of it.
+    """
+
+    name: str
+    changes: Mapping[str, Any]
+    spec: BallSpec
+
+
+@dataclass(frozen=True)
+class BallSystem:
+    """A checked system of the ball.
+
+    Attributes:
+        name: such as "ball/drop".
+        spec: the file's tables, defaults filled in.
+        path: the file, or None.
+        variants: each checked like the system itself.
+    """
+
+    name: str
+    spec: BallSpec
+    path: Path | None = None
+    variants: tuple[VariantSpec, ...] = ()
+
+    @property
+    def balls(self) -> int:
+        """How many balls there are."""
+        return self.spec.balls
+
+    def against(self, changes: Mapping[str, Any], name: str | None = None) -> BallSystem:
+        """This system with one more variant.
+
+        Args:
+            changes: dotted keys to values; text is read as TOML would read it.
+            name: what to call the variant; default the changes themselves.
+
+        Raises:
+            InputError: the variant cannot be run, or its name is taken.
+        """
+        name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
+        if name in {variant.name for variant in self.variants}:
+            raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
+        given = {".".join(key): value for key, value in read_overrides(changes).items()}
+        variant = vary(name, given, self.spec, f"--against {name}")
+        tables = {**self.spec.variants, name: given}
+        spec = self.spec.model_copy(update={"variants": tables})
+        return BallSystem(self.name, spec, self.path, (*self.variants, variant))
+
+    def for_steps(self, steps: int) -> BallSystem:
+        """This system with another number of steps; a control given by values is cut, or keeps its last.
+
+        Args:
+            steps: of a run, at least 1.
+        """
+        update: dict[str, Any] = {
+            "integrator": self.spec.integrator.model_copy(update={"steps": steps}),
+        }
+        control = self.spec.flight.control
+        if isinstance(control, ValuesControl):
+            values = control.values[:steps]
+            values += values[-1:] * (steps - len(values))
+            update["flight"] = self.spec.flight.model_copy(
+                update={"control": control.model_copy(update={"values": values})}
+            )
+        return replace(self, spec=self.spec.model_copy(update=update))
+
+    def to_toml(self, *, beside: bool = True) -> str:
+        """The system file with every default written out; a ball has no other files to be beside."""
+        return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
+
+    def write(self, folder: str | Path) -> Path:
+        """Write system.toml; returns its path."""
+        path = _made(folder) / SYSTEM_FILE
+        write_text(path, self.to_toml())
+        return path
+
+
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> VariantSpec:
+    """The system with keys changed, checked.
+
+    Args:
+        name: what to call it.
+        changes: dotted keys to values.
+        base: what is changed.
+        where: what to blame.
+
+    Raises:
+        InputError: it cannot be run.
+    """
+    if not changes:
+        raise InputError(f"variant {name!r} changes nothing", where=where, remedy="Name a key, or remove it")
+    data = base.model_dump(exclude_none=True, exclude={"variants", "name"})
+    values = {toml.dotted(key): value for key, value in changes.items()}
+    for key in values:
+        if key[0] in ("variants", "name", "about", "world") or key == ("integrator", "steps"):
+            raise InputError(
+                f"variant {name!r} changes {'.'.join(key)}, which says nothing about the arithmetic of a run",
+                where=where,
+                remedy="Remove it",
+            )
+    apply_overrides(data, values, BallSpec)
+    BallSpec.follow(data, values)
+    try:
+        spec = checked(BallSpec, data, Source(name, Path(), where))
+    except InputError as error:
+        raise InputError(f"variant {name!r}: {error.message}", remedy=error.remedy, where=where) from None
+    if spec.balls != base.balls:
+        raise InputError(
+            f"variant {name!r} has {spec.balls} balls and the system {base.balls}: "
+            "decisions of different balls cannot be compared",
+            where=where,
+            remedy="Keep the number of balls",
+        )
+    return VariantSpec(name, dict(changes), spec)
 
 
 # --- copying ----------------------------------------------------------------------------------------
@@ -271,7 +396,11 @@ def load(
     if world is not None and is_ball != (world == "ball"):
         verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
         raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
-    return make_ball(source, data) if is_ball else _make(source, data)
+    root = BallSpec if is_ball else schema.SystemSpec
+    apply_overrides(data, values, root)
+    root.follow(data, values)
+    spec = checked(root, data, source)
+    return _ball(spec, source) if isinstance(spec, BallSpec) else _md(spec, source)
 
 
 def _is_ball(data: Mapping[str, Any], where: str) -> bool:
@@ -292,15 +421,8 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
     return True
 
 
-def _make(source: Source, data: dict[str, Any]) -> System:
-    """The atoms' system of the tables of a file."""
-    apply_overrides(data, source.values, GRAMMAR)
-    _draw_again(data, source.values)
-    try:
-        spec = schema.SystemSpec.model_validate(data)
-    except ValidationError as error:
-        raise explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
-    spec = _resolve(spec)
+def _md(spec: schema.SystemSpec, source: Source) -> System:
+    spec = spec.resolved
     try:
         atoms = structures.make(spec.structure, spec.units, source.path.parent)
         system = System(spec.name or source.name, spec, source.path, atoms)
@@ -312,20 +434,18 @@ def _make(source: Source, data: dict[str, Any]) -> System:
     return system
 
 
-def _draw_again(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:
-    """A temperature or seed asked for on the command line must not be silently ignored."""
-    structure, dynamics = data.get("structure"), data.get("dynamics")
-    if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
-        return
-    asked = {("dynamics", "temperature"), ("dynamics", "seed")} & set(values)
-    if asked and ("structure", "velocities") not in values:
-        structure["velocities"] = "drawn"
+def _ball(spec: BallSpec, source: Source) -> BallSystem:
+    variants = tuple(
+        vary(name, changes, spec, source.place(("variants", name))) for name, changes in spec.variants.items()
+    )
+    return BallSystem(spec.name or source.name, spec, source.path, variants)
 
 
-def _resolve(spec: schema.SystemSpec) -> schema.SystemSpec:
-    """The defaults that depend on other keys, written out."""
-    update: dict[str, Any] = {"neighbors": spec.neighbors.model_copy(update={"skin": spec.skin})}
-    cutoff = spec.cutoff
-    if cutoff is not None and cutoff.switches and cutoff.onset is None and cutoff.base is not None:
-        update["cutoff"] = cutoff.model_copy(update={"onset": schema.ONSET_FRACTION * cutoff.base})
-    return spec.model_copy(update=update)
+def json_schema(file: str) -> dict[str, Any]:
+    """The JSON schema of system files that editors use, schema.json or BALL_SCHEMA."""
+    root, title = (BallSpec, " of the ball") if file == BALL_SCHEMA else (schema.SystemSpec, "")
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **root.model_json_schema(),
+        "title": f"mdnum system file{title}",
+    }

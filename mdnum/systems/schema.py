@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
-from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
+from pydantic import ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.systems.grammar import Named, NonNegative, TomlTable
+from mdnum.systems.toml import Key, Named, NonNegative, TomlTable, from_array
 
 Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
 Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
@@ -262,35 +262,19 @@ class CutoffTable(TomlTable):
 
 # --- structure, lists, dynamics, precision ---------------------------------------------------------------
 FloatName = Literal["float64", "float32"]
-StateName = Literal["float64", "float32", "lattice"]
-ForceFloatName = Literal["float64", "float32", "bfloat16", "float16"]
 DEFAULT_SKIN = {"metal": 1.0, "lj": 0.3}
 """Skin when the file gives none: LAMMPS uses 2.0 Å and 0.3 σ; 1.0 Å suits the argon-sized systems here."""
 
-
-def _tuple(value: Any) -> Any:
-    # TOML has arrays only; strict pydantic would refuse a list where a tuple is declared
-    return tuple(value) if isinstance(value, list) else value
-
-
-Flags = Annotated[tuple[bool, bool, bool], BeforeValidator(_tuple)]
-Counts = Annotated[
-    tuple[
-        Annotated[int, Field(gt=0)],
-        Annotated[int, Field(gt=0)],
-        Annotated[int, Field(gt=0)],
-    ],
-    BeforeValidator(_tuple),
-]
-Triple = Annotated[tuple[float, float, float], BeforeValidator(_tuple)]
-Masses = dict[str, Annotated[float, Field(gt=0)]]
+Flags = Annotated[tuple[bool, bool, bool], from_array]
+Count = Annotated[int, Field(gt=0)]
+Triple = Annotated[tuple[float, float, float], from_array]
 
 
 class _Structure(TomlTable):
     pbc: Flags | None = Field(
         default=None, description="periodic along each cell vector; overrides what the structure says"
     )
-    masses: Masses | None = Field(
+    masses: dict[str, Annotated[float, Field(gt=0)]] | None = Field(
         default=None,
         description="mass of each species (amu or m); default: the file's, else ASE's for metal and 1 for lj",
     )
@@ -316,7 +300,9 @@ class BuilderStructure(_Structure):
     builder: Literal["fcc", "bcc", "sc", "diamond"] = Field(description="lattice, with its cubic cell")
     symbol: str = Field(description="chemical symbol")
     lattice_constant: Length = Field(description="edge of the cubic cell (Å or σ)")
-    repeat: Counts = Field(default=(1, 1, 1), description="cells along x, y and z")
+    repeat: Annotated[tuple[Count, Count, Count], from_array] = Field(
+        default=(1, 1, 1), description="cells along x, y and z"
+    )
     tilt: Triple = Field(
         default=(0.0, 0.0, 0.0), description="shear of the whole crystal: xy, xz and yz, length per length"
     )
@@ -394,12 +380,12 @@ Dynamics = Annotated[NVETable | LangevinTable, Discriminator("kind")]
 class PrecisionTable(TomlTable):
     """Which float plays which role."""
 
-    state: StateName = Field(
+    state: Literal["float64", "float32", "lattice"] = Field(
         default="float64",
         description="positions and velocities (with sixteen bits a step would move no atom); lattice: whole "
         "numbers, whose decisions and sums have no rounding and whose steps can be taken back exactly",
     )
-    force: ForceFloatName = Field(
+    force: Literal["float64", "float32", "bfloat16", "float16"] = Field(
         default="float64",
         description="pair distances, energies and forces; in bfloat16 and float16 distances are those of the "
         "decision, rounded",
@@ -475,12 +461,21 @@ class SystemSpec(TomlTable):
         skin = self.neighbors.skin
         return DEFAULT_SKIN[unit_systems.get(self.units).name] if skin is None else skin
 
+    @property
+    def resolved(self) -> SystemSpec:
+        """With the defaults that depend on other keys written out."""
+        update: dict[str, Any] = {"neighbors": self.neighbors.model_copy(update={"skin": self.skin})}
+        cutoff = self.cutoff
+        if cutoff is not None and cutoff.switches and cutoff.onset is None and cutoff.base is not None:
+            update["cutoff"] = cutoff.model_copy(update={"onset": ONSET_FRACTION * cutoff.base})
+        return self.model_copy(update=update)
 
-def json_schema() -> dict[str, Any]:
-    """The JSON schema of a system file, for editors (systems/schema.json)."""
-    schema = SystemSpec.model_json_schema()
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema,
-        "title": "mdnum system file",
-    }
+    @staticmethod
+    def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
+        """Draw velocities anew for a temperature or seed that is asked for, which would be ignored else."""
+        structure, dynamics = data.get("structure"), data.get("dynamics")
+        if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
+            return
+        asked = {("dynamics", "temperature"), ("dynamics", "seed")} & set(values)
+        if asked and ("structure", "velocities") not in values:
+            structure["velocities"] = "drawn"

@@ -326,29 +326,24 @@ def _nearest(
     return near[rows, column], index[np.minimum(who[rows, column], len(index) - 1)], pairs
 
 
-def to_extxyz(atoms: Atoms) -> str:
-    """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals)."""
-    columns = ["species:S:1", "pos:R:3"]
-    if atoms.has("momenta"):
-        columns.append("momenta:R:3")
-    if atoms.has("masses"):
-        columns.append("masses:R:1")
-    comment = []
+def to_extxyz(atoms: Atoms, columns: Sequence[str] = ("momenta", "masses")) -> str:
+    """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals).
+
+    Args:
+        atoms: any.
+        columns: arrays that are written beside symbols and positions, where the atoms have them.
+    """
+    held = {name: atoms.arrays[name] for name in columns if name in atoms.arrays}
+    arrays = {"pos": atoms.positions} | {
+        name: np.asarray(array, np.float64).reshape(len(atoms), -1) for name, array in held.items()
+    }
+    words = ["species:S:1", *(f"{name}:R:{array.shape[1]}" for name, array in arrays.items())]
     cell = np.asarray(atoms.cell)
-    if cell.any():
-        comment.append(f'Lattice="{_numbers(cell.ravel())}"')
-    comment.append(f"Properties={':'.join(columns)}")
+    comment = [f'Lattice="{_numbers(cell.ravel())}"'] if cell.any() else []
+    comment.append(f"Properties={':'.join(words)}")
     comment.append(f'pbc="{" ".join("T" if flag else "F" for flag in atoms.pbc)}"')
-    arrays = [atoms.positions]
-    if atoms.has("momenta"):
-        arrays.append(atoms.get_momenta())
-    if atoms.has("masses"):
-        arrays.append(atoms.get_masses()[:, None])
-    rows = np.hstack(arrays)
-    lines = [str(len(atoms)), " ".join(comment)]
-    lines += [
-        f"{symbol} {_numbers(row)}" for symbol, row in zip(atoms.get_chemical_symbols(), rows, strict=True)
-    ]
+    rows = zip(atoms.get_chemical_symbols(), np.hstack(list(arrays.values())), strict=True)
+    lines = [str(len(atoms)), " ".join(comment), *(f"{symbol} {_numbers(row)}" for symbol, row in rows)]
     return "\n".join(lines) + "\n"
 
 

@@ -1,19 +1,29 @@
-"""TOML text: reading it with an error that names the line, finding a key's line, writing it.
+"""System files as text and as tables: reading with errors that name the line, writing, messages, overrides.
 
-The standard library reads TOML but neither writes it nor remembers where a key stood; both are small for
-the tables a system file holds.
+The standard library reads TOML but neither writes it nor remembers where a key stood; both are small for the
+tables a system file holds. A table whose keys depend on its kind is a union of pydantic models told apart by
+a key such as `kind` or `rule`; `models` follows a key through such unions. Mistakes become one line: what was
+seen and expected, and where.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError, core_schema
 
 from mdnum.errors import InputError
+from mdnum.registry import nearest
 
 Key = tuple[str, ...]
 #: Name of the system file in a folder.
@@ -23,7 +33,7 @@ SYSTEM_FILE = "system.toml"
 _DEEPEST = 20
 # what is valid in TOML and acted on by a terminal, or reorders what is read
 _UNPRINTED = re.compile("[\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\U000e0000-\U000e007f]")
-_BARE = re.compile(r"^[A-Za-z0-9_-]+$")
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
 _PART = re.compile(r"""\s*(?:"((?:[^"\\]|\\.)*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*""")
 
 
@@ -137,7 +147,7 @@ def line_of(text: str, key: Key) -> int | None:
 def dump(tables: Mapping[str, Any]) -> str:
     """TOML text of nested tables; None means absent, floats keep every bit.
 
-    Scalars come first in each table, as TOML asks; empty tables are left out.
+    Scalars come first in each table, as TOML asks, of them the kind or rule; empty tables are left out.
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
@@ -145,8 +155,9 @@ def dump(tables: Mapping[str, Any]) -> str:
 
 
 def _dump_table(path: Key, table: Mapping[str, Any], lines: list[str]) -> None:
-    simple = {k: v for k, v in table.items() if v is not None and not isinstance(v, Mapping)}
-    nested = {k: v for k, v in table.items() if isinstance(v, Mapping)}
+    ordered = sorted(table.items(), key=lambda item: item[0] not in ("kind", "rule"))
+    simple = {k: v for k, v in ordered if v is not None and not isinstance(v, Mapping)}
+    nested = {k: v for k, v in ordered if isinstance(v, Mapping)}
     if path and simple:
         lines += ["", f"[{'.'.join(_key(part) for part in path)}]"]
     lines += [f"{_key(key)} = {_value(value)}" for key, value in simple.items()]
@@ -155,7 +166,7 @@ def _dump_table(path: Key, table: Mapping[str, Any], lines: list[str]) -> None:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.match(key) else _string(key)
+    return key if _BARE.fullmatch(key) else _string(key)
 
 
 def _string(text: str) -> str:
@@ -174,3 +185,361 @@ def _value(value: Any) -> str:
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(item) for item in value) + "]"
     raise TypeError(f"no TOML for {type(value).__name__}")
+
+
+# --- tables -------------------------------------------------------------------------------------------
+
+NonNegative = Annotated[float, Field(ge=0)]
+#: TOML has arrays only; strict pydantic would refuse a list where a tuple is declared.
+from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+#: Smallest size of a number but 0; what is computed with it squares it.
+_SMALLEST = 1e-150
+_LARGEST_INT = 2**62
+
+
+class Named:
+    """A name of a registry, perhaps with an argument; checked where a file gives one.
+
+    Args:
+        registry: "module:attribute"; imported when a name is checked, because the module may be a slow one.
+        others: further words that are allowed.
+    """
+
+    def __init__(self, registry: str, *others: str):
+        self.registry, self.others = registry, others
+
+    def _loaded(self) -> Any:
+        module, _, attribute = self.registry.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+
+    def _check(self, value: Any) -> Any:
+        if value in self.others or not isinstance(value, str):
+            return value
+        registry = self._loaded()
+        if value.partition(registry.separator)[0] not in registry:
+            raise PydanticCustomError("unknown_name", "unknown name", {"known": [*self.others, *registry]})
+        try:
+            registry.parse(value)
+        except InputError as error:
+            raise PydanticCustomError("unusable_name", "{said}", {"said": error.message}) from None
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.no_info_before_validator_function(self._check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        registry = self._loaded()
+        # an editor offers those shipped, and lets others pass: packages add theirs
+        return {
+            "anyOf": [{"enum": [*self.others, *registry.shipped]}, {"type": "string"}],
+            "description": "; ".join(f"{name}: {registry.description(name)}" for name in registry.shipped),
+        }
+
+
+class TomlTable(BaseModel):
+    """Base of every table: frozen, strict, no unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Any:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            held = tuple(value.values()) if isinstance(value, Mapping) else value
+            for number in held if isinstance(held, tuple) else (held,):
+                if not isinstance(number, int | float) or isinstance(number, bool):
+                    continue
+                if isinstance(number, int) and abs(number) > _LARGEST_INT:
+                    raise ValueError(f"{name} = {number}; expected a whole number of at most 2^62")
+                # a tolerance is compared and not squared, and what tolerances can be is checked with them
+                if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
+                    raise ValueError(
+                        f"{name} = {number:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
+                        "whose square is a number, too"
+                    )
+        return self
+
+    @staticmethod
+    def foreign_keys(table: Mapping[str, Any]) -> set[str]:
+        """Keys without a meaning for the kind that a table names."""
+        return set()
+
+
+def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
+    """The error of a table that cannot be run, with the dotted key at fault."""
+    return PydanticCustomError("unusable", "{said}", {"said": message, "remedy": remedy, "key": key})
+
+
+def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
+    """Models that the table at a key may have, that of the kind which the data names first; none of a value.
+
+    Args:
+        root: the model of the whole file.
+        key: of a table.
+        data: the tables as read.
+    """
+    found, table = [root], data
+    for part in key:
+        table = table.get(part, {}) if isinstance(table, Mapping) else {}
+        # pairs."Ni-P" is the table of one pair: its key is free
+        if found and part in found[0].model_fields:
+            found = list(_models_in(found[0].model_fields[part].rebuild_annotation()))
+            found.sort(key=lambda model, own=_chosen(found, table): model is not own)
+    return found
+
+
+def _models_in(annotation: Any) -> Iterator[type[TomlTable]]:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        if issubclass(annotation, TomlTable):
+            yield annotation
+        return
+    for argument in typing.get_args(annotation):
+        yield from _models_in(argument)
+
+
+def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] | None:
+    """Of the models of a union the one that a table is meant for."""
+    tag = _tag_of(options)
+    given = table.get(tag) if tag and isinstance(table, Mapping) else None
+    if tag and isinstance(given, str):
+        kinds = {model: _literals(model, tag) for model in options}
+        # a model without a list of kinds takes those of other packages
+        named = [model for model in options if given in kinds[model]] or [m for m in options if not kinds[m]]
+        if named:
+            return named[0]
+    builder = isinstance(table, Mapping) and "builder" in table
+    return next((m for m in options if ("builder" in m.model_fields) == builder), next(iter(options), None))
+
+
+def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
+    """The key that tells the models of a union apart, or None."""
+    keys = {name for model in options for name in model.model_fields}
+    return next((name for name in ("kind", "rule") if name in keys), None)
+
+
+def _literals(model: type[TomlTable], name: str) -> tuple[Any, ...]:
+    annotation = model.model_fields[name].annotation if name in model.model_fields else None
+    return typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
+
+
+# --- messages -----------------------------------------------------------------------------------------
+
+_EXPECTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": 'text in "quotes"',
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "tuple_type": "an array",
+    "finite_number": "a finite number",
+}
+_BOUNDS = {
+    "greater_than": ("gt", "above"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "below"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """A system file as it was read.
+
+    Attributes:
+        name: what the system was called by.
+        path: the file.
+        where: the file, as a message names it.
+        text: what it holds.
+        values: overrides, by key.
+    """
+
+    name: str
+    path: Path
+    where: str
+    text: str = ""
+    values: Mapping[Key, Any] = field(default_factory=dict)
+
+    def place(self, key: Key) -> str:
+        """The file with line, or the override, that a key came from."""
+        if any(key[: len(given)] == given for given in self.values):
+            return f"--set {'.'.join(key)}"
+        number = line_of(self.text, key) if key else None
+        if number:
+            return f"{self.where}:{number}"
+        # a whole table that only overrides mention
+        given = next((given for given in self.values if key and given[: len(key)] == key), None)
+        return f"--set {'.'.join(given)}" if given else self.where
+
+
+Root = TypeVar("Root", bound=TomlTable)
+
+
+def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
+    """The tables of a file as their model.
+
+    Raises:
+        InputError: what the model refuses, in one line for the most telling mistake.
+    """
+    try:
+        return root.model_validate(data)
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+    # a misspelled key is also a missing one: name the misspelling
+    detail = min(details, key=lambda each: each["type"] != "extra_forbidden")
+    context = detail.get("ctx", {})
+    if detail["type"] == "unusable":
+        raise InputError(
+            context["said"], remedy=context["remedy"], where=source.place(tuple(context["key"].split(".")))
+        )
+    key: Key = ()
+    tag_follows = False
+    for part in detail["loc"]:
+        # pydantic puts the tag of a union between the table and the key, and the place in an array after it
+        if not (tag_follows or part == "[key]" or isinstance(part, int)):
+            key = (*key, part)
+        tag_follows = not tag_follows and isinstance(part, str) and len(models(root, key, data)) > 1
+    if detail["type"] == "union_tag_invalid":
+        key = (*key, _tag(context))
+    if detail["type"] == "value_error" and not key:
+        named = re.search(r"\[(\w+)\]", detail["msg"])
+        key = (named[1],) if named and named[1] in data else ()
+    message, remedy = _sentence(detail, key, root, data)
+    if others := len(details) - 1:
+        remedy += "" if remedy.endswith((".", "?")) else "."
+        remedy = f"{remedy} {others} more {'problem follows' if others == 1 else 'problems follow'}"
+    raise InputError(message, remedy=remedy, where=source.place(key))
+
+
+def _tag(context: Mapping[str, Any]) -> str:
+    # pydantic quotes the name of the key that tells kinds apart
+    key = str(context.get("discriminator", "kind")).strip("'")
+    return key if key.isidentifier() else "kind"
+
+
+def _sentence(
+    detail: Mapping[str, Any], key: Key, root: type[TomlTable], data: Mapping[str, Any]
+) -> tuple[str, str]:
+    kind, seen, context = str(detail["type"]), detail["input"], detail.get("ctx", {})
+    name, outer, last = ".".join(key), ".".join(key[:-1]), key[-1] if key else ""
+    fields = next((model.model_fields for model in models(root, key[:-1], data)), {})
+    meaning = (fields[last].description or "") if last in fields else ""
+
+    def kinds(key: Key, tag: str) -> list[str]:
+        return [word for model in models(root, key, data) for word in _literals(model, tag)]
+
+    if kind == "extra_forbidden":
+        known = sorted(fields, key=lambda name: name not in ("kind", "rule"))
+        near = nearest(last, known)
+        remedy = f"Did you mean {near}?" if near else f"Known keys are {', '.join(known)}."
+        return f"unknown key {last!r} in {f'[{outer}]' if outer else 'a system file'}", remedy
+    if kind == "missing":
+        if models(root, key, data):
+            return f"table [{name}] missing", f"Add a [{name}] table."
+        owner = f"[{outer}]" if outer else "the system file"
+        return f"key {last!r} missing in {owner}", f"Add `{last} = ...`" + (meaning and f" ({meaning})")
+    if kind == "union_tag_not_found":
+        tag = _tag(context)
+        return f"key {tag!r} missing in [{name}]", f"Known {tag}s are {', '.join(kinds(key, tag))}."
+    if kind in ("union_tag_invalid", "unknown_name"):
+        known = context.get("known") or kinds(key[:-1], last)
+        given = str(context.get("tag", seen))
+        near = nearest(given, known)
+        remedy = f"Did you mean {near}? " if near else ""
+        return f"unknown {outer} {last} {given!r}", f"{remedy}Known {last}s are {', '.join(known)}."
+    if kind == "literal_error":
+        options = str(context["expected"]).replace("'", '"')
+        return f"{name} = {_show(seen)}; expected {options}", meaning and f"{last}: {meaning}"
+    if kind in _BOUNDS:
+        limit, word = _BOUNDS[kind]
+        bound = f"{word} {context[limit]:.15g}"
+        return f"{name} = {_show(seen)}; expected a number {bound}", meaning and f"{last}: {meaning}"
+    if kind in ("too_short", "too_long", "missing_positional_only_argument"):
+        return f"{name} = {_show(seen)}; expected three values", "Give one for each of x, y and z."
+    if kind == "value_error":
+        said = str(detail["msg"]).removeprefix("Value error, ")
+        return said if "[" in said else f"[{name}]: {said}", ""
+    if expected := _EXPECTED.get(kind):
+        quoted = isinstance(seen, str) and "number" in expected and type(scalar(seen)) in (int, float)
+        remedy = "Leave out the quotes" if quoted else f"Correct {name}"
+        return f"{name} = {_show(seen)}; expected {expected}", remedy
+    return f"{name} = {_show(seen)}: {detail['msg']}", f"Correct {name}."
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return "a table"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+# --- overrides ----------------------------------------------------------------------------------------
+
+_RIVALS: dict[Key, tuple[str, ...]] = {
+    # what the command line says replaces the file's other way of saying it
+    ("cutoff", "radius"): ("in_sigma", "pairs"),
+    ("cutoff", "in_sigma"): ("radius", "pairs"),
+    ("structure", "file"): ("builder",),
+    ("structure", "builder"): ("file",),
+    ("start", "height"): ("boundary",),
+    ("start", "spread"): ("spread_ulps",),
+    ("start", "spread_ulps"): ("spread",),
+}
+
+
+def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
+    """Dotted keys to values; text is read as TOML would read it.
+
+    Raises:
+        InputError: a key that is none.
+    """
+    changes = {dotted(key): value for key, value in (overrides or {}).items()}
+    return {key: scalar(value) if isinstance(value, str) else value for key, value in changes.items()}
+
+
+def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[TomlTable]) -> None:
+    """Put values into the tables, and drop the keys of another kind than the one they choose.
+
+    Raises:
+        InputError: a key below one that is a value and no table.
+    """
+    for key, value in values.items():
+        table = data
+        for depth, part in enumerate(key[:-1], 1):
+            table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise InputError(
+                    f"{'.'.join(key[:depth])} is a value and not a table",
+                    where=f"--set {'.'.join(key)}",
+                    remedy=f"Set {'.'.join(key[:depth])} itself",
+                )
+        table[key[-1]] = value
+    for key in values:
+        _drop_foreign_keys(data, key, values, root)
+
+
+def _drop_foreign_keys(
+    data: dict[str, Any], key: Key, values: Mapping[Key, Any], root: type[TomlTable]
+) -> None:
+    *path, last = key
+    table: Any = data
+    for part in path:
+        table = table.get(part) if isinstance(table, dict) else None
+    if not path or not isinstance(table, dict):
+        return
+
+    def drop(names: set[str]) -> None:
+        for name in names & set(table):
+            if not any(given[: len(key)] == (*path, name) for given in values):
+                del table[name]
+
+    rivals = set(_RIVALS.get(key, ()))
+    # the onset was in the unit of the radius that goes
+    drop(rivals | ({"onset"} if {"radius", "in_sigma"} & rivals & set(table) else set()))
+    options = models(root, key[:-1], data)
+    if options and (last == _tag_of(options) or (path == ["structure"] and last in ("file", "builder"))):
+        known = {name for model in options for name in model.model_fields}
+        drop(known - set(options[0].model_fields) | options[0].foreign_keys(table))

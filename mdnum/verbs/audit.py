@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,9 @@ from mdnum.verbs.frame import Outcome, Progress, Verb, View
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.audit.base import CheckResult, Observed
-    from mdnum.audit.check import AuditCheck
+    from mdnum.audit.base import AuditCheck, CheckResult, Observed
     from mdnum.audit.record import AuditState
-    from mdnum.audit.structures import LoadedCalculator
-    from mdnum.audit.subject import CalculatorSubject
+    from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
 
 TEXTS = Texts(__file__)
 _SCRIPT = "reproduce.py"
@@ -46,18 +45,6 @@ _BOLTZMANN = 8.617333262e-5
 #: A unit of a system with dimensions where text has one: not in the name of a file.
 _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 _ROLES = ("first", "second", "third", "bad", "muted", "ink")
-
-
-class AuditStopped(KeyboardInterrupt):
-    """Somebody pressed control-C after a check was done: what had been found is in the folder.
-
-    Args:
-        outcome: the audit without the checks that were not done.
-    """
-
-    def __init__(self, outcome: Outcome):
-        super().__init__("stopped")
-        self.outcome = outcome
 
 
 def audit(
@@ -103,7 +90,7 @@ def audit(
     Raises:
         InputError: no such calculator, structure or check; something that a resumed audit has already.
         FolderError: the folder cannot be used.
-        AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
+        frame.Interrupted: control-C was pressed after a check was done; what was found till then has been
             written, its page included, and is the exception's `outcome`.
     """
     from mdnum.audit.record import AuditState, encoded, kept
@@ -152,7 +139,6 @@ def _ask_all(
 ) -> Outcome:
     """Asks the checks that are not done, keeping each answer, and finishes the folder."""
     from mdnum.audit.base import TIME_UP, TimeUp
-    from mdnum.audit.check import Settings
     from mdnum.audit.checks import CHECKS
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
@@ -166,11 +152,11 @@ def _ask_all(
     subject.meter.deadline = deadline
     if state.thresholds is not None:
         subject.known["thresholds"] = state.thresholds
-    settings = Settings(_internal(state.timestep, loaded.units), state.steps)
+    timestep = _internal(state.timestep, loaded.units)
     log = frame.logged(folder, progress)
     earlier, state.during, state.why = state.cut, None, ""
     for name in state.left:
-        check = CHECKS[name](settings)
+        check = CHECKS[name](timestep, state.steps)
         log(0, 0, {"phase": name})
         state.during = name
         try:
@@ -198,7 +184,7 @@ def _ask_all(
         state.during = next(iter(state.left), None)
         answers.save()
         summary = plain(_summary(state))
-        _judge(View(folder, summary, state)).store(folder, summary)
+        _judge(AuditView(folder, summary, given=state)).store(folder, summary)
     if state.cut is not None and state.during is None:
         state.cut = None
     answers.save()
@@ -207,14 +193,13 @@ def _ask_all(
         folder, report=report, result={one.name: one for one in state.shown}, progress=progress
     )
     if state.why == "stopped":
-        raise AuditStopped(outcome)
+        raise frame.Interrupted(outcome)
     return outcome
 
 
 def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
-    from mdnum.audit.base import CheckResult, finding
-    from mdnum.audit.subject import CalculatorError
+    from mdnum.audit.base import CalculatorError, CheckResult, finding
 
     try:
         return check(subject, log)
@@ -259,7 +244,7 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
-    from mdnum.audit.check import in_order
+    from mdnum.audit.base import in_order
     from mdnum.audit.checks import CHECKS
 
     if checks is None:
@@ -275,7 +260,8 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
 
 
 def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
-    from mdnum.audit.structures import LoadedCalculator, load_calculator
+    from mdnum.audit.record import load_calculator
+    from mdnum.audit.subject import LoadedCalculator
 
     if isinstance(calculator, str):
         return load_calculator(calculator)
@@ -328,7 +314,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
-    from mdnum.audit.verdict import answers
+    from mdnum.audit.base import answers
 
     atoms, given = state.atoms, units.get(state.units)
     said = answers(state.shown, state.checks)
@@ -418,7 +404,7 @@ def _says(result: CheckResult) -> str:
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
     """(finding, those that may follow from it) of each that is listed by itself."""
-    from mdnum.audit.verdict import heads
+    from mdnum.audit.base import heads
 
     above = heads([(one.code, one.severity) for one in found])
     return [
@@ -440,9 +426,27 @@ def _finding(one: Observed, section: str, cause: str) -> Finding:
     return made if made.text else replace(made, text=TEXTS("invariance_finding", **one.values))
 
 
-def _judge(view: View) -> Verdict:
+@dataclass(frozen=True)
+class AuditView(View):
+    """The folder of an audit.
+
+    Attributes:
+        given: what it has found, where that is known; it is read otherwise.
+    """
+
+    given: AuditState | None = None
+
+    @cached_property
+    def state(self) -> AuditState:
+        """What was found."""
+        from mdnum.audit.record import kept
+
+        return kept(self.folder) if self.given is None else self.given
+
+
+def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
-    state: AuditState = view.extra
+    state = view.state
     given, titles = units.get(state.units), {}
     for result in state.shown:
         titles |= {id(one): result.title for one in result.findings}
@@ -459,8 +463,7 @@ def _judge(view: View) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    from mdnum.audit.base import TIME_UP
-    from mdnum.audit.verdict import answers, largely_unasked, to_come
+    from mdnum.audit.base import TIME_UP, answers, largely_unasked, to_come
 
     said = answers(state.shown, state.checks)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
@@ -513,8 +516,8 @@ def _unfinished(state: AuditState, headline: str, time_up: str) -> str:
 # -- how it is shown -------------------------------------------------------------------------------
 
 
-def _page(view: View, verdict: Verdict) -> Page:
-    state, summary = view.extra, view.summary
+def _page(view: AuditView, verdict: Verdict) -> Page:
+    state, summary = view.state, view.summary
     given = units.get(state.units)
     found = [f"{one['title']} ({_ways(one)}): {one['says']}" for one in summary["parts"]]
     sections = [Section("What each check found", found, terminal=True)]
@@ -603,10 +606,4 @@ def _subject(summary: Mapping[str, Any], given: units.Units) -> Iterator[tuple[s
     yield "Took", f"{cell(summary['seconds'])} s"
 
 
-def _load(folder: RunFolder) -> AuditState:
-    from mdnum.audit.record import kept
-
-    return kept(folder)
-
-
-VERBS = {"audit": Verb(_judge, _page, load=_load)}
+VERBS = {"audit": Verb(_judge, _page, AuditView)}

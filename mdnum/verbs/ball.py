@@ -10,28 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
 from mdnum.verbs import frame
-from mdnum.verbs.ball_page import (
-    TEXTS,
-    applied,
-    decision,
-    ended,
-    first_step,
-    located,
-    margin_ratio,
-    page,
-    parameters,
-    time_of,
-)
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.ball_page import TEXTS, BallView, decision, page
+from mdnum.verbs.frame import Outcome, Progress, Verb
 
 if TYPE_CHECKING:
     from mdnum.ball.problem import BallProblem
     from mdnum.ball.rollout import BallRun
-    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build_ball import BallSimulation
+    from mdnum.systems.load import BallSystem
 
 #: Balls times steps of which every state is kept, and residuals of stop decisions kept.
 _STATES, _RESIDUALS = 20_000_000, 5_000_000
@@ -145,7 +135,7 @@ def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Loss, derivatives, closed form and variants; and the separations from the variants."""
-    from mdnum.ball.compare import first_difference
+    from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
     problem, asked = simulation.problem, simulation.system.spec.gradient
@@ -185,24 +175,18 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
     if not asked.of:
         return []
     made = compare(problem, asked.of, asked.methods[: 1 if first else None])
+    empty = {"value": None, "gradient": {}, "depends": {}}
     found: list[dict[str, Any]] = [
         {
-            "method": one.method,
-            "says": one.description,
-            "value": float(one.value),
+            "method": one.method, "says": one.description, "value": float(one.value),
             "gradient": {name: float(value) for name, value in one.gradient.items()},
             "depends": {name: bool(value) for name, value in one.depends.items()},
-            "why": dict(one.notes),
-            "details": dict(one.details),
-            "refused": False,
+            "why": dict(one.notes), "details": dict(one.details), "refused": False,
         }
         for one in made
-    ]
+    ]  # fmt: skip
     # a method that does not apply says why; the others are still worth having
-    for name, why in made.refused.items():
-        found.append(
-            {"method": name, "says": why, "value": None, "gradient": {}, "depends": {}, "refused": True}
-        )
+    found += [{"method": name, "says": why, **empty, "refused": True} for name, why in made.refused.items()]
     return found
 
 
@@ -216,12 +200,12 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 # --- judged -------------------------------------------------------------------------------------------
 
 
-def judge(view: View) -> Verdict:
+def judge(view: BallView) -> Verdict:
     """Findings, and what is right, from the folder alone."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
-        _resting,
+        _resting, _remarks,
     )  # fmt: skip
     found = [finding for rule in rules for finding in rule(view)]
     sizes = {"balls": summary["balls"], "steps": summary["steps"]}
@@ -233,18 +217,18 @@ def judge(view: View) -> Verdict:
     )
 
 
-def _evidence(view: View, codes: set[str]) -> Iterator[str]:
-    summary, exact = view.summary, view.summary["exact"] or {}
+def _evidence(view: BallView, codes: set[str]) -> Iterator[str]:
+    summary, exact = view.summary, view.exact
     flips = summary["flips_entered"] + summary["flips_left"]
     if "LEDGER_INCOMPLETE" not in codes:
         yield TEXTS("flips", flips=flips, steps=summary["steps"])
-    solves = ended(view)
-    if solves and not located(view):
+    solves = view.ended
+    if solves and not view.located:
         ways = listed([f"{word} {count(n)}" for word, n in solves.items()])
         yield TEXTS("solves", solves=sum(solves.values()), ways=ways)
     if not summary["ambiguous"]:
         yield TEXTS("rounding")
-        ratio = margin_ratio(view)
+        ratio = view.ratio
         if np.any(np.isfinite(ratio)):
             yield TEXTS("nearest_flip", ratio=float(ratio[np.isfinite(ratio)].min()))
         if summary["smallest_stop_margin"] is not None:
@@ -252,7 +236,7 @@ def _evidence(view: View, codes: set[str]) -> Iterator[str]:
     if exact:
         yield TEXTS("exact", end=exact["height_error"], most=exact["height_error_largest"])
     for name, slope in (exact.get("gradient") or {}).items():
-        met = [one["method"] for one in applied(view) if not differs(one["gradient"].get(name), slope)]
+        met = [one["method"] for one in view.applied if not differs(one["gradient"].get(name), slope)]
         if met:
             yield TEXTS("met", names=name, methods=listed(met))
 
@@ -264,47 +248,43 @@ def differs(first: float | None, second: float | None) -> bool:
     return abs(first - second) > _DISAGREE * max(abs(first), abs(second))
 
 
-def _finite(view: View) -> Iterator[Finding]:
+def _finite(view: BallView) -> Iterator[Finding]:
     broken = view.summary["not_finite"]
-    if broken is None and ended(view).get("not finite"):
-        broken = first_step(view, "not finite")
+    if broken is None and view.ended.get("not finite"):
+        broken = view.first_step("not finite")
     if broken is not None:
         yield TEXTS.finding("NOT_FINITE", step=broken)
 
 
-def _ledger(view: View) -> Iterator[Finding]:
+def _ledger(view: BallView) -> Iterator[Finding]:
     series, contacts = view.table("steps"), view.table("contacts")
-    change = series["entered"].astype(np.int64) - series["left"].astype(np.int64)
-    wrong = series["contacts"] != series["contacts"][0] + np.cumsum(change) - change[0]
     flips = int(series["entered"].sum(dtype=np.int64) + series["left"].sum(dtype=np.int64))
-    order = np.lexsort((contacts["step"], contacts["ball"]))
-    ball, entered = contacts["ball"][order], contacts["entered"][order].astype(bool)
-    section = "Contacts"
-    if wrong.any():
-        step = int(series["step"][np.argmax(wrong)])
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "balance", step=step, section=section)
-    elif flips != len(ball):
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "rows", flips=flips, rows=len(ball), section=section)
-    elif np.any((ball[1:] == ball[:-1]) & (entered[1:] == entered[:-1])):
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "twice", section=section)
+    by_ball = {**contacts, "i": contacts["ball"], "j": np.zeros_like(contacts["ball"])}
+    sound = analysis.algebra_holds({**series, "pairs": series["contacts"]})
+    if not sound.all():
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "balance", step=int(series["step"][np.argmin(sound)]))
+    elif flips != len(contacts["ball"]):
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "rows", flips=flips, rows=len(contacts["ball"]))
+    elif not analysis.scan(by_ball, len(series["step"])).alternates:
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "twice")
 
 
-def _finite_gradient(view: View) -> Iterator[Finding]:
+def _finite_gradient(view: BallView) -> Iterator[Finding]:
     found = [
         f"d/d{name} by {made['method']}"
-        for made in applied(view)
+        for made in view.applied
         for name, value in made["gradient"].items()
         if value is None or not np.isfinite(value)
     ]
     if found:
-        yield TEXTS.finding("GRADIENT_NOT_FINITE", which=listed(found), section="Gradient")
+        yield TEXTS.finding("GRADIENT_NOT_FINITE", which=listed(found))
 
 
-def _independent(view: View) -> Iterator[Finding]:
+def _independent(view: BallView) -> Iterator[Finding]:
     def unused(made: Mapping[str, Any]) -> tuple[str, ...]:
         return tuple(name for name, depends in (made.get("depends") or {}).items() if not depends)
 
-    own = {f"by {made['method']}": unused(made) for made in applied(view)}
+    own = {f"by {made['method']}": unused(made) for made in view.applied}
     theirs = {f"in variant {variant['name']}": unused(variant) for variant in view.summary["variants"]}
     places = {place: names for place, names in (own | theirs).items() if names}
     if places:
@@ -318,41 +298,39 @@ def _independent(view: View) -> Iterator[Finding]:
         names = listed(list(dict.fromkeys(name for names in places.values() for name in names)))
         finding = TEXTS.finding(
             "LOSS_INDEPENDENT", *variants, names=names, places=listed(list(places)), told=told,
-            section="Gradient",
         )  # fmt: skip
         yield finding
     zero: dict[str, list[str]] = {}
-    for made in applied(view):
+    for made in view.applied:
         for name, value in made["gradient"].items():
             if value == 0 and (made.get("depends") or {}).get(name, True):
                 zero.setdefault(name, []).append(made["method"])
     for name, methods in zero.items():
-        yield TEXTS.finding("ZERO_GRADIENT", name=name, methods=listed(methods), section="Gradient")
+        yield TEXTS.finding("ZERO_GRADIENT", name=name, methods=listed(methods))
 
 
-def _ambiguous(view: View) -> Iterator[Finding]:
-    section = "Margins of decisions"
+def _ambiguous(view: BallView) -> Iterator[Finding]:
     if contacts := view.summary["ambiguous_contacts"]:
-        yield TEXTS.finding("AMBIGUOUS_CONTACTS", contacts=contacts, section=section)
+        yield TEXTS.finding("AMBIGUOUS_CONTACTS", contacts=contacts)
     if stops := view.summary["ambiguous_stops"]:
-        yield TEXTS.finding("AMBIGUOUS_STOPS", stops=stops, section=section)
+        yield TEXTS.finding("AMBIGUOUS_STOPS", stops=stops)
 
 
-def _cap(view: View) -> Iterator[Finding]:
-    solves = ended(view)
+def _cap(view: BallView) -> Iterator[Finding]:
+    solves = view.ended
     if capped := solves.get("cap", 0):
         yield TEXTS.finding(
-            "SOLVER_CAP", section="Iterations per step", capped=capped, solves=sum(solves.values()),
-            step=first_step(view, "cap"), cap=(view.system.get("stop") or {}).get("max_iter", 0),
+            "SOLVER_CAP", capped=capped, solves=sum(solves.values()),
+            step=view.first_step("cap"), cap=(view.system.get("stop") or {}).get("max_iter", 0),
         )  # fmt: skip
 
 
-def _disagree(view: View) -> Iterator[Finding]:
-    exact = (view.summary["exact"] or {}).get("gradient") or {}
+def _disagree(view: BallView) -> Iterator[Finding]:
+    exact = view.exact.get("gradient") or {}
     rows = {
-        name: {made["method"]: made["gradient"][name] for made in applied(view)
+        name: {made["method"]: made["gradient"][name] for made in view.applied
                if made["gradient"].get(name) is not None}
-        for name in parameters(view)
+        for name in view.parameters
     }  # fmt: skip
 
     def told(names: Sequence[str]) -> str:
@@ -379,17 +357,16 @@ def _disagree(view: View) -> Iterator[Finding]:
         ]
         known = any(name in exact for name in apart)
         yield TEXTS.finding(
-            "METHODS_DISAGREE", *(["right"] if right else ["none"] if known else []), section="Gradient",
+            "METHODS_DISAGREE", *(["right"] if right else ["none"] if known else []),
             names=listed([f"dloss/d{name}" for name in apart]), told=told(apart),
             right=listed(right) if right else "",
         )  # fmt: skip
     if off:
-        section = "Against the closed form"
-        yield TEXTS.finding("OFF_CLOSED_FORM", names=listed(off), told=told(off), section=section)
+        yield TEXTS.finding("OFF_CLOSED_FORM", names=listed(off), told=told(off))
 
 
-def _forks(view: View) -> Iterator[Finding]:
-    own = (applied(view) or [{"gradient": {}}])[0]["gradient"]
+def _forks(view: BallView) -> Iterator[Finding]:
+    own = (view.applied or [{"gradient": {}}])[0]["gradient"]
     forked = [variant for variant in view.summary["variants"] if variant["fork"] is not None]
 
     def rounding(variant: Mapping[str, Any]) -> bool:
@@ -411,33 +388,41 @@ def _forks(view: View) -> Iterator[Finding]:
         words = ["precision"] * precise + ["others"] * (len(group) > _NAMED)
         words += ["moved"] * (precise and any(map(moved, group)))
         values: dict[str, Any] = {"variants": len(group), "told": told, "others": len(group) - _NAMED}
-        yield TEXTS.finding("FORKED", *words, section="Variants", **values)
+        yield TEXTS.finding("FORKED", *words, **values)
 
 
-def _iterations(view: View) -> Iterator[Finding]:
+def _iterations(view: BallView) -> Iterator[Finding]:
     found = [variant for variant in view.summary["variants"] if variant["iterations_differ"]]
     if found:
         told = listed(
             [TEXTS("differs_at", name=one["name"], steps=one["iterations_differ"]) for one in found]
         )
-        counted = "impacts" if located(view) else "iterations"
-        yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told, section="Variants")
+        counted = "impacts" if view.located else "iterations"
+        yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told)
 
 
-def _resting(view: View) -> Iterator[Finding]:
-    series, section = view.table("steps"), "Heights and contacts"
-    if ended(view).get("rest"):
-        step = first_step(view, "rest")
-        rest = (view.summary["exact"] or {}).get("rest_time")
+def _remarks(view: BallView) -> Iterator[Finding]:
+    """What the system file says that runs, and is probably not what was meant."""
+    from mdnum.systems.ball import BallSpec, remarks
+
+    for code, values in remarks(BallSpec.model_validate(view.system)):
+        yield TEXTS.finding(code, **values)
+
+
+def _resting(view: BallView) -> Iterator[Finding]:
+    series = view.table("steps")
+    if view.ended.get("rest"):
+        step = view.first_step("rest")
+        rest = view.exact.get("rest_time")
         words = ["exact"] * (rest is not None)
-        time = float(time_of(view, np.array(step)))
-        yield TEXTS.finding("RESTING", *words, step=step, time=time, rest=rest, section=section)
+        time = float(view.time(np.array(step)))
+        yield TEXTS.finding("RESTING", *words, step=step, time=time, rest=rest)
         return
     off = series["contacts"] < view.summary["balls"]
     last = int(np.flatnonzero(off)[-1]) + 1 if off.any() else 0
     if len(off) - last > max(10, 0.05 * view.summary["steps"]):
         since = int(series["step"][last])
-        yield TEXTS.finding("RESTING", "floor", step=since, section=section)
+        yield TEXTS.finding("RESTING", "floor", step=since)
 
 
-VERBS = {"ball": Verb(judge, page)}
+VERBS = {"ball": Verb(judge, page, BallView)}

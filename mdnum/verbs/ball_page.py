@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.analysis import margins_in_bounds
+from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs
-from mdnum.report.svg import FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.verbs.frame import View
 
@@ -21,46 +23,54 @@ TABLE_ROWS = 5_000
 _REASONS = ("", "none", "tolerance", "cap", "fixed", "not finite", "rest")
 
 
-def applied(view: View) -> list[Mapping[str, Any]]:
-    """Derivatives by method, without those that do not apply."""
-    return [made for made in view.summary["gradient"] if not made["refused"]]
+class BallView(View):
+    """The folder of a run of the ball."""
 
+    @property
+    def applied(self) -> list[Mapping[str, Any]]:
+        """Derivatives by method, without those that do not apply."""
+        return [made for made in self.summary["gradient"] if not made["refused"]]
 
-def parameters(view: View) -> list[str]:
-    return list(dict.fromkeys(name for made in applied(view) for name in made["gradient"]))
+    @property
+    def exact(self) -> Mapping[str, Any]:
+        """What is known in closed form; empty where nothing is."""
+        return self.summary["exact"] or {}
 
+    @property
+    def parameters(self) -> list[str]:
+        """What the loss was differentiated by."""
+        return list(dict.fromkeys(name for made in self.applied for name in made["gradient"]))
 
-def ended(view: View) -> dict[str, int]:
-    return {word: n for word, n in view.summary["ended"].items() if n and word != "none"}
+    @property
+    def ended(self) -> dict[str, int]:
+        """How many solves ended, by what ended them."""
+        return {word: n for word, n in self.summary["ended"].items() if n and word != "none"}
 
+    @property
+    def located(self) -> bool:
+        """Whether impacts are located inside a step: what is counted are impacts, not iterations."""
+        return self.summary["integrator"] == "event-located"
 
-def located(view: View) -> bool:
-    """Whether impacts are located inside a step: what is counted are impacts, not iterations."""
-    return view.summary["integrator"] == "event-located"
+    def first_step(self, reason: str) -> int:
+        """The first step that something ended."""
+        series = self.table("steps")
+        return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
 
+    def time(self, step: np.ndarray) -> np.ndarray:
+        """When steps were, s."""
+        return np.interp(step, self.table("steps")["step"], self.table("steps")["time"])
 
-def first_step(view: View, reason: str) -> int:
-    series = view.table("steps")
-    return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
-
-
-def time_of(view: View, step: np.ndarray) -> np.ndarray:
-    return np.interp(step, view.table("steps")["step"], view.table("steps")["time"])
-
-
-def margin_ratio(view: View) -> np.ndarray:
-    """|margin| of each contact flip in units of its rounding bound."""
-    contacts = view.table("contacts")
-    margin, bound = np.abs(contacts["margin"]), contacts["bound"]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(bound > 0, margin / bound, np.where(margin > 0, np.inf, 0.0))
+    @cached_property
+    def ratio(self) -> np.ndarray:
+        """|margin| of each contact flip in units of its rounding bound."""
+        return margins_in_bounds(self.table("contacts"))
 
 
 def decision(variant: Mapping[str, Any]) -> str:
     return variant["channel"] + ("" if variant["ball"] is None else f", ball {variant['ball']}")
 
 
-def page(view: View, verdict: Verdict) -> Page:
+def page(view: BallView, verdict: Verdict) -> Page:
     """Heights, solver, margins, derivatives, closed form, variants, and every decision."""
     summary = view.summary
     about = TEXTS(
@@ -70,7 +80,7 @@ def page(view: View, verdict: Verdict) -> Page:
     described = [str(view.system["about"])] if view.system.get("about") else []
     sections = [
         Section("Heights and contacts", [*described, *_plots(view, _heights, _nearest)]),
-        Section("Impacts per step" if located(view) else "Iterations per step", _plots(view, _solver_plot)),
+        Section("Impacts per step" if view.located else "Iterations per step", _plots(view, _solver_plot)),
         Section("Margins of decisions", _plots(view, _stops, _flips)),
         Section("Gradient", list(_gradient(view)), terminal=True),
         Section("Against the closed form", list(_exact(view)), terminal=True),
@@ -84,17 +94,17 @@ def page(view: View, verdict: Verdict) -> Page:
     )  # fmt: skip
 
 
-def _keys(view: View) -> Iterator[Key]:
+def _keys(view: BallView) -> Iterator[Key]:
     summary, first = view.summary, view.summary["first_contact"]
     when = "none begins" if first is None else f"first at step {count(first)}"
     when = when if summary["flips_entered"] or first is None else "in contact at the start"
     yield Key("Contacts", count(summary["flips_entered"]), when)
     total = count(summary["iterations_total"])
-    if located(view):
+    if view.located:
         yield Key("Impacts", total, "located inside steps")
     else:
         most = f"{count(summary['iterations_max'])} at most in a step"
-        yield Key("Iterations", total, most if ended(view) else "nothing is solved")
+        yield Key("Iterations", total, most if view.ended else "nothing is solved")
     yield Key("Ambiguous", count(summary["ambiguous"]), "decisions within rounding")
     yield Key("Loss", number(summary["loss"], 6), summary["loss_kind"])
     error = (summary["exact"] or {}).get("height_error_largest")
@@ -103,7 +113,7 @@ def _keys(view: View) -> Iterator[Key]:
         yield Key("Speed", number(summary["steps_per_second"]), "steps per second")
 
 
-def _plots(view: View, *declared: Callable[[View], Plot | None]) -> list[Any]:
+def _plots(view: BallView, *declared: Callable[[BallView], Plot | None]) -> list[Any]:
     return [plot for plot in (each(view) for each in declared) if plot is not None]
 
 
@@ -118,7 +128,7 @@ def _groups(
     )
 
 
-def _heights(view: View) -> Plot | None:
+def _heights(view: BallView) -> Plot | None:
     rows, series, contacts = view.table("heights"), view.table("steps"), view.table("contacts")
     balls = np.unique(rows["ball"]).astype(int).tolist()
     roles: tuple[Role, ...] = ("first", "second", "third")
@@ -127,20 +137,20 @@ def _heights(view: View) -> Plot | None:
     if few:
         for n, ball in enumerate(balls):
             mine = rows["ball"] == ball
-            at = time_of(view, rows["step"][mine])
+            at = view.time(rows["step"][mine])
             lines.append(Series(f"ball {ball}", at, rows["y"][mine], "line", roles[n]))
     else:
         # one line with a gap after each ball
         order = np.argsort(rows["ball"], kind="stable")
         ends = np.cumsum(np.bincount(rows["ball"].astype(int)))
-        x, y = (np.insert(values[order], ends, np.nan) for values in (time_of(view, rows["step"]), rows["y"]))
+        x, y = (np.insert(values[order], ends, np.nan) for values in (view.time(rows["step"]), rows["y"]))
         lines.append(Series("balls", x, y))
     if not balls:
         if not np.isfinite(series["mean_height"]).any():
             return None
         lines.append(Series("mean over the balls", series["time"], series["mean_height"]))
     entered = contacts["entered"].astype(bool) & (np.isin(contacts["ball"], balls) | (not balls))
-    at = time_of(view, contacts["step"][entered])
+    at = view.time(contacts["step"][entered])
     # on the floor, where they are decided
     marks = [Series("contact begins", at, np.zeros(len(at)), "points", "bad")] if len(at) else []
     return Plot(
@@ -150,7 +160,7 @@ def _heights(view: View) -> Plot | None:
     )  # fmt: skip
 
 
-def _nearest(view: View) -> Plot | None:
+def _nearest(view: BallView) -> Plot | None:
     series = view.table("steps")
     margin = series["min_margin"]
     if not np.isfinite(margin).any():
@@ -165,7 +175,7 @@ def _nearest(view: View) -> Plot | None:
     )  # fmt: skip
 
 
-def _solver_plot(view: View) -> Plot | None:
+def _solver_plot(view: BallView) -> Plot | None:
     series = view.table("steps")
     reason, iterations = series["reason"].astype(str), series["iterations"].astype(float)
     shown = _groups(
@@ -174,16 +184,16 @@ def _solver_plot(view: View) -> Plot | None:
         (reason == "not finite", "not finite", "bad"), (reason == "rest", "held at rest", "third"),
         ((reason == "none") & (iterations > 0), "impacts", "second"),
     )  # fmt: skip
-    what = "impacts" if located(view) else "iterations"
+    what = "impacts" if view.located else "iterations"
     title = f"{what.capitalize()} per step, by what ended them"
     return Plot("iterations", title, "time (s)", f"{what} per step", shown) if shown else None
 
 
-def _stops(view: View) -> Plot | None:
+def _stops(view: BallView) -> Plot | None:
     rows = view.table("solver")
     stopped, capped = rows["stopped"].astype(bool), rows["reason"].astype(str) == "cap"
     shown = _groups(
-        time_of(view, rows["step"]), rows["margin"].astype(float), (stopped, "stopped", "first"),
+        view.time(rows["step"]), rows["margin"].astype(float), (stopped, "stopped", "first"),
         (~stopped & ~capped, "continued", "second"), (~stopped & capped, "gave up", "bad"),
     )  # fmt: skip
     if not shown:
@@ -196,11 +206,11 @@ def _stops(view: View) -> Plot | None:
     )  # fmt: skip
 
 
-def _flips(view: View) -> Plot | None:
-    ratio, contacts = margin_ratio(view), view.table("contacts")
+def _flips(view: BallView) -> Plot | None:
+    ratio, contacts = view.ratio, view.table("contacts")
     entered = contacts["entered"].astype(bool)
     shown = _groups(
-        time_of(view, contacts["step"]), ratio, (entered, "contact begins", "first"),
+        view.time(contacts["step"]), ratio, (entered, "contact begins", "first"),
         (~entered, "contact ends", "second"),
     )  # fmt: skip
     if not shown:
@@ -213,8 +223,8 @@ def _flips(view: View) -> Plot | None:
     )  # fmt: skip
 
 
-def _gradient(view: View) -> Iterator[Any]:
-    names, exact = parameters(view), view.summary["exact"] or {}
+def _gradient(view: BallView) -> Iterator[Any]:
+    names, exact = view.parameters, view.exact
     if not names:
         yield TEXTS("no_gradient")
         return
@@ -223,8 +233,8 @@ def _gradient(view: View) -> Iterator[Any]:
         "gradient", "A panel for each parameter; the line is the closed form's derivative where it is known. "
         "An open circle: the loss does not depend on the parameter.",
         "; ".join(f"dloss/d{name} by {one['method']}: {number(one['gradient'].get(name))}"
-                  for name in names for one in applied(view)),
-        lambda figure: _dots(view, figure), 0.5 + (0.55 + 0.25 * len(applied(view))) * len(names),
+                  for name in names for one in view.applied),
+        lambda figure: _dots(view, figure), 0.5 + (0.55 + 0.25 * len(view.applied)) * len(names),
     )  # fmt: skip
 
     def cell(made: Mapping[str, Any], name: str) -> Any:
@@ -235,7 +245,7 @@ def _gradient(view: View) -> Iterator[Any]:
         return text if error is None else f"{text} ± {number(error, 2)}"
 
     rows = [(one["method"], number(one["value"], 6), *(cell(one, name) for name in names), one["says"])
-            for one in applied(view)]  # fmt: skip
+            for one in view.applied]  # fmt: skip
     if known:
         slopes = [number(known.get(name), 6) for name in names]
         rows.append(("closed form", "–", *slopes, "The derivative of the exact motion."))
@@ -244,11 +254,11 @@ def _gradient(view: View) -> Iterator[Any]:
     yield Table(("method", "loss", *(f"dloss/d{name}" for name in names), "which derivative it is"), rows)
 
 
-def _dots(view: View, figure: Any) -> None:
+def _dots(view: BallView, figure: Any) -> None:
     from mdnum.report import drawing
 
-    made, names = applied(view), parameters(view)
-    exact = (view.summary["exact"] or {}).get("gradient") or {}
+    made, names = view.applied, view.parameters
+    exact = view.exact.get("gradient") or {}
     place = np.arange(len(made))[::-1]
     for axes, name in zip(figure.subplots(len(names), 1, squeeze=False)[:, 0], names, strict=True):
         values = np.array([np.nan if (x := one["gradient"].get(name)) is None else x for one in made], float)
@@ -269,7 +279,7 @@ def _dots(view: View, figure: Any) -> None:
             drawing.legend(axes)
 
 
-def _exact(view: View) -> Iterator[Any]:
+def _exact(view: BallView) -> Iterator[Any]:
     exact = view.summary["exact"]
     if not exact:
         return
@@ -291,7 +301,7 @@ def _exact(view: View) -> Iterator[Any]:
     yield pairs([motion, *rows, *off])
 
 
-def _variants(view: View) -> Iterator[Any]:
+def _variants(view: BallView) -> Iterator[Any]:
     variants, rows = view.summary["variants"], view.table("separations")
     if not variants:
         return
@@ -301,9 +311,9 @@ def _variants(view: View) -> Iterator[Any]:
         lines = []
         for n, name in enumerate(names):
             mine = rows["variant"].astype(str) == name
-            x, y = time_of(view, rows["step"][mine]), rows["separation"][mine]
+            x, y = view.time(rows["step"][mine]), rows["separation"][mine]
             lines.append(Series(name, x, y, "line", roles[n % len(roles)], n >= len(roles)))
-        forks = [(float(time_of(view, np.array(one["fork"]))), f"{one['name']} forks")
+        forks = [(float(view.time(np.array(one["fork"]))), f"{one['name']} forks")
                  for one in variants if one["fork"] is not None]  # fmt: skip
         yield Plot(
             "separation", "Separation of the variants", "time (s)", "largest |difference| of heights (m)",
@@ -329,72 +339,43 @@ def _variants(view: View) -> Iterator[Any]:
     yield TEXTS("variants")
 
 
-def _contacts(view: View) -> Iterator[Any]:
+def _contacts(view: BallView) -> Iterator[Any]:
     """The contact flips nearest to the threshold, in the order of steps."""
-    rows, ratio = view.table("contacts"), margin_ratio(view)
+    rows, ratio = view.table("contacts"), view.ratio
     if not len(ratio):
         yield TEXTS("no_contacts")
         return
     chosen = np.sort(np.argsort(ratio, kind="stable")[:TABLE_ROWS])
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "entered")
-    ]
-    columns += [(rows[name][chosen].astype(float), 4) for name in ("height", "margin", "velocity")]
-    columns.append((ratio[chosen].astype(float), 3))
     yield TEXTS("contacts", shown=len(chosen), rows=len(ratio))
-    yield Browse(
-        name="contacts",
-        row_id="contact-rows",
-        label="Search contacts",
-        placeholder="ball 3, step:100..200, entered",
-        columns=(
-            Column(0, "step", kind="count"),
-            Column(1, "ball", kind="count"),
-            Column(2, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(3, "height", "m"),
-            Column(4, "margin", "m"),
-            Column(5, "velocity", "m/s"),
-            Column(6, "margin", "÷ bound", digits=2, missing="∞"),
-        ),
-        rows=plain_rows(columns),
-        words={"entered": (2, 1), "in": (2, 1), "left": (2, 0), "out": (2, 0)},
-        ranges={"step": 0, "ball": 1},
-        subjects=(1,),
-        nouns=("ball",),
-        ambiguous=6,
+    near = {name: values[chosen] for name, values in rows.items()}
+    columns = (
+        Column("step", near["step"], "count"),
+        Column("ball", near["ball"], "count", subject=True),
+        flipped(near["entered"]),
+        Column("height", near["height"], unit="m"),
+        Column("margin", near["margin"], unit="m"),
+        Column("velocity", near["velocity"], unit="m/s"),
+        Column("margin", ratio[chosen], "ratio", "÷ bound", digits=2),
     )
+    yield Browse("contacts", "contacts", "ball 3, step:100..200, entered", columns)
 
 
-def _stop_decisions(view: View) -> Iterator[Any]:
+def _stop_decisions(view: BallView) -> Iterator[Any]:
     """The stop decisions nearest to their tolerance, in the order of steps."""
     rows = view.table("solver")
     if not len(rows["step"]):
         return
-    near = np.abs(rows["margin"].astype(float))
-    chosen = np.sort(np.argsort(near, kind="stable")[:TABLE_ROWS])
-    codes = np.array([_REASONS.index(word) for word in rows["reason"].astype(str)[chosen].tolist()], int)
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "iteration")
+    chosen = np.sort(np.argsort(np.abs(rows["margin"].astype(float)), kind="stable")[:TABLE_ROWS])
+    near = {name: values[chosen] for name, values in rows.items()}
+    codes = [_REASONS.index(word) for word in near["reason"].astype(str).tolist()]
+    columns = [
+        Column("step", near["step"], "count"),
+        *[Column("ball", near["ball"], "count")] * bool(np.any(rows["ball"] >= 0)),
+        Column("iteration", near["iteration"], "count"),
+        Column("residual", near["residual"], digits=4),
+        Column("margin", near["margin"], unit="tolerance − residual"),
+        Column("decision", near["stopped"], "word", words=("continued", "stopped"), colors=("out", "in")),
+        Column("ended by", codes, "word", words=_REASONS),
     ]
-    columns += [(rows[name][chosen].astype(float), 5) for name in ("residual", "margin")]
-    columns += [(rows["stopped"][chosen].astype(int), None), (codes, None)]
-    each = bool(np.any(rows["ball"] >= 0))
-    shown = [
-        Column(0, "step", kind="count"), Column(1, "ball", kind="count"),
-        Column(2, "iteration", kind="count"),
-        Column(3, "residual", digits=4), Column(4, "margin", "tolerance − residual", digits=3),
-        Column(5, "decision", kind="word", words=("continued", "stopped"), colors=("out", "in")),
-        Column(6, "ended by", kind="word", words=("", *_REASONS[1:])),
-    ]  # fmt: skip
-    yield TEXTS("stops", shown=len(chosen), rows=len(near))
-    yield Browse(
-        name="stops",
-        row_id="stop-rows",
-        label="Search stop decisions",
-        placeholder="step:100..200, iteration:5.., stopped, cap",
-        columns=tuple(column for column in shown if each or column.at != 1),
-        rows=plain_rows(columns),
-        words={"stopped": (5, 1), "continued": (5, 0), "tolerance": (6, 2), "cap": (6, 3), "fixed": (6, 4),
-               "rest": (6, 6)},
-        ranges={"step": 0, "ball": 1, "iteration": 2},
-    )  # fmt: skip
+    yield TEXTS("stops", shown=len(chosen), rows=len(rows["step"]))
+    yield Browse("stops", "stop decisions", "step:100..200, iteration:5.., stopped, cap", columns)

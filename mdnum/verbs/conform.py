@@ -16,12 +16,11 @@ from annotated_types import Ge, Le
 from mdnum.deadline import Deadline
 from mdnum.errors import InputError
 from mdnum.references.conformance.case import AREAS
-from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
+from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, CaseAnswers, Report
 from mdnum.references.conformance.lists import LIMITS, PairList
-from mdnum.references.conformance.results import CaseAnswers, Failed, Report
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
@@ -136,7 +135,8 @@ def conform(
             it is not the one that a folder was begun with.
         FolderError: the folder cannot be used.
     """
-    from mdnum.references.conformance.loading import from_object, load
+    from mdnum.references.conformance.lists import from_object
+    from mdnum.references.conformance.peers import load
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     deadline = Deadline(time)
@@ -187,17 +187,9 @@ def conform(
                 due = monotonic() + max(10.0, 20 * (monotonic() - now))
 
         examine(
-            tested,
-            cases=options.cases,
-            seed=options.seed,
-            large=options.large,
-            apart=True,
-            progress=frame.logged(folder, progress),
-            examiner=examiner,
-            deadline=deadline,
-            answers=state,
-            saved=saved,
-        )
+            tested, cases=options.cases, seed=options.seed, large=options.large, apart=True, saved=saved,
+            progress=frame.logged(folder, progress), examiner=examiner, deadline=deadline, answers=state,
+        )  # fmt: skip
         kept.save()
         found.seconds = state.seconds
         summary = _summary(found, _write_scripts(folder, found), options.seed)
@@ -243,72 +235,51 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
     tested = found.tested
+    own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "padding",
+           "asked", "wrong", "conforms", "seconds")  # fmt: skip
     why = {area: sorted(tally.why.items(), key=lambda one: -one[1]) for area, tally in found.areas.items()}
     return {
         "world": "conform",
         "question": "conform",
         "system": tested.name,
         "about": tested.description,
-        "package": tested.package,
-        "version": tested.version,
-        "kept": tested.kept,
+        **{name: getattr(tested, name) for name in ("package", "version", "kept", "known")},
+        **{name: getattr(found, name) for name in own},
         "full": found.how.full,
         "shift_sign": found.how.sign,
         "precision": "float64" if found.how.unit == DOUBLE else "float32",
-        "superset": found.superset,
-        "found_out": found.found_out,
         "single": found.single and found.single.name,
-        "ties": {"counted": found.ties[0], "not_counted": found.ties[1]},
-        "keeps_order": found.keeps_order,
-        "shifts": found.shifts,
-        "aliased": found.aliased,
-        "known": dict(tested.known),
+        "ties": dict(zip(("counted", "not_counted"), found.ties, strict=True)),
         "refusals": [
             {
-                "why": refusal.exception,
-                "case": refusal.case.name,
-                "atoms": refusal.case.atoms,
-                "uneven": refusal.uneven,
-                "answers": refusal.answers,
+                "why": one.exception, "case": one.case.name, "atoms": one.case.atoms, "uneven": one.uneven,
+                "answers": one.answers,
             }
-            for refusal in found.refusals
+            for one in found.refusals
         ],
-        "questions": found.questions,
-        "left": found.left,
-        "padding": found.padding,
         "padding_stated": found.stated,
         "rule": {"motions": found.motions, "calls": found.calls},
-        "asked": found.asked,
-        "wrong": found.wrong,
         "silent": sum(tally.silent for tally in found.areas.values()),
-        "conforms": found.conforms,
         "areas": [
-            {"area": area, "about": AREAS[area], "passed": tally.passed, "silent": tally.silent}
-            | asdict(tally)
+            asdict(tally)
+            | {name: getattr(tally, name) for name in ("passed", "failed", "silent")}
+            | {"area": area, "about": AREAS[area]}
             | {"why": [{"why": text, "cases": cases} for text, cases in why[area]]}
             for area, tally in found.areas.items()
         ],
-        "failures": [_failure(failed, name) for failed, name in zip(found.failed, scripts, strict=True)],
-        "large": None if found.large is None else {"atoms": found.large[0], "seconds": found.large[1]},
+        "failures": [
+            {
+                "code": one.code, "area": one.case.area, "case": one.case.name, "atoms": one.case.atoms,
+                "steps": one.case.steps, "step": one.worst.step, "text": one.worst.text, "script": script,
+                "alone": one.alone,
+            }
+            for one, script in zip(found.failed, scripts, strict=True)
+        ],
+        "large": None if found.large is None else dict(zip(("atoms", "seconds"), found.large, strict=True)),
         "seed": seed,
-        "seconds": found.seconds,
         "findings": [],
         "status": "stopped" if found.left or not found.whole else "complete",
-    }
-
-
-def _failure(failed: Failed, script: str) -> dict[str, Any]:
-    return {
-        "code": failed.code,
-        "area": failed.case.area,
-        "case": failed.asked.name,
-        "atoms": failed.case.atoms,
-        "steps": failed.case.steps,
-        "step": failed.worst.step,
-        "text": failed.worst.text,
-        "script": script,
-        "alone": failed.alone,
-    }
+    }  # fmt: skip
 
 
 def _cases(summary: Mapping[str, Any], code: str) -> int:
@@ -324,31 +295,25 @@ def judge(view: View) -> Verdict:
     """Headline, evidence and findings of an examination, from its folder alone."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
-    values = {
-        "name": view.name,
-        "asked": asked,
-        "wrong": wrong,
-        "right": _total(summary, "passed"),
-        "answered": asked - _total(summary, "refused") - _cases(summary, "RAISED"),
-        **{code.lower(): _cases(summary, code) for code in SILENT},
-    }
-    if not asked:
-        said = "nothing_asked"
-    elif not values["answered"]:
-        said = "nothing_answered"
-    elif not wrong:
-        said = "conforms"
-    elif summary["silent"] < wrong:
-        said = "failed"
-    else:
-        codes = [code.lower() for code in SILENT if values[code.lower()]]
-        said = f"silent_{codes[0]}" if len(codes) == 1 else "silent"
+    silent = {code.lower(): _cases(summary, code) for code in SILENT}
+    ways = [code for code, cases in silent.items() if cases]
+    answered = asked - _total(summary, "refused") - _cases(summary, "RAISED")
+    values = {"name": view.name, "asked": asked, "answered": answered, "wrong": wrong, **silent}
+    values["right"] = _total(summary, "passed")
+    said = (
+        "nothing_asked" if not asked
+        else "nothing_answered" if not answered
+        else "conforms" if not wrong
+        else "failed" if summary["silent"] < wrong
+        else f"silent_{ways[0]}" if len(ways) == 1
+        else "silent"
+    )  # fmt: skip
     headline = TEXTS(said, **values)
     if left:
         headline = TEXTS(
             "so_far", headline=headline, done=summary["questions"] - left, questions=summary["questions"]
         )
-    findings = [*_failures(summary), *_conduct(summary, values["answered"])]
+    findings = [*_failures(summary), *_conduct(summary, answered)]
     return conclude(findings, _evidence(view), headline=headline, best="good", judged=True)
 
 
@@ -401,7 +366,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
         ends = any("exit" in row["text"].lower() for row in rows)
         variants = ["rounding"] * rounding + ["exit"] * ends
         yield TEXTS.finding(
-            code, *variants, seen=seen, **values, section="Failures, reproduced", cause=cause
+            code, *variants, seen=seen, **values, cause=cause
         )  # fmt: skip
 
 
@@ -409,11 +374,11 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
     """What is nobody's mistake and good to know."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
-        yield TEXTS.finding("TIES", **ties, section="Conventions")
+        yield TEXTS.finding("TIES", **ties)
     if "float32" in summary["found_out"]:
-        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"], section="Conventions")
+        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"])
     if summary["keeps_order"] is False:
-        yield TEXTS.finding("ORDER", section="Conventions")
+        yield TEXTS.finding("ORDER")
     if summary["aliased"] is not None:
         yield TEXTS.finding("ALIASED", case=summary["aliased"])
     for refusal in summary["refusals"]:
@@ -424,11 +389,11 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
         (row, one) for row in summary["areas"] for one in row["why"] if row["refused"] and ": " in one["why"]
     ]
     often = max(reasons, key=lambda each: each[1]["cases"], default=({"area": ""}, {"why": ""}))
-    total, section = _total(summary, "refused"), "Cases by what they are about"
+    total = _total(summary, "refused")
     values = {"refused": total, "exception": often[1]["why"].rstrip(". "), "area": often[0]["area"]}
     if not answered:
         variants = ["time"] * (not summary["asked"]) + ["first"] * bool(reasons)
-        yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values, section=section)
+        yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values)
     elif reasons:
         others = [one for one in summary["refusals"] if one["answers"]]
         also = " ".join(
@@ -436,7 +401,7 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
             for one in others
         )  # fmt: skip
         variants = ["many"] * (total > 0.2 * summary["asked"]) + ["also"] * bool(also)
-        yield TEXTS.finding("REFUSES", *variants, **values, also=also, section=section)
+        yield TEXTS.finding("REFUSES", *variants, **values, also=also)
 
 
 def page(view: View, verdict: Verdict) -> Page:
@@ -484,36 +449,20 @@ def page(view: View, verdict: Verdict) -> Page:
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
     """A row for each area: of lists at one moment, and of lists in use."""
-    columns = (
-        "area",
-        "asked",
-        "right",
-        "wrong",
-        "no answer",
-        "refused",
-        "not asked",
-        "about",
-        "not answered",
-    )
+    counts = ("asked", "right", "wrong", "no answer", "refused", "not asked")
     for title, used in (("a list asked once", False), ("a list in use", True)):
         rows = [
             (
-                row["area"],
-                row["asked"],
-                row["passed"],
-                row["failed"] - row["silent"] or None,
-                row["silent"] or None,
-                row["refused"] or None,
-                row["skipped"] or None,
-                row["about"],
+                row["area"], row["asked"], row["passed"], row["failed"] - row["silent"] or None,
+                row["silent"] or None, row["refused"] or None, row["skipped"] or None, row["about"],
                 "; ".join(f"{one['why']} ({count(one['cases'])})" for one in row["why"][:3]),
             )
             for row in summary["areas"]
             if (row["area"] in _IN_USE) == used
-        ]
+        ]  # fmt: skip
         if rows:
             bad = frozenset(n for n, row in enumerate(rows) if row[3] or row[4])
-            yield Table(columns, rows, title, bad=bad)
+            yield Table(("area", *counts, "about", "not answered"), rows, title, bad=bad)
 
 
 def _figure(summary: Mapping[str, Any]) -> Figure:

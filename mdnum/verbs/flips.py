@@ -14,11 +14,10 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.store.tables import TableStream
+from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import about, ending, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
-from mdnum.verbs.interrupt import asked_to_stop
+from mdnum.verbs.flips_shared import FlipsView, about, ending, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -147,7 +146,7 @@ def flips(
         return finish(folder, report=report, result=found, progress=progress)
 
 
-VERBS = {"flips": Verb(judge, page)}
+VERBS = {"flips": Verb(judge, page, FlipsView)}
 
 
 # ---- what is asked for
@@ -302,7 +301,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     def columns(name: str, part: int, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         found: dict[str, list[np.ndarray]] = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
         for batch in streams[name].batches(["rule", *kinds]):
-            rows = {name: batch[name].to_numpy() for name in ("rule", *kinds)}
+            rows = {name: as_numpy(batch[name]) for name in ("rule", *kinds)}
             mine = rows["rule"] == rule
             if parts > 1:
                 mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part

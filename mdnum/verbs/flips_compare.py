@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number
 from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker, atoms_of
-from mdnum.verbs.flips_shared import Written, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, logged, new_folder, store
-from mdnum.verbs.interrupt import asked_to_stop
+from mdnum.verbs.flips_shared import FlipsView, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -128,19 +127,8 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 # ---- findings
 
 
-@dataclass(frozen=True)
-class _Shown:
+class ComparisonView(FlipsView):
     """A comparison as its sentences need it."""
-
-    view: View
-
-    @property
-    def summary(self) -> Mapping[str, Any]:
-        return self.view.summary
-
-    @property
-    def said(self) -> Written:
-        return Written(self.summary)
 
     @property
     def certain(self) -> bool:
@@ -156,15 +144,15 @@ class _Shown:
     @property
     def largest(self) -> tuple[str, str]:
         """(largest separation at any frame, what resolution explains then)."""
-        table = self.view.table("apart")
+        table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
-        return self.said.length(float(table["furthest"][at])), self.said.length(float(table["bound"][at]))
+        return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
         """A frame: its place among those compared, and its numbers in the files if others."""
         if at is None:
             return "no frame"
-        a, b = (int(self.view.table("apart")[f"number_{one}"][at]) for one in "ab")
+        a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
         if a == b == at:
             return f"frame {count(at)}"
         if a == b:
@@ -181,56 +169,55 @@ class _Shown:
         """Of one rule, for sentences."""
         first = one["first"] or {}
         return {
-            "rule": self.said.rule(one), "frames": self.summary["frames"], "pairs": first.get("pairs", 0),
+            "rule": self.rule(one), "frames": self.summary["frames"], "pairs": first.get("pairs", 0),
             "first": self.frame(first.get("frame")), "certain": self.frame(one["certain"]),
             "seed": self.frame(self.summary["seed"]), "beyond": self.frame(self.summary["beyond"]),
-            "furthest": self.said.length(first.get("furthest")),
-            "before": self.said.length(first.get("furthest_before")),
-            "last": self.said.length(self.summary["last"]["furthest"]),
+            "furthest": self.length(first.get("furthest")),
+            "before": self.length(first.get("furthest_before")),
+            "last": self.length(self.summary["last"]["furthest"]),
             "largest": self.largest[0], "explained": self.largest[1],
             "sure": first.get("pairs", 0) - first.get("ambiguous", 0),
         }  # fmt: skip
 
 
-def judge(view: View) -> Verdict:
+def judge(view: ComparisonView) -> Verdict:
     """Headline, evidence and findings of a comparison."""
-    shown = _Shown(view)
-    return conclude(_findings(shown), _evidence(shown), headline=_headline(shown))
+    return conclude(_findings(view), _evidence(view), headline=_headline(view))
 
 
-def _headline(shown: _Shown) -> str:
+def _headline(view: ComparisonView) -> str:
     """The verdict on the first rule, and where there are several a sentence on each other."""
-    first, *others = shown.summary["rules"]
-    text = TEXTS(f"head_{_head(shown, first)}", **shown.values(first))
-    if shown.summary["seed"] is None and not any(one["first"] for one in shown.summary["rules"]):
+    first, *others = view.summary["rules"]
+    text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
+    if view.summary["seed"] is None and not any(one["first"] for one in view.summary["rules"]):
         return text
-    return " ".join([text, *(_in_short(shown, one) for one in others)])
+    return " ".join([text, *(_in_short(view, one) for one in others)])
 
 
-def _head(shown: _Shown, one: Mapping[str, Any]) -> str:
-    summary, first = shown.summary, one["first"]
+def _head(view: ComparisonView, one: Mapping[str, Any]) -> str:
+    summary, first = view.summary, one["first"]
     box = "" if summary["other_box"] is None else "_box"
     if first is None:
         if summary["seed"] is None:
             return f"same{box}"
-        if not shown.certain:
+        if not view.certain:
             return "not_shown"
         return f"same_sets{box}" if summary["beyond"] is None else "positions"
-    if not shown.certain:
+    if not view.certain:
         return "not_shown_sets"
     if first["ambiguous"] == first["pairs"]:
         return "sets_never" if one["certain"] is None else "sets_unsure"
-    return "sets_box" if shown.by_boxes(first) else "sets"
+    return "sets_box" if view.by_boxes(first) else "sets"
 
 
-def _in_short(shown: _Shown, one: Mapping[str, Any]) -> str:
-    return TEXTS("other_same" if one["first"] is None else "other_differ", **shown.values(one))
+def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
+    return TEXTS("other_same" if one["first"] is None else "other_differ", **view.values(one))
 
 
-def _evidence(shown: _Shown) -> Iterator[str]:
+def _evidence(view: ComparisonView) -> Iterator[str]:
     """What the frames show: positions, the sets of the first rule, and in short those of the others."""
-    summary, (one, *others) = shown.summary, shown.summary["rules"]
-    seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], shown.values(one)
+    summary, (one, *others) = view.summary, view.summary["rules"]
+    seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
         code = "explained" if beyond is None else "at_once" if beyond == seed else "later"
         yield TEXTS(f"positions_{code}", **values)
@@ -240,15 +227,15 @@ def _evidence(shown: _Shown) -> Iterator[str]:
         yield TEXTS("positions_same")
     if first is not None:
         yield TEXTS(f"certain_{_certain(one)}", **values)
-        yield TEXTS(f"order_{_order(shown, one)}", **values)
-        yield from _leap(shown, first)
-        yield from _rates(shown, one["growth"])
+        yield TEXTS(f"order_{_order(view, one)}", **values)
+        yield from _leap(view, first)
+        yield from _rates(view, one["growth"])
     elif beyond is not None:
         yield TEXTS("order_none", **values)
     for other in others:
-        yield _in_short(shown, other)
+        yield _in_short(view, other)
         if other["first"] is not None:
-            yield TEXTS(f"certain_{_certain(other)}", **shown.values(other))
+            yield TEXTS(f"certain_{_certain(other)}", **view.values(other))
 
 
 def _certain(one: Mapping[str, Any]) -> str:
@@ -258,26 +245,26 @@ def _certain(one: Mapping[str, Any]) -> str:
     return "never" if one["certain"] is None else "later"
 
 
-def _order(shown: _Shown, one: Mapping[str, Any]) -> str:
+def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
     """Whether a difference of positions was there before one of sets."""
-    at, beyond, certain = one["first"]["frame"], shown.summary["beyond"], one["certain"]
+    at, beyond, certain = one["first"]["frame"], view.summary["beyond"], one["certain"]
     if beyond is not None and beyond < at:
         return "positions"
-    if shown.by_boxes(one["first"]):
+    if view.by_boxes(one["first"]):
         return "boxes"
-    if not shown.certain:
+    if not view.certain:
         return "not_shown"
     if at in (beyond, certain):
         return "together" if at else "start"
     return "unknown"
 
 
-def _leap(shown: _Shown, first: Mapping[str, Any]) -> Iterator[str]:
+def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
     """Whether the separation leaps when the sets come to differ, as it does nowhere before."""
-    table, at = shown.view.table("apart"), int(first["frame"])
+    table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it
-    start = max((shown.summary["seed"] or 0) + _WINDOW, at // 2)
+    start = max((view.summary["seed"] or 0) + _WINDOW, at // 2)
     # what resolution explains does not grow
     above = (furthest > table["bound"])[start:].all()
     if at + _WINDOW >= len(furthest) or start + _WINDOW > at or not above:
@@ -289,14 +276,14 @@ def _leap(shown: _Shown, first: Mapping[str, Any]) -> Iterator[str]:
         yield TEXTS(code, window=_WINDOW, after=after, before=before)
 
 
-def _rates(shown: _Shown, grown: Mapping[str, Any]) -> Iterator[str]:
+def _rates(view: ComparisonView, grown: Mapping[str, Any]) -> Iterator[str]:
     rates = {}
     for name in ("before", "after"):
         line = grown[name]
         if line is not None and line["r2"] >= _FITS and line["rate"] > 0:
             rates[name] = line["rate"]
             text = number(1 / line["rate"])
-            length = shown.said.time(text) if shown.summary["timed"] else f"{text} frames"
+            length = view.time(text) if view.summary["timed"] else f"{text} frames"
             yield TEXTS(f"growth_{name}", time=length, frames=line["frames"])
     if len(rates) == 2:
         ratio = rates["after"] / rates["before"]
@@ -304,8 +291,8 @@ def _rates(shown: _Shown, grown: Mapping[str, Any]) -> Iterator[str]:
         yield TEXTS(f"growth_{code}", ratio=ratio)
 
 
-def _findings(shown: _Shown) -> Iterator[Finding]:
-    summary, frames = shown.summary, shown.summary["frames"]
+def _findings(view: ComparisonView) -> Iterator[Finding]:
+    summary, frames = view.summary, view.summary["frames"]
     if summary["stopped"]:
         yield TEXTS.finding("STOPPED", frames=frames, error=summary["stopped"])
     if summary["interrupted"]:
@@ -314,8 +301,8 @@ def _findings(shown: _Shown) -> Iterator[Finding]:
     if unsure:
         made = []
         for one in unsure:
-            variants = ["minor"] * (not shown.certain) + ["never"] * (one["certain"] is None)
-            made.append(TEXTS.finding("WITHIN_RESOLUTION", *variants, section="Rules", **shown.values(one)))
+            variants = ["minor"] * (not view.certain) + ["never"] * (one["certain"] is None)
+            made.append(TEXTS.finding("WITHIN_RESOLUTION", *variants, **view.values(one)))
         text = " ".join([*(one.text for one in made), TEXTS.entries["WITHIN_RESOLUTION"]["why"]])
         yield replace(made[0], text=text)
     boxes, beyond = summary["other_box"], summary["beyond"]
@@ -323,9 +310,9 @@ def _findings(shown: _Shown) -> Iterator[Finding]:
         # two runs at constant pressure have two boxes once they have diverged
         later = not boxes["axes"] and beyond is not None and 0 < beyond <= boxes["frame"]
         variants = ["later"] * later + ["axes"] * boxes["axes"]
-        a, b = (shown.said.box(boxes[one]) for one in "ab")
-        yield TEXTS.finding("OTHER_BOX", *variants, frame=shown.frame(boxes["frame"]), a=a, b=b)
-    if shown.differ:
+        a, b = (view.box(boxes[one]) for one in "ab")
+        yield TEXTS.finding("OTHER_BOX", *variants, frame=view.frame(boxes["frame"]), a=a, b=b)
+    if view.differ:
         yield TEXTS.finding("NO_CAUSE_FROM_FILES")
     if not summary["same_species"]:
         yield TEXTS.finding("OTHER_SPECIES")
@@ -341,54 +328,54 @@ def _findings(shown: _Shown) -> Iterator[Finding]:
 # ---- page
 
 
-def page(view: View, verdict: Verdict) -> Page:
+def page(view: ComparisonView, verdict: Verdict) -> Page:
     """The page of two trajectories."""
-    summary, shown = view.summary, _Shown(view)
+    summary = view.summary
     table = view.table("apart")
     size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')} of both"
-    cannot = [*(["cause"] * shown.differ), "between", "programs"]
+    cannot = [*(["cause"] * view.differ), "between", "programs"]
     sections = [
-        Section("Rules", [_rules(shown), *_first_pairs(shown)], terminal=True),
-        Section("Separation", list(_separation(shown, table))),
-        Section("Pairs that differ", list(_differing(shown, table))),
+        Section("Rules", [_rules(view), *_first_pairs(view)], terminal=True),
+        Section("Separation", list(_separation(view, table))),
+        Section("Pairs that differ", list(_differing(view, table))),
         Section("What two trajectories do not show", [TEXTS(f"cannot_{one}") for one in cannot]),
-        Section("What was read", [pairs(list(_input(shown, size))), TEXTS("files")]),
+        Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]),
     ]
     return Page(
-        f"{view.name} and {summary['other']}", f"{size} compared", list(_keys(shown)),
+        f"{view.name} and {summary['other']}", f"{size} compared", list(_keys(view)),
         [one for one in sections if one.parts], provenance=view.folder.provenance,
     )  # fmt: skip
 
 
-def _keys(shown: _Shown) -> Iterator[Key]:
-    summary, one, said = shown.summary, shown.summary["rules"][0], shown.said
+def _keys(view: ComparisonView) -> Iterator[Key]:
+    summary, one = view.summary, view.summary["rules"][0]
 
     def first_frame(at: int | None) -> str:
         return "never" if at is None else count(at)
 
     first, seed = one["first"], summary["seed"]
-    at_all = "the same bit for bit" if seed is None else f"at all from {shown.frame(seed)} on"
+    at_all = "the same bit for bit" if seed is None else f"at all from {view.frame(seed)} on"
     yield Key("Positions differ", first_frame(summary["beyond"]), f"first frame, beyond resolution; {at_all}")
     yield Key(
         "Sets differ",
         first_frame(None if first is None else first["frame"]),
-        f"first frame ({said.rule(one)})",
+        f"first frame ({view.rule(one)})",
     )
     if first is not None:
         yield Key("Sets differ for certain", first_frame(one["certain"]), "first frame, beyond resolution")
         yield Key("Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution")
-        yield Key("Separation then", said.length(first["furthest"]), "furthest atom")
-    yield Key("Separation at the end", said.length(summary["last"]["furthest"]), "furthest atom")
+        yield Key("Separation then", view.length(first["furthest"]), "furthest atom")
+    yield Key("Separation at the end", view.length(summary["last"]["furthest"]), "furthest atom")
 
 
-def _rules(shown: _Shown) -> Table:
+def _rules(view: ComparisonView) -> Table:
     columns = ("inside", "sets differ from frame", "pairs then", "undecidable", "for certain from frame")
     rows = []
-    for one in shown.summary["rules"]:
+    for one in view.summary["rules"]:
         first = one["first"] or {}
         rows.append(
             (
-                shown.said.rule(one),
+                view.rule(one),
                 *(first.get(name) for name in ("frame", "pairs", "ambiguous")),
                 one["certain"],
             )
@@ -396,10 +383,10 @@ def _rules(shown: _Shown) -> Table:
     return Table(columns, rows)
 
 
-def _first_pairs(shown: _Shown) -> Iterator[Table]:
-    unit = f" ({shown.said.unit})" if shown.said.unit else ""
+def _first_pairs(view: ComparisonView) -> Iterator[Table]:
+    unit = f" ({view.unit})" if view.unit else ""
     columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
-    for one in shown.summary["rules"]:
+    for one in view.summary["rules"]:
         rows = [
             (
                 f"{row['i']}–{row['j']}", f"{row['inside']} only", f"{row['distance_a']:.10g}",
@@ -411,42 +398,42 @@ def _first_pairs(shown: _Shown) -> Iterator[Table]:
             yield Table(
                 columns,
                 rows,
-                f"{shown.said.rule(one)}: the first pairs to differ, {shown.values(one)['first']}",
+                f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}",
             )
 
 
 def _axis(
-    shown: _Shown, table: Mapping[str, np.ndarray]
+    view: ComparisonView, table: Mapping[str, np.ndarray]
 ) -> tuple[str, np.ndarray, tuple[tuple[float, str], ...]]:
     """(label, values, marks) of an axis along the frames."""
-    timed = shown.summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
+    timed = view.summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]
-    beyond, first = shown.summary["beyond"], shown.summary["rules"][0]["first"]
+    beyond, first = view.summary["beyond"], view.summary["rules"][0]["first"]
     marks = [(float(x[beyond]), "positions differ")] if beyond else []
     marks += [(float(x[first["frame"]]), "sets differ")] if first is not None else []
-    return f"time ({shown.summary['time']})" if timed else "frame", x, tuple(marks)
+    return f"time ({view.summary['time']})" if timed else "frame", x, tuple(marks)
 
 
-def _separation(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Plot]:
+def _separation(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterator[Plot]:
     if len(table["frame"]) < 2 or not table["furthest"].any():
         return
-    label, x, marks = _axis(shown, table)
+    label, x, marks = _axis(view, table)
     series = (
         Series("furthest atom", x, table["furthest"]),
         Series("root mean square", x, table["typical"], role="second"),
         Series("explained by resolution", x, table["bound"], role="muted", dashed=True),
     )
-    y = f"separation ({shown.said.unit})" if shown.said.unit else "separation"
+    y = f"separation ({view.unit})" if view.unit else "separation"
     yield Plot(
         "separation", "Separation of the two", label, y, series, y_scale="log", verticals=marks,
         caption=TEXTS("caption_separation"),
     )  # fmt: skip
 
 
-def _differing(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
+def _differing(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
     only = (table["only_a"] + table["only_b"]).astype(float)
     if len(only) > 1 and only.any():
-        label, x, marks = _axis(shown, table)
+        label, x, marks = _axis(view, table)
         series = (
             Series("inside in one only", x, only, role="bad"),
             Series("inside in A", x, table["pairs_a"].astype(float), role="muted", dashed=True),
@@ -455,38 +442,27 @@ def _differing(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
             "differing", "Pairs that differ", label, "pairs", series, y_scale="log", verticals=marks,
             caption=TEXTS("caption_differing"),
         )  # fmt: skip
-    rows = shown.view.table("differing")
+    rows = view.table("differing")
     if not len(rows["i"]):
         return
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name].astype(int), None) for name in ("frame", "i", "j")
-    ]
-    columns.append(((rows["inside"] == "B").astype(int), None))
-    columns += [(rows[name], 6) for name in ("distance_a", "distance_b", "margin_a", "margin_b")]
-    columns += [(rows[name].astype(int), None) for name in ("ambiguous", "rule")]
-    rules, unit = tuple(shown.said.rule(one) for one in shown.summary["rules"]), shown.said.unit
+    rules, unit = tuple(view.rule(one) for one in view.summary["rules"]), view.unit
     yield TEXTS("browse")
-    yield Browse(
-        name="pairs", row_id="pair-rows", label="Search pairs",
-        placeholder="3-17, atom 5, frame:100..200, undecidable",
-        columns=(
-            Column(0, "frame", kind="count"),
-            Column(1, "pair", kind="pair"),
-            Column(3, "inside in", kind="word", words=("A only", "B only")),
-            Column(4, "r in A", unit, digits=5),
-            Column(5, "r in B", unit, digits=5),
-            Column(6, "margin in A", unit),
-            Column(7, "margin in B", unit),
-            Column(8, "decided", kind="word", words=("yes", "no")),
-            *((Column(9, "rule", kind="word", words=rules),) if len(rules) > 1 else ()),
-        ),
-        rows=plain_rows(columns), words={"undecidable": (8, 1)}, ranges={"frame": 0}, subjects=(1, 2),
-        nouns=("atom", "pair"),
-    )  # fmt: skip
+    columns = [
+        Column("frame", rows["frame"], "count"),
+        Column("pair", (rows["i"], rows["j"]), "pair"),
+        Column("inside in", rows["inside"] == "B", "word", words=("A only", "B only")),
+        Column("r in A", rows["distance_a"], unit=unit, digits=5),
+        Column("r in B", rows["distance_b"], unit=unit, digits=5),
+        Column("margin in A", rows["margin_a"], unit=unit),
+        Column("margin in B", rows["margin_b"], unit=unit),
+        Column("decided", rows["ambiguous"], "word", words=("yes", "no"), aliases=("", "undecidable")),
+        *[Column("rule", rows["rule"], "word", words=rules)] * (len(rules) > 1),
+    ]
+    yield Browse("pairs", "pairs", "3-17, atom 5, frame:100..200, undecidable", columns)
 
 
-def _input(shown: _Shown, size: str) -> Iterator[tuple[str, str]]:
-    summary, unit = shown.summary, shown.said.unit
+def _input(view: ComparisonView, size: str) -> Iterator[tuple[str, str]]:
+    summary, unit = view.summary, view.unit
     for side, prefix in (("A", ""), ("B", "other_")):
         file, format, kept = (summary[f"{prefix}{name}"] for name in ("file", "format", "resolution"))
         yield side, f"{file} ({format}); {resolution(kept, unit)}"
@@ -496,4 +472,4 @@ def _input(shown: _Shown, size: str) -> Iterator[tuple[str, str]]:
     yield "Took", f"{number(summary['seconds'], 2)} s"
 
 
-VERBS = {"flips-compare": Verb(judge, page)}
+VERBS = {"flips-compare": Verb(judge, page, ComparisonView)}

@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number, percent, plain
-from mdnum.verbs.flips_shared import TEXTS, Written, repeating, resolution
-from mdnum.verbs.frame import View
+from mdnum.verbs.flips_shared import TEXTS, FlipsView, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02
 #: The same for flips between frames, and for those that are reversed at once.
 HIDDEN, CHATTER = 0.10, 0.15
-#: Share of contacts without a beginning or an end in the file above which that is said.
+#: Share of contacts without a beginning or an end in the file above which that is view.
 CENSORED = 0.5
 #: Fewer flips than this say nothing in shares.
 FEW = 20
@@ -36,24 +35,21 @@ Limit = tuple[str, tuple[str, ...], dict[str, Any]]
 # ---- findings
 
 
-def judge(view: View) -> Verdict:
+def judge(view: FlipsView) -> Verdict:
     """Headline, evidence and findings of a trajectory."""
-    said = Written(view.summary)
-    found = [*_ended(view), *_of_rules(view, said), *_others(view, said)]
+    found = [*_ended(view), *_of_rules(view), *_others(view)]
     quiet = all(one.severity == "info" for one in found)
-    return conclude(
-        found, _evidence(view, said), headline=_headline(view, said), best="good" if quiet else "info"
-    )
+    return conclude(found, _evidence(view), headline=_headline(view), best="good" if quiet else "info")
 
 
-def _headline(view: View, said: Written) -> str:
+def _headline(view: FlipsView) -> str:
     summary, every = view.summary, view.summary["rules"]
     if summary["frames"] < 2:
-        return TEXTS("one_frame", pairs=every[0]["pairs_first"], rule=said.rule(every[0]))
+        return TEXTS("one_frame", pairs=every[0]["pairs_first"], rule=view.rule(every[0]))
     one = next((one for one in every if one["flips"]), None)
     if one is None:
         return TEXTS("no_flips", frames=summary["frames"])
-    frames, rule = summary["frames"], said.rule(one)
+    frames, rule = summary["frames"], view.rule(one)
     parts = [TEXTS("flips", flips=one["flips"], pairs=one["pairs_flipped"], frames=frames, rule=rule)]
     if one["flips"] >= FEW:
         flux, between = by_velocities(one), one["stride"]["between"]
@@ -65,19 +61,19 @@ def _headline(view: View, said: Written) -> str:
     return " ".join(parts)
 
 
-def _evidence(view: View, said: Written) -> Iterator[str]:
-    yield resolution(view.summary["resolution"], said.unit)
+def _evidence(view: FlipsView) -> Iterator[str]:
+    yield resolution(view.summary["resolution"], view.unit)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
         if view.summary["frames"] > 1 and not len(_disagreeing(view, place)):
             numbers = {name: one[name] for name in ("flips", "entered", "left")}
-            yield TEXTS("algebra", rule=said.rule(one), **numbers)
+            yield TEXTS("algebra", rule=view.rule(one), **numbers)
         life = one["lifetime"]
         if life["followed"] and life["leaves"]:
-            mean = said.duration(life["mean_by_rate"])
-            yield TEXTS("life", rule=said.rule(one), median=said.life(life), mean=mean)
+            mean = view.duration(life["mean_by_rate"])
+            yield TEXTS("life", rule=view.rule(one), median=view.life(life), mean=mean)
 
 
-def _ended(view: View) -> Iterator[Finding]:
+def _ended(view: FlipsView) -> Iterator[Finding]:
     summary = view.summary
     values = {"last": int(view.table("frames")["number"][-1]), "frames": summary["frames"]}
     if summary["stopped"]:
@@ -87,7 +83,7 @@ def _ended(view: View) -> Iterator[Finding]:
         yield TEXTS.finding("INTERRUPTED", **values)
 
 
-def _disagreeing(view: View, place: int) -> np.ndarray:
+def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
     """Frames whose pairs are not those before + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
@@ -95,13 +91,13 @@ def _disagreeing(view: View, place: int) -> np.ndarray:
     return np.flatnonzero(np.diff(table["pairs"][rows]) != net)
 
 
-def _of_rules(view: View, said: Written) -> Iterator[Finding]:
+def _of_rules(view: FlipsView) -> Iterator[Finding]:
     """One finding for each code: those of several rules are told one after the other, the reason once."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
-        for code, variants, values in _limits(view, said, place, one):
-            section = _title(_SECTIONS[code], view, said, one)
-            made = TEXTS.finding(code, *variants, section=section, rule=said.rule(one), **values)
+        for code, variants, values in _limits(view, place, one):
+            section = _title(TEXTS.entries[code].get("section", ""), view, one)
+            made = TEXTS.finding(code, *variants, section=section, rule=view.rule(one), **values)
             by_code.setdefault(code, []).append(made)
     for code, several in by_code.items():
         worst = min(several, key=lambda one: _ORDER.index(one.severity))
@@ -110,14 +106,14 @@ def _of_rules(view: View, said: Written) -> Iterator[Finding]:
         yield replace(worst, title=title, text=" ".join(filter(None, texts)))
 
 
-def _limits(view: View, said: Written, place: int, one: Rule) -> Iterator[Limit]:
+def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
     """(code, variants, values) of what one rule's flips do not show."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames, life = one["flips"], view.summary["frames"], one["lifetime"]
     if flips:
         yield from _undecided(one)
-        yield from _between(said, one)
+        yield from _between(view, one)
         flux, lost = one["flux"], by_velocities(one)
         if lost and lost > HIDDEN:
             values = {name: flux[name] for name in ("frames", "rate", "error", "seen")}
@@ -125,8 +121,8 @@ def _limits(view: View, said: Written, place: int, one: Rule) -> Iterator[Limit]
         chatter = one["chatter"]
         if flips >= FEW and chatter["share"] >= CHATTER and not _far_apart(one):
             values = {name: chatter[name] for name in ("share", "window", "undone")}
-            loose = said.life(one["intermittent"])
-            yield "CHATTER", (), {**values, "flips": flips, "life": said.life(life), "loose": loose}
+            loose = view.life(one["intermittent"])
+            yield "CHATTER", (), {**values, "flips": flips, "life": view.life(life), "loose": loose}
     total = sum(one["contacts"].values())
     cut = total - one["contacts"]["seen"]
     if total and cut > CENSORED * total and frames > 1:
@@ -153,10 +149,10 @@ def _far_apart(one: Rule) -> bool:
     return one["flips"] >= FEW and one["lifetime"]["median"] == 1
 
 
-def _between(said: Written, one: Rule) -> Iterator[Limit]:
+def _between(view: FlipsView, one: Rule) -> Iterator[Limit]:
     between = one["stride"]["between"]
     if _far_apart(one):
-        yield "FRAMES_FAR_APART", (), {"interval": said.duration(1), "stays": one["stays_over"]}
+        yield "FRAMES_FAR_APART", (), {"interval": view.duration(1), "stays": one["stays_over"]}
     elif one["flips"] < FEW or between is None:
         return
     elif between["lost"] is None:
@@ -181,11 +177,11 @@ def by_velocities(one: Rule) -> float | None:
     return flux["lost"] if flux["rate"] - flux["seen"] > 2.0 * flux["error"] else 0.0
 
 
-def _others(view: View, said: Written) -> Iterator[Finding]:
+def _others(view: FlipsView) -> Iterator[Finding]:
     summary, leaps = view.summary, view.summary["leaps"]
     if leaps:
         others = leaps["frames"] - 1
-        values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": said.length(leaps["distance"])}
+        values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": view.length(leaps["distance"])}
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
     if summary["frames"] > 1:
         if not summary["has_times"]:
@@ -193,7 +189,7 @@ def _others(view: View, said: Written) -> Iterator[Finding]:
         elif summary["backward"]:
             yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
         elif not summary["even"]:
-            yield TEXTS.finding("UNEVEN_FRAMES", interval=said.duration(1))
+            yield TEXTS.finding("UNEVEN_FRAMES", interval=view.duration(1))
     axes = repeating(summary["box"])
     more = (
         ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes) + ["velocities"] * summary["velocities_odd"]
@@ -201,63 +197,57 @@ def _others(view: View, said: Written) -> Iterator[Finding]:
     if summary["notes"] or more:
         yield TEXTS.finding("READING", *more, notes=" ".join(summary["notes"]), axes=", ".join(axes))
     if any(one["min_margin"] == 0 for one in summary["rules"]):
-        yield TEXTS.finding("TIE", margin=said.length(0.0))
+        yield TEXTS.finding("TIE", margin=view.length(0.0))
 
 
 # ---- sections
 
-_SECTIONS = {
-    "EVENT_ALGEBRA": "Pairs and flips", "UNDECIDABLE": "Pairs and flips", "IMAGES": "Pairs and flips",
-    "FRAMES_FAR_APART": "Between the frames", "BETWEEN_FRAMES": "Between the frames",
-    "FLUX": "Between the frames", "CHATTER": "Between the frames", "CENSORED": "How long contacts last",
-}  # fmt: skip
 
-
-def _title(title: str, view: View, said: Written, one: Rule) -> str:
+def _title(title: str, view: FlipsView, one: Rule) -> str:
     """Of a section about a rule, which is named where there are several."""
-    return f"{title}, {said.rule(one)}" if len(view.summary["rules"]) > 1 else title
+    return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 
-def page(view: View, verdict: Verdict) -> Page:
+def page(view: FlipsView, verdict: Verdict) -> Page:
     """The page of a trajectory."""
-    summary, said = view.summary, Written(view.summary)
+    summary = view.summary
     size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
-    if said.timed:
-        size += f" {said.time(plain(summary['interval']))} apart"
-    sections = [Section("Rules", [_rules(view, said)], terminal=True)]
+    if view.timed:
+        size += f" {view.time(plain(summary['interval']))} apart"
+    sections = [Section("Rules", [_rules(view)], terminal=True)]
     for place, one in enumerate(summary["rules"]):
-        sections += _rule_sections(view, said, place, one)
+        sections += _rule_sections(view, place, one)
     if (browsed := _busiest(view)) is not None:
         sections.append(Section("The busiest pairs", [browsed]))
-    sections.append(Section("What was read", [pairs(list(_input(view, said, size))), TEXTS("files")]))
+    sections.append(Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]))
     return Page(
         f"{view.name}: neighbor-set flips", f"{size}; {summary['format']}, read by {summary['reader']}",
-        list(_keys(said, summary["rules"][0])), sections, provenance=view.folder.provenance,
+        list(_keys(view, summary["rules"][0])), sections, provenance=view.folder.provenance,
     )  # fmt: skip
 
 
-def _keys(said: Written, one: Rule) -> Iterator[Key]:
-    yield Key("Pairs inside", number(one["pairs_mean"], 4), f"on average, {said.rule(one)}")
-    yield Key("Flips", count(one["flips"]), said.rate(one["flips_per_frame"]))
+def _keys(view: FlipsView, one: Rule) -> Iterator[Key]:
+    yield Key("Pairs inside", number(one["pairs_mean"], 4), f"on average, {view.rule(one)}")
+    yield Key("Flips", count(one["flips"]), view.rate(one["flips_per_frame"]))
     share = percent(one["ambiguous"] / one["flips"]) if one["flips"] else ""
     yield Key("Undecidable", count(one["ambiguous"]), share)
-    yield Key("Median contact", said.life(one["lifetime"]), "of those seen to begin")
-    yield Key("Mean by rate", said.duration(one["lifetime"]["mean_by_rate"]), "all of them")
+    yield Key("Median contact", view.life(one["lifetime"]), "of those seen to begin")
+    yield Key("Mean by rate", view.duration(one["lifetime"]["mean_by_rate"]), "all of them")
 
 
-def _input(view: View, said: Written, size: str) -> Iterator[tuple[str, str]]:
+def _input(view: FlipsView, size: str) -> Iterator[tuple[str, str]]:
     summary = view.summary
     frames = f", frames {summary['slice']}" if summary["slice"] else ""
     yield "File", f"{summary['file']}{frames} ({summary['format']}, read by {summary['reader']})"
     yield "Size", size
-    yield "Box", said.box(summary["box"]) + (", at the first frame" if summary["frames"] > 1 else "")
+    yield "Box", view.box(summary["box"]) + (", at the first frame" if summary["frames"] > 1 else "")
     if summary["between"]:
         yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
-    yield "Resolution", resolution(summary["resolution"], said.unit)
+    yield "Resolution", resolution(summary["resolution"], view.unit)
     yield "Took", f"{number(sum(summary['seconds'].values()), 2)} s"
 
 
-def _rules(view: View, said: Written) -> Table:
+def _rules(view: FlipsView) -> Table:
     columns = (
         "rule",
         "pairs",
@@ -270,30 +260,30 @@ def _rules(view: View, said: Written) -> Table:
     )
     rows = [
         (
-            said.rule(one), f"{count(one['pairs_first'])} to {count(one['pairs_last'])}", one["flips"],
-            one["flips_per_frame"], one["ambiguous"], said.life(one["lifetime"]),
-            said.duration(one["lifetime"]["mean_by_rate"]), percent(one["chatter"]["share"]),
+            view.rule(one), f"{count(one['pairs_first'])} to {count(one['pairs_last'])}", one["flips"],
+            one["flips_per_frame"], one["ambiguous"], view.life(one["lifetime"]),
+            view.duration(one["lifetime"]["mean_by_rate"]), percent(one["chatter"]["share"]),
         )
         for one in view.summary["rules"]
     ]  # fmt: skip
     return Table(columns, rows)
 
 
-def _rule_sections(view: View, said: Written, place: int, one: Rule) -> Iterator[Section]:
+def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
     plots: dict[str, list[Plot]] = {}
-    for title, plot in _plots(view, said, place, one) if place < _DRAWN else ():
+    for title, plot in _plots(view, place, one) if place < _DRAWN else ():
         plots.setdefault(title, []).append(replace(plot, name=f"rule{place}-{plot.name}"))
 
     def section(title: str, *parts: Any, level: Any = 3) -> Section:
-        return Section(_title(title, view, said, one), [*parts, *plots.get(title, [])], level=level)
+        return Section(_title(title, view, one), [*parts, *plots.get(title, [])], level=level)
 
-    yield section("Pairs and flips", pairs(list(_numbers(said, one))), level=2)
-    yield section("How long contacts last", pairs(list(_lifetimes(said, one))))
-    lost = list(_lost(view, said, one))
+    yield section("Pairs and flips", pairs(list(_numbers(view, one))), level=2)
+    yield section("How long contacts last", pairs(list(_lifetimes(view, one))))
+    lost = list(_lost(view, one))
     yield section("Between the frames", *([pairs(lost)] if lost else []))
-    tables = [_classes(view, said, "species", one["by_species"])]
+    tables = [_classes(view, "species", one["by_species"])]
     if one["by_residue_name"]:
-        tables.append(_classes(view, said, "residues by name", one["by_residue_name"]))
+        tables.append(_classes(view, "residues by name", one["by_residue_name"]))
     if len(rows := np.flatnonzero(view.table("residues")["rule"] == place)[:_ROWS]):
         table = view.table("residues")
         told = [(str(table["residue"][k]), int(table["between"][k]), int(table["within"][k])) for k in rows]
@@ -303,7 +293,7 @@ def _rule_sections(view: View, said: Written, place: int, one: Rule) -> Iterator
         yield section("Neighbors")
 
 
-def _numbers(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+def _numbers(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     around, chatter = one["neighbors"], one["chatter"]
     yield "Pairs inside at the first frame", count(one["pairs_first"])
     yield "Pairs inside at the last", count(one["pairs_last"])
@@ -314,14 +304,14 @@ def _numbers(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
     yield "Undecidable flips", count(one["ambiguous"])
     yield "Undecidable pairs at an average frame", number(one["near_mean"])
     if one["min_margin"] is not None:
-        yield "Closest decision", f"{said.length(one['min_margin'])} from its threshold"
+        yield "Closest decision", f"{view.length(one['min_margin'])} from its threshold"
     span = f"{count(around['fewest'])} to {count(around['most'])}"
     yield "Neighbors of an atom", f"{span}, {number(around['mean'], 4)} on average"
     back = f"{many(chatter['undone'], 'flip')} ({percent(chatter['share'])})"
     yield f"Reversed within {many(chatter['window'], 'frame')}", back
 
 
-def _lifetimes(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+def _lifetimes(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     seen, life, loose = one["contacts"], one["lifetime"], one["intermittent"]
     yield "Contacts seen whole", count(seen["seen"])
     yield "Going on after the last frame (censored on the right)", count(seen["goes_on"])
@@ -329,26 +319,26 @@ def _lifetimes(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
     yield "Throughout", count(seen["throughout"])
     if not life["followed"]:
         return
-    yield "Median life", said.life(life)
+    yield "Median life", view.life(life)
     if life["quarter_gone"] is not None:
-        ends = [said.duration(life[name]) for name in ("quarter_gone", "three_quarters_gone")]
+        ends = [view.duration(life[name]) for name in ("quarter_gone", "three_quarters_gone")]
         yield "Quartiles", " and ".join(ends)
     if life["mean"] is not None:
         at_least = "" if life["mean_is_whole"] else "at least "
-        yield "Mean life (product-limit)", at_least + said.duration(life["mean"])
+        yield "Mean life (product-limit)", at_least + view.duration(life["mean"])
     if life["leaves"]:
-        error = said.duration(life["mean_by_rate_error"], 2)
+        error = view.duration(life["mean_by_rate_error"], 2)
         yield (
             "Mean life (by rate)",
-            f"{said.duration(life['mean_by_rate'])} ± {error}, if leaves are independent",
+            f"{view.duration(life['mean_by_rate'])} ± {error}, if leaves are independent",
         )
     gaps = f"gaps up to {many(one['chatter']['window'], 'frame')} overlooked"
-    yield f"Median life, {gaps}", said.life(loose)
+    yield f"Median life, {gaps}", view.life(loose)
     if loose["leaves"]:
-        yield f"Mean life by rate, {gaps}", said.duration(loose["mean_by_rate"])
+        yield f"Mean life by rate, {gaps}", view.duration(loose["mean_by_rate"])
 
 
-def _lost(view: View, said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     between, flux = one["stride"]["between"], one["flux"]
     if between is not None:
         code = between["reason"]
@@ -370,54 +360,45 @@ def _lost(view: View, said: Written, one: Rule) -> Iterator[tuple[str, str]]:
         yield "Lost by velocities", percent(lost) if lost else none
 
 
-def _classes(view: View, said: Written, title: str, rows: list[Mapping[str, Any]]) -> Table:
+def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Table:
     frames = view.summary["frames"]
     told = [
         (
             f"{one['first']}–{one['second']}", one["inside"] / frames, one["entered"] + one["left"],
-            said.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
-            said.duration(one["stay"], beyond="–"),
+            view.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
+            view.duration(one["stay"], beyond="–"),
         )
         for one in rows[:_ROWS]
     ]  # fmt: skip
     return Table((title, "pairs inside", "flips", "rate", "mean stay by rate"), told)
 
 
-def _busiest(view: View) -> Browse | None:
+def _busiest(view: FlipsView) -> Browse | None:
     """The pairs that flipped most often; None where none did."""
     table, rules = view.table("busiest"), view.summary["rules"]
     if not len(table["i"]):
         return None
     words = np.array([f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)], object)
     ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
-    columns: list[tuple[np.ndarray, int | None]] = [(ranks, None)]
-    columns += [(table[name].astype(int), None) for name in ("i", "j", "rank", "flips", "inside")]
-    columns += [
-        (table["inside"] / view.summary["frames"], 3),
-        (table["rule"].astype(int), None),
-        (words, None),
-    ]
     names = tuple(one["rule"] for one in rules)
-    return Browse(
-        name="pairs", row_id="pair-rows", label="Search pairs", placeholder="3-17, atom 5",
-        columns=(
-            Column(0, "", kind="count"),
-            *((Column(7, "rule", kind="word", words=names),) if len(rules) > 1 else ()),
-            Column(1, "pair", kind="pair"),
-            *((Column(3, "image", kind="count"),) if table["rank"].any() else ()),
-            Column(8, "of", kind="text"),
-            Column(4, "flips", kind="count"),
-            Column(5, "frames inside", kind="count"),
-            Column(6, "share of frames"),
-        ),
-        rows=plain_rows(columns), subjects=(1, 2), nouns=("atom", "pair"),
-    )  # fmt: skip
+    share = table["inside"] / view.summary["frames"]
+    columns = [
+        Column("", ranks, "count"),
+        *[Column("rule", table["rule"], "word", words=names)] * (len(rules) > 1),
+        Column("pair", (table["i"], table["j"]), "pair"),
+        *[Column("image", table["rank"], "count")] * bool(table["rank"].any()),
+        Column("of", words, "text"),
+        Column("flips", table["flips"], "count"),
+        Column("frames inside", table["inside"], "count"),
+        Column("share of frames", share),
+    ]
+    return Browse("pairs", "pairs", "3-17, atom 5", columns)
 
 
 # ---- figures
 
 
-def _plots(view: View, said: Written, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
+def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
     """(title of its section, figure) of a rule; those that would be empty are left out."""
 
     def rows(table: str) -> dict[str, np.ndarray]:
@@ -428,7 +409,7 @@ def _plots(view: View, said: Written, place: int, one: Rule) -> Iterator[tuple[s
         return Plot(name, title, x, y, tuple(series), caption=TEXTS(f"caption_{name}"), **more)
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
-    label, x = said.axis(frames)
+    label, x = view.axis(frames)
     if moving:
         inside = [Series("pairs inside", x, frames["pairs"].astype(float))]
         yield "Pairs and flips", plot("pairs", "Pairs inside", label, "pairs inside", inside)
@@ -443,7 +424,7 @@ def _plots(view: View, said: Written, place: int, one: Rule) -> Iterator[tuple[s
         yield "Pairs and flips", plot("flips", "Flips from frame to frame", label, y, series)
     if view.summary["frames"] > 2:
         table = rows("lifetimes")
-        lags = table["frames"] * (view.summary["interval"] if said.timed else 1.0)
+        lags = table["frames"] * (view.summary["interval"] if view.timed else 1.0)
         lines: list[tuple[str, str, Any, bool]] = [
             ("lifetime (seen to begin)", "survival", "first", False),
             (f"gaps up to {view.summary['window']} frames overlooked", "intermittent", "first", True),
@@ -456,7 +437,7 @@ def _plots(view: View, said: Written, place: int, one: Rule) -> Iterator[tuple[s
             if np.isfinite(table[name][1:]).any()
         ]
         if series:
-            x_label = f"time ({view.summary['time']})" if said.timed else "frames"
+            x_label = f"time ({view.summary['time']})" if view.timed else "frames"
             title = "How long contacts last"
             yield title, plot("lifetimes", title, x_label, "share", series, x_scale="log")
     stride = one["stride"]

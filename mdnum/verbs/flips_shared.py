@@ -11,6 +11,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.report.finding import Texts
 from mdnum.report.words import listed, number, plain
+from mdnum.verbs.frame import View
 
 if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
@@ -68,17 +69,18 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
     }
 
 
-class Written:
-    """Numbers of a folder of flips as people read them: frames as times, lengths and rules with units.
+class FlipsView(View):
+    """A folder of flips, with its numbers as people read them: frames as times, lengths with units."""
 
-    Args:
-        summary: of the folder.
-    """
+    @property
+    def timed(self) -> bool:
+        """Whether frames have times."""
+        return bool(self.summary["timed"] and self.summary["interval"])
 
-    def __init__(self, summary: Mapping[str, Any]):
-        self.summary = summary
-        self.timed = bool(summary["timed"] and summary["interval"])
-        self.unit: str = summary["length"]
+    @property
+    def unit(self) -> str:
+        """The unit of length."""
+        return self.summary["length"]
 
     def time(self, text: str) -> str:
         """A number with the unit of time; steps are counted, units are not."""
@@ -108,7 +110,7 @@ class Written:
         """A length with its unit."""
         return f"{number(value)} {self.unit}".rstrip()
 
-    def rule(self, one: Rule) -> str:
+    def rule(self, one: Mapping[str, Any]) -> str:
         """A rule with its unit: r < 8.5 Å."""
         name = one["rule"]
         return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name

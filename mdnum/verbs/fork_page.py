@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.patches import Circle
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number, plain
 from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
 
@@ -286,7 +286,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
         return
     reason = minimal["reason"]
     values = {**minimal, "reason": reason[:1].upper() + reason[1:]}
-    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **values)
+    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_missing", **values)
     if minimal["pairs"]:
         rows = []
         for pair in minimal["pairs"]:
@@ -409,49 +409,26 @@ def _flips(view: View) -> Iterator[Any]:
         return
     ball = "balls" in s
     table = view.folder.read("cross_flips", rows=TABLE_ROWS)
-    run_b = (table["run"].astype(str) == "B").astype(int)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(table["margin"] / table["bound"]).astype(float)
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (table[name].astype(int), None) for name in ("step", "i", "j")
-    ]
-    columns.append((run_b, None))
-    if ball:
-        columns += [((table["channel"].astype(str) == "stop").astype(int), None)]
-        columns += [(table[name].astype(int), None) for name in ("a", "b")]
-        shown = (
-            Column(1, "ball", kind="count"), Column(4, "decision", kind="word", words=("contact", "stop")),
-            Column(5, "in A", kind="count"), Column(6, "in B", kind="count"),
-        )  # fmt: skip
-        words = {"contact": (4, 0), "stop": (4, 1)}
-    else:
-        columns += [(table[name].astype(int), None) for name in ("entered", "differs")]
-        columns.append((run_b, None))
-        shown = (
-            Column(1, "pair", kind="pair"), Column(3, "run", kind="word", words=("A", "B")),
-            Column(4, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(5, "the runs now", kind="word", words=("agree", "differ")),
-        )  # fmt: skip
-        words = {
-            "entered": (4, 1),
-            "in": (4, 1),
-            "left": (4, 0),
-            "out": (4, 0),
-            "differ": (5, 1),
-            "agree": (5, 0),
-        }
-    columns += [(table["margin"].astype(float), 4), (ratio, 3)]
-    rows = plain_rows(columns)
-    yield TEXTS("flips_ball" if ball else "flips_md", shown=len(rows), total=total, counted=s.get("counted"))
+        ratio = np.abs(table["margin"] / table["bound"])
+    run = Column("run", table["run"].astype(str) == "B", "word", words=("A", "B"))
+    shown = (
+        Column("ball", table["i"], "count", subject=True), run,
+        Column("decision", table["channel"].astype(str) == "stop", "word", words=("contact", "stop")),
+        Column("in A", table["a"], "count"), Column("in B", table["b"], "count"),
+    ) if ball else (
+        Column("pair", (table["i"], table["j"]), "pair"), run, flipped(table["entered"]),
+        Column("the runs now", table["differs"], "word", words=("agree", "differ")),
+    )  # fmt: skip
+    rows = len(table["step"])
+    yield TEXTS("flips_ball" if ball else "flips_md", shown=rows, total=total, counted=s.get("counted"))
     yield Browse(
-        name="flips", row_id="flip-rows", label="Search decisions",
-        placeholder="step:100..200, ambiguous, " + ("ball 3, contact" if ball else "3-17, atom 5, B"),
-        columns=(
-            Column(0, "step", kind="count"), *shown, Column(7, "margin"),
-            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        "flips", "decisions",
+        f"step:100..200, ambiguous, {'ball 3, contact' if ball else '3-17, atom 5, B'}",
+        (
+            Column("step", table["step"], "count"), *shown, Column("margin", table["margin"]),
+            Column("margin", ratio, "ratio", "÷ bound", digits=2),
         ),
-        rows=rows, words={**words, "a": (3, 0), "b": (3, 1)}, ranges={"step": 0},
-        subjects=(1,) if ball else (1, 2), nouns=("ball",) if ball else ("atom", "pair"), ambiguous=8,
     )  # fmt: skip
 
 

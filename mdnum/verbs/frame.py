@@ -12,6 +12,8 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 from __future__ import annotations
 
 import importlib
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -61,12 +63,10 @@ class View:
     Attributes:
         folder: on disk.
         summary: as written, without what was judged.
-        extra: what the verb's own `load` made of its tables, None without one.
     """
 
     folder: RunFolder
     summary: Mapping[str, Any]
-    extra: Any = None
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @property
@@ -108,13 +108,13 @@ class Verb:
     Attributes:
         judge: findings and headline, from the folder alone.
         page: everything else that is shown.
-        load: reads what both need once; default nothing beyond the summary.
+        view: how they read the folder.
         unfinished: whether a folder without a summary can be judged (a run that was killed can).
     """
 
-    judge: Callable[[View], Verdict]
-    page: Callable[[View, Verdict], Page]
-    load: Callable[[RunFolder], Any] | None = None
+    judge: Callable[[Any], Verdict]
+    page: Callable[[Any, Verdict], Page]
+    view: type[View] = View
     unfinished: bool = False
 
 
@@ -134,6 +134,41 @@ class Outcome:
     verdict: Verdict
     page: Page
     result: Any = None
+
+
+class Interrupted(KeyboardInterrupt):
+    """Somebody pressed control-C where there was an answer already, which is in its folder.
+
+    Args:
+        outcome: that answer.
+    """
+
+    def __init__(self, outcome: Outcome):
+        super().__init__("stopped")
+        self.outcome = outcome
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Control-C as a wish: whether it was pressed since; pressed again, it interrupts as it always does.
+
+    Outside of the main thread, where Python hands no signals over, nobody ever asks.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        asked.set()
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -189,7 +224,7 @@ def finish(
                 remedy=folder.again,
                 where=str(folder.path),
             )
-        view = View(folder, summary, verb.load(folder) if verb.load is not None else None)
+        view = verb.view(folder, summary)
         verdict = verb.judge(view)
         judged = verdict.store(folder, summary)
         page = verb.page(view, verdict)

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from mdnum.gradients import Gradient, Method, Problem
     from mdnum.gradients.diagnose import GradientDiagnosis
     from mdnum.store import RunFolder
-    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build import Simulation
-    from mdnum.systems.load import System
+    from mdnum.systems.load import BallSystem, System
 
 ALL = "all"
 #: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
@@ -429,7 +428,7 @@ def _ball_system(
     """The ball with the loss and the parameters that were asked for in its own tables."""
     from dataclasses import replace
 
-    from mdnum.systems import BallSystem, ball, ball_checks, load
+    from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
     if of is not None and of not in kinds:
@@ -437,7 +436,7 @@ def _ball_system(
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
     made = system if isinstance(system, BallSystem) else load(system, overrides, world="ball")
-    known = (*ball_checks.PARAMETERS[made.spec.contact.kind], *ball_checks.ALWAYS)
+    known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):
         seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate by"

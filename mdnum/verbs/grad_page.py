@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import Code, Key, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.words import MINUS, count, heading, many, number, percent, power
@@ -414,34 +414,21 @@ def _browse(table: Mapping[str, np.ndarray]) -> Browse:
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(table["margin"]) / table["bound"]
     added = [name for name in table if name.startswith("contribution.")][:_SHOWN]
-    columns: list[tuple[np.ndarray, int | None]] = [(np.arange(1, len(ratio) + 1), None)]
-    columns += [(table[name].astype(int), None) for name in ("step", "i", "j", "entered", "grazing")]
-    columns += [(table[name].astype(float), 4) for name in ("radial_speed", "weight", *added)]
-    columns.append((ratio.astype(float), 3))
-    adds = [f"adds to {name.removeprefix('contribution.').rpartition('.')[2]}" for name in added]
-    return Browse(
-        name="flips",
-        row_id="flip-rows",
-        label="Search flips",
-        placeholder="3-17, atom 5, step:100..200, entered, grazing",
-        columns=(
-            Column(0, "rank", kind="count"),
-            Column(1, "step", kind="count"),
-            Column(2, "pair", kind="pair"),
-            Column(4, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(6, "radial speed"),
-            Column(7, "weight"),
-            *(Column(8 + place, label) for place, label in enumerate(adds)),
-            Column(5, "", kind="word", words=("", "grazing")),
-            Column(8 + len(added), "margin", "÷ bound", digits=2, missing="∞"),
+    columns = [
+        Column("rank", np.arange(1, len(ratio) + 1), "count"),
+        Column("step", table["step"], "count"),
+        Column("pair", (table["i"], table["j"]), "pair"),
+        flipped(table["entered"]),
+        Column("radial speed", table["radial_speed"]),
+        Column("weight", table["weight"]),
+        *(
+            Column(f"adds to {one.removeprefix('contribution.').rpartition('.')[2]}", table[one])
+            for one in added
         ),
-        rows=plain_rows(columns),
-        words={"entered": (4, 1), "in": (4, 1), "left": (4, 0), "out": (4, 0), "grazing": (5, 1)},
-        ranges={"step": 1},
-        subjects=(2, 3),
-        nouns=("atom", "pair"),
-        ambiguous=8 + len(added),
-    )
+        Column("", table["grazing"], "word", words=("", "grazing")),
+        Column("margin", ratio, "ratio", "÷ bound", digits=2),
+    ]
+    return Browse("flips", "flips", "3-17, atom 5, step:100..200, entered, grazing", columns)
 
 
 def _spectrum(view: View) -> Iterator[Any]:

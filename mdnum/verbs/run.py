@@ -13,9 +13,8 @@ from mdnum.plain import plain
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.store import RunFolder
-from mdnum.verbs import run_page
-from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, say
-from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, Record, load, residual
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
+from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, page
 
 if TYPE_CHECKING:
     from mdnum.rollout.run import RunResult
@@ -134,17 +133,16 @@ def _beside_float64(folder: RunFolder, result: RunResult) -> None:
 # -- what is wrong with a run, or should be known about it -------------------------------------------
 
 
-def judge(view: View) -> Verdict:
+def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
-    run: Record = view.extra
     found = [
-        *_status(view, run), *_lists(view, run), *_ledger(view, run), *_energy(view, run), *_ase(view),
-        *_decisions(view, run), *_drift(view, run), *_cutoff(view, run),
+        *_status(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
+        *_decisions(run), *_drift(run), *_cutoff(run),
     ]  # fmt: skip
-    found += view.kept(TEXTS.entries)
+    found += run.kept(TEXTS.entries)
     severities = {finding.severity for finding in found}
-    complete = view.summary.get("status") == "complete"
-    failed = view.summary.get("status") == "failed"
+    complete = run.summary.get("status") == "complete"
+    failed = run.summary.get("status") == "failed"
     name = (
         "failed" if failed
         else "errors" if "error" in severities
@@ -153,51 +151,50 @@ def judge(view: View) -> Verdict:
         else "notes" if severities
         else "clean"
     )  # fmt: skip
-    return conclude(found, _evidence(view, run), headline=TEXTS(name), best="good")
+    return conclude(found, _evidence(run), headline=TEXTS(name), best="good")
 
 
-def _status(view: View, run: Record) -> Iterator[Finding]:
-    status = view.summary.get("status")
-    planned = view.summary.get("steps_asked") or (view.system.get("dynamics") or {}).get("steps")
+def _status(run: RunView) -> Iterator[Finding]:
+    status = run.summary.get("status")
+    planned = run.summary.get("steps_asked") or (run.system.get("dynamics") or {}).get("steps")
     of = f" of {planned:,}" if planned and planned > run.steps else ""
     if status == "failed":
-        error = view.summary.get("error") or "It stopped at the first number that was not finite."
+        error = run.summary.get("error") or "It stopped at the first number that was not finite."
         yield TEXTS.finding("RUN_FAILED", step=run.step(-1), of=of, error=str(error))
     elif status != "complete":
         yield TEXTS.finding("NOT_FINISHED", steps=run.steps, of=of)
 
 
-def _lists(view: View, run: Record) -> Iterator[Finding]:
+def _lists(run: RunView) -> Iterator[Finding]:
     lost, dangerous = run.total("lost_pairs"), run.total("dangerous_builds", "dangerous")
-    section = "List health"
     if lost:
         firsts = run.epochs["first_lost_step"]
         since = int(firsts[firsts >= 0].min()) if np.any(firsts >= 0) else None
-        rebuild = (view.system.get("neighbors") or {}).get("rebuild") or {}
+        rebuild = (run.system.get("neighbors") or {}).get("rebuild") or {}
         variants = ["since"] * (since is not None) + ["blind"] * (rebuild.get("check") is False)
         yield TEXTS.finding(
-            "LOST_PAIRS", *variants, section=section, lost=lost, pair_steps=run.total("lost_pair_steps"),
-            since=since, every=rebuild.get("every", 1),
+            "LOST_PAIRS", *variants, lost=lost, pair_steps=run.total("lost_pair_steps"), since=since,
+            every=rebuild.get("every", 1),
         )  # fmt: skip
     # a list that is known to have lost pairs disagrees with the next one for that reason
-    elif mismatches := view.summary.get("count_mismatches"):
-        yield TEXTS.finding("LISTS_DISAGREE", section=section, mismatches=mismatches)
+    elif mismatches := run.summary.get("count_mismatches"):
+        yield TEXTS.finding("LISTS_DISAGREE", mismatches=mismatches)
     if dangerous:
         overdrawn = float(np.max(-run.epochs["margin"][run.epochs["dangerous"]], initial=0.0))
         yield TEXTS.finding(
-            "DANGEROUS_BUILDS", "lost" if lost else "sound", section=section, dangerous=dangerous,
-            lists=len(run.epochs["epoch"]), overdrawn=overdrawn, unit=view.units.length,
+            "DANGEROUS_BUILDS", "lost" if lost else "sound", dangerous=dangerous,
+            lists=len(run.epochs["epoch"]), overdrawn=overdrawn, unit=run.units.length,
         )  # fmt: skip
 
 
-def _ledger(view: View, run: Record) -> Iterator[Finding]:
+def _ledger(run: RunView) -> Iterator[Finding]:
     lost = ["lost"] * bool(run.total("lost_pairs"))
     wrong = np.flatnonzero(~analysis.algebra_holds(run.series))
     if len(wrong):
         yield TEXTS.finding("EVENT_ALGEBRA", *lost, step=run.step(wrong[0]), steps=len(wrong))
     counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
     wrong = np.flatnonzero(~run.flips.matches(run.series))
-    values = {"counted": counted, "listed": run.flips.total, "section": "Flips"}
+    values = {"counted": counted, "listed": run.flips.total}
     if counted != run.flips.total:
         yield TEXTS.finding("LEDGER_INCOMPLETE", **values)
     elif len(wrong):
@@ -207,61 +204,58 @@ def _ledger(view: View, run: Record) -> Iterator[Finding]:
         yield TEXTS.finding("LEDGER_INCOMPLETE", *lost, "twice", **values)
 
 
-def _energy(view: View, run: Record) -> Iterator[Finding]:
-    if view.summary.get("energy_budget_closes") is not False:
+def _energy(run: RunView) -> Iterator[Finding]:
+    if run.summary.get("energy_budget_closes") is not False:
         return
     moves = np.abs(np.diff(run.budget["residual"]))
     variants = ["lost"] * bool(run.total("lost_pairs")) + ["jump"] * bool(run.jump and len(moves))
     worst = int(np.argmax(moves)) if len(moves) else 0
     yield TEXTS.finding(
-        "BUDGET_OPEN", *variants, section="Energy and its budget", residual=residual(view, run),
-        unit=view.units.energy, tolerance=view.summary.get("energy_budget_tolerance"), jump=abs(run.jump),
+        "BUDGET_OPEN", *variants, residual=run.residual,
+        unit=run.units.energy, tolerance=run.summary.get("energy_budget_tolerance"), jump=abs(run.jump),
         largest=float(moves[worst]) if len(moves) else None, step=run.step(worst + 1) if len(moves) else None,
     )  # fmt: skip
 
 
-def _ase(view: View) -> Iterator[Finding]:
-    ase, section = view.summary.get("ase") or {}, "Agreement with ASE"
+def _ase(run: RunView) -> Iterator[Finding]:
+    ase = run.ase
     if ase.get("ok") is False:
         yield TEXTS.finding(
-            "ASE_DISAGREES", section=section, energy=ase.get("energy_rel"), force=ase.get("force_max"),
-            scale=ase.get("force_scale"), unit=f"{view.units.energy}/{view.units.length}",
+            "ASE_DISAGREES", energy=ase.get("energy_rel"), force=ase.get("force_max"),
+            scale=ase.get("force_scale"), unit=f"{run.units.energy}/{run.units.length}",
         )  # fmt: skip
     elif ase.get("ok") is None:
         note = ase.get("note")
         yield TEXTS.finding("ASE_NOT_COMPARED", *["note"] * bool(note), note=str(note))
 
 
-def _decisions(view: View, run: Record) -> Iterator[Finding]:
+def _decisions(run: RunView) -> Iterator[Finding]:
     margin = abs(float(run.series["min_margin"][0]))
     if not margin or run.series["ambiguous"][0]:
         yield TEXTS.finding("TIE_AT_CUTOFF", margin=margin)
-    ambiguous = view.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
+    ambiguous = run.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
     if ambiguous:
-        yield TEXTS.finding(
-            "AMBIGUOUS_DECISIONS", section="Margins in units of rounding", ambiguous=ambiguous,
-            expected=run.expected_ambiguous,
-        )  # fmt: skip
+        yield TEXTS.finding("AMBIGUOUS_DECISIONS", ambiguous=ambiguous, expected=run.expected_ambiguous)
     undone = run.flips.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if run.flips.total >= 20 and undone >= CHATTER_SHARE * run.flips.total:
         busiest = run.flips.busiest
         smooth = not run.jump and not run.cutoff.get("force_jump")
         yield TEXTS.finding(
-            "CHATTER", *["smooth"] * smooth, section="Chatter and residence", undone=undone,
+            "CHATTER", *["smooth"] * smooth, undone=undone,
             flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
             pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
         )  # fmt: skip
 
 
-def _drift(view: View, run: Record) -> Iterator[Finding]:
-    atoms, units = view.summary.get("atoms"), view.units
+def _drift(run: RunView) -> Iterator[Finding]:
+    atoms, units = run.summary.get("atoms"), run.units
     thermal = units.k_B * float(np.mean(run.series["temperature"]))
     if not atoms or not thermal > 0:
         return
     time, left = run.series["time"], run.budget["residual"]
     # jumps do not count: what they add follows the number of pairs, up and down
-    drift = view.summary.get("energy_drift_without_jumps")
+    drift = run.summary.get("energy_drift_without_jumps")
     if drift is None and np.isfinite(left).all():
         from mdnum.rollout.summary import LineFit
 
@@ -273,7 +267,7 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
         moved = abs(float(drift)) * span
         if moved >= DRIFT_SHARE * thermal:
             yield TEXTS.finding(
-                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")), section="Energy and its budget",
+                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")),
                 drift=float(drift), moved=moved, share=moved / thermal, time=span, energy=units.energy,
                 time_unit=units.time,
             )  # fmt: skip
@@ -282,37 +276,36 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
         low, high = min(float(moves.min()), 0.0), max(float(moves.max()), 0.0)
         share = (high - low) / (atoms * thermal)
         if share >= DRIFT_SHARE:
-            yield TEXTS.finding(
-                "WANDER", section="Energy and its budget", low=low, high=high, share=share, unit=units.energy
-            )
+            yield TEXTS.finding("WANDER", low=low, high=high, share=share, unit=units.energy)
 
 
-def _cutoff(view: View, run: Record) -> Iterator[Finding]:
+def _cutoff(run: RunView) -> Iterator[Finding]:
     kind, force = run.cutoff.get("kind"), float(run.cutoff.get("force_jump") or 0.0)
-    values = {"kind": kind, "force": abs(force), "energy": view.units.energy, "length": view.units.length}
+    values = {"kind": kind, "force": abs(force), "energy": run.units.energy, "length": run.units.length}
     if kind and run.jump:
         yield TEXTS.finding("HARD_CUTOFF", jump=run.jump, **values)
     elif kind and force:
         yield TEXTS.finding("FORCE_JUMP", *["shifted"] * (kind == "shifted"), "gradient", **values)
 
 
-def _evidence(view: View, run: Record) -> Iterator[str]:
-    summary, units = view.summary, view.units
+def _evidence(run: RunView) -> Iterator[str]:
+    summary, units = run.summary, run.units
     if analysis.algebra_holds(run.series).all():
         yield TEXTS("flips_accounted", flips=run.flips.total, steps=len(run.series["step"]))
     if len(run.epochs["epoch"]) and not run.total("lost_pairs"):
         yield TEXTS("lists_sound", lists=len(run.epochs["epoch"]))
     if summary.get("energy_budget_closes"):
         yield TEXTS(
-            "budget_closes" if run.jump else "budget_closes_smooth", residual=residual(view, run),
+            "budget_closes" if run.jump else "budget_closes_smooth", residual=run.residual,
             unit=units.energy, checks=int(summary.get("energy_budget_checks") or 0),
         )  # fmt: skip
-    ase = summary.get("ase") or {}
+    ase = run.ase
     if ase.get("ok") and ase.get("energy_rel") is not None:
         yield TEXTS(
-            "ase_agrees", reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
+            "ase_agrees_sampled" if "sampled" in ase else "ase_agrees", sampled=ase.get("sampled"),
+            atoms=summary.get("atoms"), reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
             force=ase.get("force_max"), unit=f"{units.energy}/{units.length}",
         )  # fmt: skip
 
 
-VERBS = {"md": Verb(judge, run_page.page, load, unfinished=True)}
+VERBS = {"md": Verb(judge, page, RunView, unfinished=True)}

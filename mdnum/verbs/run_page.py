@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,19 +12,17 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mdnum.errors import FolderError
 from mdnum.report import analysis
-from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.drawing import envelope, few_ticks, legend, line
+from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, few_ticks, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
 from mdnum.report.words import count, many, number, percent, plain
+from mdnum.store.tables import as_numpy
+from mdnum.verbs.frame import View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
-
-    from mdnum.store import RunFolder
-    from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("run.py"))
 
@@ -37,21 +34,36 @@ _BUSIEST = 10
 _COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "energy_jump", "bound")
 
 
-@dataclass(frozen=True)
-class Record:
-    """A run folder's tables on the host.
+class RunView(View):
+    """The folder of a run, finished or not."""
 
-    Attributes:
-        summary, system: as written.
-        series, epochs: arrays by column name.
-        flips: what the table of flips says, which may be larger than memory.
-    """
+    @cached_property
+    def series(self) -> Mapping[str, np.ndarray]:
+        """A row for each step.
 
-    summary: Mapping[str, Any]
-    system: Mapping[str, Any]
-    series: Mapping[str, np.ndarray]
-    epochs: Mapping[str, np.ndarray]
-    flips: analysis.Scan
+        Raises:
+            FolderError: there is none.
+        """
+        series = self.table("series")
+        if not len(series["step"]):
+            remedy, where = self.folder.again, str(self.folder.path)
+            raise FolderError("holds no step of a run", remedy=remedy, where=where)
+        return series
+
+    @property
+    def epochs(self) -> Mapping[str, np.ndarray]:
+        """A row for each neighbor list."""
+        return self.table("epochs")
+
+    @cached_property
+    def flips(self) -> analysis.Scan:
+        """What the table of flips says, which may be larger than memory."""
+        flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
+        for batch in self.folder.batches("flips", _COLUMNS):
+            flips.take({name: as_numpy(batch[name]) for name in _COLUMNS})
+        if not flips.nearest:
+            flips.take(self.folder.read("flips", _COLUMNS, rows=1))
+        return flips
 
     @property
     def steps(self) -> int:
@@ -69,6 +81,11 @@ class Record:
         return float(self.cutoff.get("energy_jump") or 0.0)
 
     @property
+    def ase(self) -> Mapping[str, Any]:
+        """The comparison with ASE; empty without one."""
+        return self.summary.get("ase") or {}
+
+    @property
     def conservative(self) -> bool:
         """Whether the total energy should stay what it was."""
         return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
@@ -82,9 +99,14 @@ class Record:
     def budget(self) -> dict[str, np.ndarray]:
         """Energy against time: its change, the ledger's jumps summed, and what is left between the two."""
         conserved = self.series["conserved"]
-        change = conserved - conserved[0] if len(conserved) else conserved
-        jumps = np.cumsum(self.series["energy_jump"])
+        change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
+
+    @property
+    def residual(self) -> float:
+        """How far the budget is from closing, as the run stated it or else |E(t) - E(0) - sum of jumps|."""
+        stated = self.summary.get("energy_budget_residual")
+        return float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
 
     def total(self, key: str, column: str | None = None) -> int:
         """A count from the summary, or from the epochs where a killed run has no summary."""
@@ -95,33 +117,9 @@ class Record:
         return int(self.series["step"][row])
 
 
-def load(folder: RunFolder) -> Record:
-    """Reads a run folder, finished or not.
-
-    Raises:
-        FolderError: it holds no step of a run.
-    """
-    series = folder.read("series")
-    if not len(series["step"]):
-        raise FolderError("holds no step of a run", remedy=folder.again, where=str(folder.path))
-    flips = analysis.Scan(len(series["step"]), TABLE_ROWS)
-    for batch in folder.batches("flips", _COLUMNS):
-        flips.take({name: batch[name].to_numpy() for name in _COLUMNS})
-    if not flips.nearest:
-        flips.take(folder.read("flips", _COLUMNS, rows=1))
-    return Record(folder.summary, folder.system, series, folder.read("epochs"), flips)
-
-
-def residual(view: View, run: Record) -> float:
-    """How far the budget is from closing, as the run stated it or else |E(t) - E(0) - sum of jumps|."""
-    stated = view.summary.get("energy_budget_residual")
-    return float(np.max(np.abs(run.budget["residual"]))) if stated is None else abs(float(stated))
-
-
-def page(view: View, verdict: Verdict) -> Page:
+def page(run: RunView, verdict: Verdict) -> Page:
     """The page of a run."""
-    run: Record = view.extra
-    atoms, cutoff, units = view.summary.get("atoms"), run.cutoff, view.units
+    atoms, cutoff, units = run.summary.get("atoms"), run.cutoff, run.units
     about = [many(atoms, "atom")] if atoms else []
     about.append(many(run.steps, "step"))
     if cutoff.get("kind"):
@@ -129,23 +127,23 @@ def page(view: View, verdict: Verdict) -> Page:
         at = f" at {plain(radius, 6)} {units.length}" if isinstance(radius, int | float) else ""
         about.append(f"{cutoff['kind']} cutoff{at}")
     sections = [
-        Section("What was run", [pairs(list(_what(view, run)))]),
-        Section("Energy and its budget", list(_energy(view, run))),
-        Section("Flips per step", list(_flips_per_step(view, run))),
+        Section("What was run", [pairs(list(_what(run)))]),
+        Section("Energy and its budget", list(_energy(run))),
+        Section("Flips per step", list(_flips_per_step(run))),
         Section("Margins in units of rounding", list(_margins(run))),
         Section("Chatter and residence", list(_chatter(run))),
         Section("List health", list(_lists(run))),
-        Section("Flips", list(_nearest(view, run))),
-        Section("Agreement with ASE", list(_ase(view))),
+        Section("Flips", list(_nearest(run))),
+        Section("Agreement with ASE", list(_ase(run))),
     ]
     return Page(
-        view.name, ", ".join(about), list(_keys(view, run)), [each for each in sections if each.parts],
-        view.system_toml, view.folder.provenance,
+        run.name, ", ".join(about), list(_keys(run)), [each for each in sections if each.parts],
+        run.system_toml, run.folder.provenance,
     )  # fmt: skip
 
 
-def _keys(view: View, run: Record) -> Iterator[Key]:
-    summary, atoms = view.summary, view.summary.get("atoms")
+def _keys(run: RunView) -> Iterator[Key]:
+    summary, atoms = run.summary, run.summary.get("atoms")
     entered, left = (int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left"))
     rate = (
         f", {number(run.flips.total / run.steps / atoms, 2)} per atom and step" if atoms and run.steps else ""
@@ -159,23 +157,24 @@ def _keys(view: View, run: Record) -> Iterator[Key]:
     )
     closes = summary.get("energy_budget_closes")
     budget = "" if closes is None else "; budget closes" if closes else "; budget is open"
-    yield Key("Budget residual", number(residual(view, run), 2), view.units.energy + budget)
-    drift, per = summary.get("energy_drift"), f"{view.units.energy}/atom/{view.units.time}"
+    yield Key("Budget residual", number(run.residual, 2), run.units.energy + budget)
+    drift, per = summary.get("energy_drift"), f"{run.units.energy}/atom/{run.units.time}"
     yield Key("Energy drift", number(drift, 2, signed=True), per)
-    ase = summary.get("ase") or {}
-    compared = "relative energy difference" if ase.get("energy_rel") is not None else "not compared"
-    yield Key("Against ASE", number(ase.get("energy_rel"), 2), compared)
+    error = run.ase.get("energy_rel")
+    compared = "not compared" if error is None else "relative energy difference"
+    compared += " of a sample" if "sampled" in run.ase else ""
+    yield Key("Against ASE", number(error, 2), compared)
     speed = summary.get("steps_per_second")
     yield Key("Speed", number(speed), "steps per second" if speed else "too short a run to tell")
 
 
-def _what(view: View, run: Record) -> Iterator[tuple[str, str]]:
+def _what(run: RunView) -> Iterator[tuple[str, str]]:
     """What was run; what the system file leaves out is left out."""
-    units, system, time = view.units, view.system, run.series["time"]
+    units, system, time = run.units, run.system, run.series["time"]
     if system.get("about"):
         yield "System", str(system["about"])
     span = f"{many(run.steps, 'step')}, {plain(float(time[-1] - time[0]))} {units.time}"
-    atoms = view.summary.get("atoms")
+    atoms = run.summary.get("atoms")
     yield "Size", f"{many(atoms, 'atom')}, {span}" if atoms else span
     lengths = {"radius": units.length, "onset": units.length, "skin": units.length}
     for key, title in (("potential", "Potential"), ("cutoff", "Cutoff"), ("neighbors", "Neighbor lists")):
@@ -197,8 +196,8 @@ def _what(view: View, run: Record) -> Iterator[tuple[str, str]]:
         yield "Precision", in_words(precision)
 
 
-def _energy(view: View, run: Record) -> Iterator[Any]:
-    budget, units, summary = run.budget, view.units, view.summary
+def _energy(run: RunView) -> Iterator[Any]:
+    budget, units, summary = run.budget, run.units, run.summary
     smooth = not np.any(run.series["energy_jump"])
 
     def draw(figure: Canvas) -> None:
@@ -231,7 +230,7 @@ def _energy(view: View, run: Record) -> Iterator[Any]:
         moves = float(np.max(np.abs(np.diff(left))))
         yield TEXTS("one_flip", jump=abs(run.jump), unit=units.energy, moves=moves)
         if checks := summary.get("energy_budget_checks"):
-            yield TEXTS("checked_smooth", checks=checks, residual=residual(view, run), unit=units.energy)
+            yield TEXTS("checked_smooth", checks=checks, residual=run.residual, unit=units.energy)
     if summary.get("energy_drift") is not None:
         yield TEXTS(
             "drift", drift=summary["energy_drift"], without=summary.get("energy_drift_without_jumps"),
@@ -246,7 +245,7 @@ def _energy(view: View, run: Record) -> Iterator[Any]:
             )  # fmt: skip
 
 
-def _flips_per_step(view: View, run: Record) -> Iterator[Any]:
+def _flips_per_step(run: RunView) -> Iterator[Any]:
     series = run.series
 
     def draw(figure: Canvas) -> None:
@@ -266,7 +265,7 @@ def _flips_per_step(view: View, run: Record) -> Iterator[Any]:
         below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         above.set_ylabel("flips per step")
         below.set_ylabel("pairs inside")
-        below.set_xlabel(f"time ({view.units.time})")
+        below.set_xlabel(f"time ({run.units.time})")
         legend(above)
 
     most = max(int(series[name].max(initial=0)) for name in ("entered", "left"))
@@ -280,7 +279,7 @@ def _flips_per_step(view: View, run: Record) -> Iterator[Any]:
         yield TEXTS("no_flips")
 
 
-def _margins(run: Record) -> Iterator[Any]:
+def _margins(run: RunView) -> Iterator[Any]:
     ratio = run.flips.ratios
     ratio = ratio[np.isfinite(ratio)]
     # without a bound (whole numbers are compared) there is no unit to measure margins in
@@ -318,7 +317,7 @@ def _margins(run: Record) -> Iterator[Any]:
     yield TEXTS("margins", closest=closest, median=median, expected=expected)
 
 
-def _chatter(run: Record) -> Iterator[Any]:
+def _chatter(run: RunView) -> Iterator[Any]:
     busiest, stays = run.flips.busiest, run.flips.stays
     if not len(busiest.i):
         return
@@ -352,7 +351,7 @@ def _chatter(run: Record) -> Iterator[Any]:
     yield Table(("pair", "flips", "one in … steps"), rows, "Pairs that flip most")
 
 
-def _lists(run: Record) -> Iterator[Any]:
+def _lists(run: RunView) -> Iterator[Any]:
     epochs = run.epochs
     if not len(epochs["epoch"]):
         return
@@ -407,56 +406,37 @@ def _lists(run: Record) -> Iterator[Any]:
     ])  # fmt: skip
 
 
-def _nearest(view: View, run: Record) -> Iterator[Any]:
+def _nearest(run: RunView) -> Iterator[Any]:
     """The flips nearest to the threshold, in the order of steps."""
-    flips, units = run.flips.nearest, view.units
+    flips, units = run.flips.nearest, run.units
     if not len(flips["step"]):
         yield TEXTS("no_flips")
         return
     compare = str(run.cutoff.get("compare", "r2 <"))
-    columns: list[tuple[np.ndarray, int | None]] = [(flips[name], None) for name in ("step", "i", "j")]
-    columns.append((flips["entered"].astype(int), None))
-    for name, digits in (
-        ("distance", 9),
-        ("margin", 4),
-        ("radial_speed", 4),
-        ("energy_jump", 4),
-        ("ratio", 3),
-    ):
-        columns.append((flips[name], digits))
-    rows = plain_rows(columns)
-    yield TEXTS("nearest", shown=len(rows), flips=run.flips.total, compare=compare)
+    yield TEXTS("nearest", shown=len(flips["step"]), flips=run.flips.total, compare=compare)
     yield Browse(
-        name="flips",
-        row_id="flip-rows",
-        label="Search flips",
-        placeholder="atom 17, pair 17-203, step:100..200, entered, ambiguous",
-        columns=(
-            Column(0, "step", kind="count"),
-            Column(1, "pair", kind="pair"),
-            Column(3, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(4, "distance", units.length, kind="fixed", digits=6),
-            Column(5, "margin", compare),
-            Column(6, "radial speed", f"{units.length}/{units.time}"),
-            Column(7, "energy jump", units.energy),
-            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        "flips", "flips", "atom 17, pair 17-203, step:100..200, entered, ambiguous",
+        (
+            Column("step", flips["step"], "count"),
+            Column("pair", (flips["i"], flips["j"]), "pair"),
+            flipped(flips["entered"]),
+            Column("distance", flips["distance"], "fixed", units.length, digits=6),
+            Column("margin", flips["margin"], unit=compare),
+            Column("radial speed", flips["radial_speed"], unit=f"{units.length}/{units.time}"),
+            Column("energy jump", flips["energy_jump"], unit=units.energy),
+            Column("margin", flips["ratio"], "ratio", "÷ bound", digits=2),
         ),
-        rows=rows,
-        words={"entered": (3, 1), "in": (3, 1), "left": (3, 0), "out": (3, 0)},
-        ranges={"step": 0},
-        subjects=(1, 2),
-        nouns=("atom", "pair"),
-        ambiguous=8,
-    )
+    )  # fmt: skip
 
 
-def _ase(view: View) -> Iterator[Any]:
-    ase, units = view.summary.get("ase") or {}, view.units
+def _ase(run: RunView) -> Iterator[Any]:
+    ase, units = run.ase, run.units
     if ase.get("energy_rel") is None:
         yield TEXTS("not_compared")
         return
     if ase.get("reference"):
-        yield TEXTS("compared", reference=ase["reference"])
+        key = "compared_sampled" if "sampled" in ase else "compared"
+        yield TEXTS(key, reference=ase["reference"], sampled=ase.get("sampled"), atoms=run.summary["atoms"])
     rows = [("energy", ase["energy_rel"], "relative")]
     if ase.get("force_max") is not None:
         scale = ase.get("force_scale")

@@ -13,14 +13,13 @@ import pytest
 import small_systems
 from forks.harness import made as twin_of
 
-from mdnum.forks.choices import FormatChoice, unavailable
-from mdnum.forks.choices.lists import FORMATS
-from mdnum.forks.reordered import FormattedSimulation
+from mdnum.forks.choices import parse, unavailable
+from mdnum.forks.choices.arithmetic import FORMATS
+from mdnum.forks.reordered import ReorderedSimulation
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
 from mdnum.numerics.reductions import Exact
-from mdnum.numerics.running import Tap
-from mdnum.numerics.sums import Halves, Sequential, Twice
+from mdnum.numerics.sums import Halves, Sequential, Tap, Twice
 from mdnum.systems.build import Simulation, build
 
 
@@ -136,7 +135,7 @@ def _evaluated(force, x, tables):
 @pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_choice_adds_in_the_order_of_the_format(simulation, rows, format):
-    made = FormattedSimulation.of(simulation, format)
+    made = ReorderedSimulation.of(simulation, format)
     assert made.reduction == {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}[format]
     wrapped, _ = wrap_positions(made.cell, made.positions)
     table = made.verlet_list().build(wrapped, made.cell)
@@ -182,7 +181,7 @@ def test_a_list_in_another_format_holds_the_same_pairs(simulation):
         labels = np.append(table.order, len(table.order))[table.index]
         for half in np.split(labels, 2 if word == "ordered-sparse" else 1):
             assert (np.diff(half, axis=0) >= 0).all()
-    assert unavailable(FormatChoice(word="sparse"), replace(simulation.system, spec=_pairwise(simulation)))
+    assert unavailable(parse("format=sparse"), replace(simulation.system, spec=_pairwise(simulation)))
 
 
 def _pairwise(simulation: Simulation):

@@ -13,7 +13,7 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.plain import plain
 from mdnum.references.conformance.lists import PairList
-from mdnum.references.conformance.loading import load
+from mdnum.references.conformance.peers import load
 from mdnum.references.oracle import all_pairs, exactly_inside
 from mdnum.references.pair_check import (
     Search,
@@ -174,7 +174,7 @@ def test_a_shell_at_the_cutoff_is_borderline_and_not_wrong():
     assert scipy.verdict == "differs at the cutoff" and scipy.borderline == 3 * len(atoms)
     assert vesin.verdict == "agrees"
     assert report.decided_exactly == 3 * len(atoms)
-    assert {code for code, _ in codes(report)} == {"pairs-at-the-cutoff", "pairs-ambiguous"}
+    assert {code for code, _ in codes(report)} == {"PAIRS_AT_THE_CUTOFF", "PAIRS_AMBIGUOUS"}
 
 
 @pytest.mark.parametrize(("package", "severity"), [("mdnum", "error"), ("numpy", "warning")])
@@ -191,7 +191,7 @@ def test_a_lost_pair_and_a_phantom_are_found(package: str, severity: str):
     (result,) = report.results
     assert (result.missing, result.extra, result.verdict) == (3, 2, "differs")
     assert report.ok is (package != "mdnum")
-    assert codes(report) == [("pairs-differ", severity)]
+    assert codes(report) == [("PAIRS_DIFFER", severity)]
 
 
 def test_a_search_that_fails_is_a_result_and_a_failure_of_mdnum_is_not():
@@ -201,7 +201,7 @@ def test_a_search_that_fails_is_a_result_and_a_failure_of_mdnum_is_not():
     system, vesin = make(crystal(), LENNARD_JONES, HARD), Search(load("vesin"))
     report = check_pairs(system, searches=[search(raises), vesin], effective=False)
     assert [one.verdict for one in report.results] == ["failed", "agrees"]
-    assert report.ok and codes(report) == [("search-failed", "warning")]
+    assert report.ok and codes(report) == [("SEARCH_FAILED", "warning")]
     assert "index 6" in report.rows()[0]["verdict"]
     with pytest.raises(IndexError, match="index 6"):
         check_pairs(system, searches=[search(raises, "mdnum")])

@@ -11,7 +11,7 @@ import pytest
 from report.synthetic import make_run
 
 from mdnum.verbs import frame
-from mdnum.verbs.run_page import TABLE_ROWS, load
+from mdnum.verbs.run_page import TABLE_ROWS, RunView
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -52,7 +52,7 @@ document.body.append(result);
 
 def test_sort_search_and_pages(tmp_path):
     folder = make_run(tmp_path / "run", steps=120, candidates=300)
-    run = load(folder)
+    run = RunView(folder, folder.summary)
     page = frame.finish(folder).folder / "report.html"
     i, j = int(run.flips.nearest["i"][0]), int(run.flips.nearest["j"][0])
     script = SCRIPT.replace("PAIR", f'"{j}-{i}"').replace("ATOM", f'"{i}"')

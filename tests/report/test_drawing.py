@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from mdnum.report import drawing, svg, thin
+from mdnum.report import drawing
 from mdnum.report.section import Figure, Plot, Region, Series
 
 
@@ -178,11 +178,11 @@ PLOTS = awkward()
 def test_awkward_plots_are_drawn_without_a_warning(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        text = svg.standalone(svg.markup(drawing.draw(PLOTS[name]), "figure"))
+        text = drawing.standalone(drawing.markup(drawing.draw(PLOTS[name]), "figure"))
     ElementTree.fromstring(text)
     assert len(text) < 400_000
     assert "nan" not in re.sub(r"<text.*?</text>", "", text).lower()
-    assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*svg.LIGHT.values(), *svg.DARK.values()}
+    assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*drawing.LIGHT.values(), *drawing.DARK.values()}
     assert PLOTS[name].title in PLOTS[name].alt and "nan" not in PLOTS[name].alt
 
 
@@ -223,8 +223,8 @@ def test_long_lines_keep_their_peaks_and_their_gaps():
     y = np.sin(30 * x)
     y[[700, 12_345]] = [9.0, -9.0]
     y[60_000:60_100] = np.nan
-    keep = thin.line(x, y)
-    assert len(keep) <= 4 * (thin.BINS + 4)
+    keep = drawing.thin_line(x, y)
+    assert len(keep) <= 4 * (drawing.BINS + 4)
     assert {0, 700, 12_345, 59_999, 60_100, 99_999} <= set(keep.tolist())
     assert np.isnan(y[keep]).any()
     # away from the planted peaks the line through what is kept is the line
@@ -232,16 +232,16 @@ def test_long_lines_keep_their_peaks_and_their_gaps():
     inside = np.r_[1_000:12_000, 13_000:59_000, 61_000:100_000]
     assert np.max(np.abs((drawn - y)[inside])) < 1e-2
     circle = np.linspace(0, 2 * np.pi, 10_000)
-    assert len(thin.line(np.cos(circle), np.sin(circle))) > 9_000
+    assert len(drawing.thin_line(np.cos(circle), np.sin(circle))) > 9_000
 
 
 def test_many_points_become_few_that_cover_the_same_places():
     x, y = np.random.default_rng(0).normal(size=(2, 100_000))
-    keep = thin.points(x, y)
-    assert 300 < len(keep) <= thin.MARKS
+    keep = drawing.thin_points(x, y)
+    assert 300 < len(keep) <= drawing.MARKS
     assert abs(x[keep].max() - x.max()) < 0.5 and abs(y[keep].min() - y.min()) < 0.5
     few = np.array([0.0, np.nan, 2.0])
-    assert thin.points(few, few).tolist() == [0, 2]
+    assert drawing.thin_points(few, few).tolist() == [0, 2]
 
 
 def test_a_region_covers_its_cells_and_nothing_else():
@@ -296,7 +296,7 @@ def test_every_color_of_text_can_be_read():
         linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
         return np.dot([0.2126, 0.7152, 0.0722], linear)
 
-    for theme, card in ((svg.LIGHT, "#f5f6f8"), (svg.DARK, "#1d232b")):
+    for theme, card in ((drawing.LIGHT, "#f5f6f8"), (drawing.DARK, "#1d232b")):
         for role in set(theme) - {"paper", "grid"}:
             for ground in (theme["paper"], card):
                 low, high = sorted((luminance(theme[role]), luminance(ground)))

@@ -13,7 +13,8 @@ from mdnum import systems
 from mdnum.ball.limits import smallest
 from mdnum.errors import InputError
 from mdnum.systems import BallSystem, System, ball, load
-from mdnum.systems.ball_system import BALL_SCHEMA
+from mdnum.systems.ball import remarks
+from mdnum.systems.load import BALL_SCHEMA
 
 PENALTY = """\
 about = "a ball"
@@ -78,25 +79,19 @@ timestep = 0.01
 """
 
 
-@pytest.fixture
-def penalty(tmp_path: Path) -> Path:
-    path = tmp_path / "penalty.toml"
-    path.write_text(PENALTY)
-    return path
+def _written(name: str, text: str) -> Any:
+    @pytest.fixture(name=name)
+    def fixture(tmp_path: Path) -> Path:
+        path = tmp_path / f"{name}.toml"
+        path.write_text(text)
+        return path
+
+    return fixture
 
 
-@pytest.fixture
-def projection(tmp_path: Path) -> Path:
-    path = tmp_path / "projection.toml"
-    path.write_text(PROJECTION)
-    return path
-
-
-@pytest.fixture
-def impact(tmp_path: Path) -> Path:
-    path = tmp_path / "impact.toml"
-    path.write_text(IMPACT)
-    return path
+penalty = _written("penalty", PENALTY)
+projection = _written("projection", PROJECTION)
+impact = _written("impact", IMPACT)
 
 
 def refusal(path: Path, overrides: dict[str, Any] | None = None) -> str:
@@ -234,10 +229,9 @@ def test_a_projection_that_cannot_converge_is_told_its_product(projection: Path)
     assert "cannot converge" in said
     assert "alpha below 0.5" in said
     # overshooting is allowed, and said
-    (warning,) = load(projection, {"contact.k": "3"}).warnings
-    assert warning.code == "PROJECTION_OVERSHOOTS"
-    assert "alpha k = 1.5" in warning.text
-    assert load(projection).warnings == ()
+    ((code, values),) = remarks(load(projection, {"contact.k": "3"}).spec)
+    assert (code, values["product"]) == ("PROJECTION_OVERSHOOTS", 1.5)
+    assert not list(remarks(load(projection).spec))
 
 
 @pytest.mark.parametrize(
@@ -327,14 +321,13 @@ def test_a_relative_tolerance_is_compared_where_decisions_are_made(projection: P
 
 
 def test_a_tolerance_below_the_rounding_of_the_heights_is_worth_a_word(projection: Path):
-    assert load(projection, {"stop.tol": "1e-15"}).warnings == ()
-    (warning,) = load(projection, {"stop.tol": "1e-10", "precision.state": "float32"}).warnings
-    assert (warning.code, warning.severity) == ("TOLERANCE_BELOW_ROUNDING", "info")
+    assert not list(remarks(load(projection, {"stop.tol": "1e-15"}).spec))
+    ((code, values),) = remarks(load(projection, {"stop.tol": "1e-10", "precision.state": "float32"}).spec)
     # a fall of sqrt(2 g) h = 0.0443 m in a step: spacing 2^-28 in float32
-    assert "3.7e-09 m" in warning.text
+    assert (code, values["unit"]) == ("TOLERANCE_BELOW_ROUNDING", 2.0**-28)
     # a bound on the whole time step of an explicit scheme in contact
-    (warning,) = load("ball/drop", {"contact.k": "1e7"}).warnings
-    assert (warning.code, warning.severity) == ("STEP_BEYOND_STABILITY", "warning")
+    ((code, values),) = remarks(load("ball/drop", {"contact.k": "1e7"}).spec)
+    assert (code, values["stiff"]) == ("STEP_BEYOND_STABILITY", pytest.approx(3.16, rel=1e-3))
 
 
 def test_numbers_that_vanish_in_a_role(impact: Path):

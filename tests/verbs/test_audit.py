@@ -20,10 +20,9 @@ from command_line import call
 from other_package import install
 
 import mdnum
-from mdnum.audit.base import CheckResult, finding
+from mdnum.audit.base import CheckResult, answers, finding, heads
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
-from mdnum.audit.structures import LoadedCalculator
-from mdnum.audit.verdict import answers, heads
+from mdnum.audit.subject import LoadedCalculator
 from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.store import RunFolder
@@ -364,7 +363,7 @@ def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
             return energy, forces + 0.1
 
     loaded = LoadedCalculator("reduced", "reduced", Wrong, units=LJ, kT=0.1)
-    monkeypatch.setattr("mdnum.audit.structures.load_calculator", lambda words: loaded)
+    monkeypatch.setattr("mdnum.audit.record.load_calculator", lambda words: loaded)
     monkeypatch.setattr("mdnum.audit.checks.dynamics.find_thresholds", lambda subject: [])
     atoms = planted.crystal()
     atoms.info["origin"] = "8 atoms, nearest distance 2.76 Å"
@@ -383,7 +382,7 @@ def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
 def test_another_package_adds_a_check(tmp_path, monkeypatch):
     """One file: the check, its codes and its sentences; the command line knows it by its entry point."""
     module = (
-        "from mdnum.audit.base import CheckResult, finding\nfrom mdnum.audit.check import AuditCheck\n"
+        "from mdnum.audit.base import AuditCheck, CheckResult, finding\n"
         "class Odd(AuditCheck):\n"
         '    """Has the structure an even number of atoms?"""\n'
         '    name, title = "odd", "Odd"\n'

@@ -18,8 +18,8 @@ from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
 from mdnum.verbs import ball_record, bounce, frame, run
 from mdnum.verbs.ball import VERBS, differs, judge
-from mdnum.verbs.ball_page import TEXTS, page
-from mdnum.verbs.frame import Outcome, View
+from mdnum.verbs.ball_page import TEXTS, BallView, page
+from mdnum.verbs.frame import Outcome
 
 PROJECTION = """\
 world = "ball"
@@ -316,23 +316,33 @@ FORK = {"seed": 3, "fork": 30, "channel": "contact", "ball": 2, "margin": 1e-17,
 
 
 @pytest.fixture(scope="module")
-def good(three: Outcome) -> View:
+def good(three: Outcome) -> BallView:
     """A run with nothing to find in it: of the real one what its summary says about derivatives goes."""
     folder = RunFolder.open(three.folder)
     plain = {"gradient": [made("unrolled", {"k": -2.5e-5})], "variants": [], "exact": None, "findings": []}
     quiet = {"ambiguous": 0, "ambiguous_contacts": 0, "ambiguous_stops": 0}
-    return View(folder, folder.summary | plain | quiet)
+    return BallView(folder, folder.summary | plain | quiet)
 
 
-def altered(view: View, tables: dict[str, dict[str, np.ndarray]] | None = None, **summary: Any) -> View:
+def altered(
+    view: BallView, tables: dict[str, dict[str, np.ndarray]] | None = None, **summary: Any
+) -> BallView:
     return replace(view, summary={**view.summary, **summary}, _tables=tables or {})
 
 
-def codes(view: View) -> dict[str, Any]:
+def of(view: BallView, system: str, **overrides: Any) -> BallView:
+    """The same run, said to be of another system."""
+    view = altered(view)
+    spec = load(system, {key.replace("__", "."): value for key, value in overrides.items()}).spec
+    vars(view)["system"] = spec.model_dump(exclude_none=True)
+    return view
+
+
+def codes(view: BallView) -> dict[str, Any]:
     return {finding.code: finding for finding in judge(view).findings}
 
 
-def test_every_planted_defect_is_found_and_nothing_else(good: View):
+def test_every_planted_defect_is_found_and_nothing_else(good: BallView):
     own, exact = good.summary["gradient"][0], {"height_error": 1e-9, "height_error_largest": 1e-9}
     contacts, series = good.table("contacts"), {k: v.copy() for k, v in good.table("steps").items()}
     short = {name: values[1:] for name, values in contacts.items()}
@@ -350,6 +360,11 @@ def test_every_planted_defect_is_found_and_nothing_else(good: View):
         "FORKED": altered(good, variants=[SAME | FORK | {"gradient": {"k": -1.0}}]),
         "ITERATIONS_DIFFER": altered(good, variants=[SAME | {"iterations_differ": 4}]),
         "RESTING": altered(good, ended={"rest": 4}),
+        "TOLERANCE_BELOW_ROUNDING": of(
+            good, "ball/batch-on-the-boundary", start__height=1.0, flight__gravity=9.81, stop__tol=1e-10
+        ),
+        "PROJECTION_OVERSHOOTS": of(good, "ball/batch-on-the-boundary", contact__k=3.0),
+        "STEP_BEYOND_STABILITY": of(good, "ball/drop", contact__k=1e7),
     }
     assert set(planted) == set(TEXTS.entries) - {"sentences"}
     assert codes(good) == {}
@@ -361,7 +376,7 @@ def test_every_planted_defect_is_found_and_nothing_else(good: View):
     assert set(found) == {"LEDGER_INCOMPLETE", "RESTING"} and found["RESTING"].values == {"step": 81}
 
 
-def test_a_good_run_rests_on_evidence(good: View):
+def test_a_good_run_rests_on_evidence(good: BallView):
     verdict = judge(good)
     assert (verdict.tone, len(verdict.evidence)) == ("good", 5)
     exact = {"gradient": {"k": -2.5001e-5}, "height_error": 2e-14, "height_error_largest": 3e-14}
@@ -370,7 +385,7 @@ def test_a_good_run_rests_on_evidence(good: View):
     assert verdict.evidence[-1] == TEXTS("met", names="k", methods="unrolled")
 
 
-def test_variants_of_a_finding(good: View):
+def test_variants_of_a_finding(good: BallView):
     own = good.summary["gradient"][0]
     fragile = SAME | {"name": "fragile", "depends": {"k": False}, "gradient": {"k": -2.5e-5}}
     finding = codes(altered(good, variants=[fragile]))["LOSS_INDEPENDENT"]
@@ -394,7 +409,7 @@ def test_variants_of_a_finding(good: View):
     assert not differs(0.0, 0.0) and not differs(None, None)
 
 
-def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: View):
+def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: BallView):
     remark = {
         "code": "STIFF",
         "severity": "warning",
@@ -406,7 +421,9 @@ def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: Vi
     assert set(codes(altered(good, findings=[remark, stale]))) == {"STIFF"}
 
 
-def test_the_page_shows_what_the_folder_holds(three: Outcome, good: View, monkeypatch: pytest.MonkeyPatch):
+def test_the_page_shows_what_the_folder_holds(
+    three: Outcome, good: BallView, monkeypatch: pytest.MonkeyPatch
+):
     shown = {section.title: section for section in three.page.sections}
     assert {"Heights and contacts", "Margins of decisions", "Gradient", "Variants", "Contacts"} <= set(shown)
     folder = RunFolder.open(three.folder)

@@ -19,7 +19,8 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.verbs.flips import rules
 from mdnum.verbs.flips_page import by_velocities, judge, page
-from mdnum.verbs.frame import Outcome, View, finish
+from mdnum.verbs.flips_shared import FlipsView
+from mdnum.verbs.frame import Outcome, finish
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +168,7 @@ def test_the_page_holds_what_the_folder_holds(examined) -> None:
     folder = RunFolder.open(result.folder)
     frames = dict(folder.read("frames"))
     frames["entered"] = frames["entered"] + (np.arange(len(frames["entered"])) == 9)
-    holed = judge(View(folder, result.summary, None, {"frames": frames}))
+    holed = judge(FlipsView(folder, result.summary, {"frames": frames}))
     assert holed.findings[0].code == "EVENT_ALGEBRA" and holed.findings[0].values["first"] == 9
 
 
@@ -256,7 +257,7 @@ def test_velocities_show_what_is_lost_unless_chance_may(examined, crossed, rate,
         "lost": 1 - 10.0 / rate,
     }  # fmt: skip
     assert by_velocities(one) == (pytest.approx(lost) if lost else lost)
-    view = View(RunFolder.open(result.folder), summary)
+    view = FlipsView(RunFolder.open(result.folder), summary)
     verdict = judge(view)
     assert ("FLUX" in {one.code for one in verdict.findings}) == bool(lost)
     (section,) = [one for one in page(view, verdict).sections if one.title == "Between the frames"]

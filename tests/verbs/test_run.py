@@ -13,12 +13,12 @@ import pytest
 from report.synthetic import TOML, make_run
 
 from mdnum.errors import FolderError
-from mdnum.report import analysis, svg
+from mdnum.report import analysis, drawing
 from mdnum.rollout.summary import LineFit
 from mdnum.store import RunFolder
 from mdnum.verbs import frame
 from mdnum.verbs.run import judge
-from mdnum.verbs.run_page import TABLE_ROWS, TEXTS, load, page
+from mdnum.verbs.run_page import TABLE_ROWS, TEXTS, RunView, page
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def good(folder):
-    return frame.View(folder, folder.summary, load(folder))
+    return RunView(folder, folder.summary)
 
 
 @pytest.fixture(scope="module")
@@ -42,19 +42,21 @@ def report(folder):
 
 def changed(view, summary=None, **changes):
     """The view of a folder that says something else."""
-    summary = {**view.summary, **(summary or {})}
-    return replace(view, summary=summary, extra=replace(view.extra, summary=summary, **changes))
+    flips = changes.pop("flips", view.flips)
+    made = replace(view, summary={**view.summary, **(summary or {})}, _tables={**view._tables, **changes})
+    made.__dict__["flips"] = flips
+    return made
 
 
 def epochs(view, **changes):
-    columns = {name: values.copy() for name, values in view.extra.epochs.items()}
+    columns = {name: values.copy() for name, values in view.epochs.items()}
     for name, value in changes.items():
         columns[name][1] = value
     return columns
 
 
 def series(view, row, **changes):
-    columns = {name: values.copy() for name, values in view.extra.series.items()}
+    columns = {name: values.copy() for name, values in view.series.items()}
     for name, value in changes.items():
         columns[name][row] = value
     return columns
@@ -71,7 +73,7 @@ def test_a_good_run(good):
 
 
 def test_every_planted_defect_is_found(good):
-    run = good.extra
+    run = good
     table = {name: np.delete(values, 40) for name, values in good.folder.read("flips").items()}
     kicks = 1e4 * run.series["energy_jump"]
     kicked = {"energy_jump": kicks + run.series["energy_jump"]}
@@ -127,10 +129,10 @@ def test_what_follows_from_lost_pairs_does_not_hide_them(good):
 
 def test_a_flip_dropped_by_the_recorder_is_noticed(tmp_path):
     folder = make_run(tmp_path / "run", steps=60, candidates=800, drop_flip=True)
-    view = frame.View(folder, folder.summary, load(folder))
+    view = RunView(folder, folder.summary)
     errors = {code: each for code, each in found(view).items() if each.severity == "error"}
     assert "BUDGET_OPEN" in errors and set(errors) <= {"BUDGET_OPEN", "LEDGER_INCOMPLETE", "EVENT_ALGEBRA"}
-    assert not analysis.algebra_holds(view.extra.series)[30:].any()
+    assert not analysis.algebra_holds(view.series)[30:].any()
     values = errors["BUDGET_OPEN"].values
     assert values["step"] == 30 and values["largest"] == pytest.approx(values["jump"], rel=0.01)
 
@@ -139,7 +141,7 @@ def test_chatter_is_a_matter_of_the_cutoff(good):
     flips = {name: values[:40] for name, values in good.folder.read("flips").items()}
     flips |= {"step": np.arange(1, 41), "i": np.full(40, 3), "j": np.full(40, 8)}
     flips |= {"entered": np.arange(40) % 2 == 0}
-    columns = {name: values.copy() for name, values in good.extra.series.items()}
+    columns = {name: values.copy() for name, values in good.series.items()}
     for name, inside in (("entered", flips["entered"]), ("left", ~flips["entered"])):
         columns[name] = np.bincount(flips["step"][inside], minlength=len(columns["step"]))
     columns["pairs"] = 100 + np.cumsum(columns["entered"] - columns["left"])
@@ -230,9 +232,9 @@ def test_one_whole_file_that_loads_nothing(html, folder):
 def test_the_page_states_what_the_folder_holds(html, folder, good):
     for text in (TEXTS("notes"), "HARD_CUTOFF", "Liquid argon (Rahman 1964)", "9f1c52d0a7b3e4c8"):
         assert text in html
-    rows = json.loads(re.search(r'id="flip-rows">(.*?)</script>', html, re.DOTALL)[1])
+    rows = json.loads(re.search(r'id="flips-rows">(.*?)</script>', html, re.DOTALL)[1])
     flips = folder.read("flips")
-    assert len(rows) == min(TABLE_ROWS, good.extra.flips.total)
+    assert len(rows) == min(TABLE_ROWS, good.flips.total)
     shown = {(step, i, j) for step, i, j, *_ in rows}
     nearest = np.argsort(np.abs(flips["margin"]) / flips["bound"])[:TABLE_ROWS]
     assert shown == {(int(flips["step"][row]), int(flips["i"][row]), int(flips["j"][row])) for row in nearest}
@@ -245,9 +247,9 @@ def test_figures_are_files_of_their_own(folder, html):
     for name in names:
         text = (folder.path / "figures" / name).read_text(encoding="utf-8")
         ElementTree.fromstring(text)
-        assert set(re.findall(r"var\(--(\w+)\)", text)) <= set(svg.LIGHT) == set(svg.DARK)
+        assert set(re.findall(r"var\(--(\w+)\)", text)) <= set(drawing.LIGHT) == set(drawing.DARK)
         # a color that no theme knows would vanish on one of the two backgrounds
-        assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*svg.LIGHT.values(), *svg.DARK.values()}
+        assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*drawing.LIGHT.values(), *drawing.DARK.values()}
 
 
 def test_text_from_a_file_is_no_markup(tmp_path):
@@ -275,7 +277,7 @@ def test_bad_numbers_do_not_break_the_page(tmp_path):
 def test_runs_in_which_nothing_happens_have_pages(tmp_path, good):
     """No flip; atoms at rest; no skin; steps of no length."""
     assert report(make_run(tmp_path / "still", steps=5, candidates=0, summary={"ase": None, "cutoff": None}))
-    run = good.extra
+    run = good
     names = ("energy_jump", "temperature", "entered", "left")
     still = {name: np.zeros_like(run.series[name]) for name in names}
     still |= {name: np.full_like(run.series[name], run.series[name][0]) for name in ("conserved", "pairs")}

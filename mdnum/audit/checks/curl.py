@@ -10,8 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import CheckResult, Progress, TimeUp, finding
-from mdnum.audit.check import AuditCheck, ask_each
+from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
@@ -29,23 +28,14 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Loop:
-    """A force carried around a circle in the space of all coordinates.
+    """A force carried around a circle in the space of all coordinates."""
 
-    Attributes:
-        plane: in words.
-        radius: Å, of the displacement of all atoms together.
-        work: eV.
-        curl: work over area: v·Ju - u·Jv with J the derivative of the forces, eV/Å².
-        error: of the curl, eV/Å².
-        stiffness: size of the symmetric part of J in the plane, eV/Å².
-    """
-
-    plane: str
-    radius: float
-    work: float
-    curl: float
-    error: float
-    stiffness: float
+    plane: str  # in words
+    radius: float  # Å, of the displacement of all atoms together
+    work: float  # eV
+    curl: float  # work over area: v·Ju - u·Jv with J the derivative of the forces, eV/Å²
+    error: float  # of the curl, eV/Å²
+    stiffness: float  # size of the symmetric part of J in the plane, eV/Å²
 
     @property
     def conservative(self) -> bool:
@@ -63,27 +53,32 @@ class CurlCheck(AuditCheck):
 
     name, title, order = "curl", "Curl", 40
     needed_to = ("differentiate",)
-    seed = 0
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """The circulation of the forces in planes of all kinds."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         atoms, noise = settled(worker, rng, at_least=FEW)
-        skipped: list[tuple[str, str]] = []
+        ways = Ways()
         wanted = list(_planes(worker, atoms, rng))
 
-        def asked(plane: str, u: Displacement, v: Displacement) -> Loop:
-            return agreed([around(worker, atoms, u, v, radius, noise, plane) for radius in _RADII])
+        def asked(plane: tuple[str, Displacement, Displacement]) -> Loop:
+            name, u, v = plane
+            return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in _RADII])
 
-        ways = [(f"a loop of {one[0]}", lambda one=one: asked(*one)) for one in wanted]
-        loops = list(ask_each(worker, ways, progress, self.name, skipped, spread=True).values())
-        if not loops:
-            raise TimeUp
+        name = lambda plane: f"a loop of {plane[0]}"  # noqa: E731
+        found = ways.each(worker, wanted, name, asked, progress, self.name, spread=True, required=True)
+        loops = list(found.values())
         wrong = [one for one in loops if not one.conservative]
         worst = max(wrong, key=lambda one: one.share, default=None)
         limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
-        values: dict[str, Any] = {"loops": len(loops), "wrong": len(wrong)}
+        numbers = {
+            "loops": len(loops), "with_work": len(wrong),
+            "largest_curl": max(abs(one.curl) for one in loops),
+            "largest_share": max((one.share for one in wrong), default=0.0),
+            "largest_error": max(one.error for one in loops),
+        }  # fmt: skip
+        values = {"loops": len(loops), "wrong": len(wrong)}
         values |= {"limit": abs(limit.curl) + limit.error, "stiffness": limit.stiffness}
         found = []
         if worst:
@@ -96,16 +91,8 @@ class CurlCheck(AuditCheck):
             says=(["curl_found" if worst else "curl_none"], values),
             findings=found,
             tables={"Work around closed loops": [_row(one) for one in loops]},
-            numbers={
-                "loops": len(loops),
-                "with_work": len(wrong),
-                "largest_curl": max(abs(one.curl) for one in loops),
-                "largest_share": max((one.share for one in wrong), default=0.0),
-                "largest_error": max(one.error for one in loops),
-            },
-            skipped=skipped,
-            asked=len(loops),
-            possible=len(wanted),
+            numbers=numbers,
+            **vars(ways),
         )
 
 
@@ -165,14 +152,7 @@ def around(
     noise: NoiseFloor,
     plane: str = "",
 ) -> Loop:
-    """The work of the forces around x + radius (u cos t + v sin t).
-
-    Args:
-        atoms: the center.
-        u, v: orthogonal unit vectors.
-        radius: Å.
-        noise: of the forces there.
-        plane: in words.
+    """The work of the forces around x + radius (u cos t + v sin t), in the plane of orthogonal unit vectors.
 
     Error:
         what a part of the points gives otherwise, and the noise of the forces.

@@ -11,11 +11,19 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit import transformations
-from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
-from mdnum.audit.check import AuditCheck, ask_each
+from mdnum.audit.base import (
+    AuditCheck,
+    CalculatorError,
+    Chart,
+    CheckResult,
+    Observed,
+    Progress,
+    Ways,
+    finding,
+)
+from mdnum.audit.checks import invariance
 from mdnum.audit.noise import FEW, NoiseFloor, direction, displaced, precision, settled, steps
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding, only_trying, rms
+from mdnum.audit.subject import CalculatorSubject, no_rounding, rms
 
 #: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
 _LADDER = 0.064 * 0.25 ** np.arange(9)
@@ -40,25 +48,16 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Slope:
-    """The derivative of the energy along a direction, by differences and from the forces.
+    """The derivative of the energy along a direction, by differences and from the forces."""
 
-    Attributes:
-        direction: in words.
-        difference: by differences of the energy, eV/Å.
-        error: of it, estimated from two steps and the noise, eV/Å.
-        force: the same from the forces, eV/Å.
-        step: Å, the one chosen.
-        gaps: |difference - force| at each step of the ladder, without extrapolation, eV/Å.
-        jump: energy step between the two nearest points, eV; 0 where there is none.
-    """
-
-    direction: str
-    difference: float
-    error: float
-    force: float
-    step: float
+    direction: str  # in words
+    difference: float  # by differences of the energy, eV/Å
+    error: float  # of it, estimated from two steps and the noise, eV/Å
+    force: float  # the same from the forces, eV/Å
+    step: float  # Å, the one chosen
+    # |difference - force| at each step of the ladder, without extrapolation, eV/Å
     gaps: Float[np.ndarray, "steps"]
-    jump: float
+    jump: float  # energy step between the two nearest points, eV; 0 where there is none
 
     @property
     def gap(self) -> float:
@@ -81,7 +80,6 @@ class ForcesCheck(AuditCheck):
 
     name, title, order = "forces", "Forces", 30
     needed_to = ("run", "differentiate")
-    seed = 0
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Forces against central differences, extrapolated, and sums that must vanish."""
@@ -90,15 +88,13 @@ class ForcesCheck(AuditCheck):
         atoms, noise = settled(worker, rng, at_least=FEW)
         forces = worker.forces(atoms)
         scale = rms(forces)
-        skipped: list[tuple[str, str]] = []
         wanted = list(_directions(atoms, rng))
-        ways = [
-            (f"moving {what}", lambda what=what, line=line: slope(worker, atoms, line, forces, noise, what))
-            for what, line in wanted
-        ]
-        found = ask_each(worker, ways, progress, self.name, skipped, spread=True)
-        if not found:
-            raise TimeUp
+        ways = Ways()
+        found = ways.each(
+            worker, wanted, lambda way: f"moving {way[0]}",
+            lambda way: slope(worker, atoms, way[1], forces, noise, way[0]),
+            progress, self.name, spread=True, required=True,
+        )  # fmt: skip
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = list(_judged_sums(sums, scale))
         if wrong_sums or not all(one.agrees for one in slopes):
@@ -132,6 +128,11 @@ class ForcesCheck(AuditCheck):
             says = ["forces_wrong"]
         elif known > _DROWNED * scale or not clear:
             says = ["forces_drowned"]
+        numbers = {
+            "directions": len(slopes), "disagree": values["wrong"], "could_not_tell": len(unclear),
+            "largest_difference": values["gap"], "largest_error": values["error"], "rms_force": scale,
+            "step": _worst(slopes).step, "noise_energy": noise.energy, "noise_force": noise.force,
+        }  # fmt: skip
         return CheckResult(
             says=(says, values),
             findings=observed,
@@ -140,38 +141,21 @@ class ForcesCheck(AuditCheck):
                 "Sums that must vanish": sums,
             },
             charts=[_chart(slopes)],
-            numbers={
-                "directions": len(slopes),
-                "disagree": values["wrong"],
-                "could_not_tell": len(unclear),
-                "largest_difference": values["gap"],
-                "largest_error": values["error"],
-                "rms_force": scale,
-                "step": _worst(slopes).step,
-                "noise_energy": noise.energy,
-                "noise_force": noise.force,
-            },
-            skipped=skipped,
-            asked=len(slopes),
-            possible=len(wanted),
+            numbers=numbers,
+            **vars(ways),
         )
 
 
 def _values(slopes: list[Slope], unclear: list[Slope], scale: float) -> dict[str, Any]:
     clear = [one for one in slopes if not any(one is other for other in unclear)] or slopes
     return {
-        "directions": len(slopes),
-        "clear": len(clear),
-        "wrong": sum(not one.agrees for one in slopes),
-        "gap": max(one.gap for one in slopes),
-        "error": max(one.error for one in slopes),
-        "clear_gap": max(one.gap for one in clear),
-        "clear_error": max(one.error for one in clear),
-        "scale": scale,
-        "unclear": len(unclear),
+        "directions": len(slopes), "clear": len(clear), "wrong": sum(not one.agrees for one in slopes),
+        "gap": max(one.gap for one in slopes), "error": max(one.error for one in slopes),
+        "clear_gap": max(one.gap for one in clear), "clear_error": max(one.error for one in clear),
+        "scale": scale, "unclear": len(unclear),
         "unclear_direction": unclear[0].direction if unclear else "",
         "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
-    }
+    }  # fmt: skip
 
 
 def _worst(slopes: list[Slope]) -> Slope:
@@ -200,7 +184,6 @@ def slope(
     """The derivative of the energy along a line by differences, with its error, beside that of the forces.
 
     Args:
-        atoms: where.
         line: displacement per Å of step.
         forces: the calculator's at `atoms`.
         noise: of the energy there.
@@ -270,19 +253,13 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
     """Net force, and net torque where nothing repeats: by symmetry of space both are zero."""
     size = float(np.sum(np.abs(forces)))
     allowed = 40 * (noise.force * np.sqrt(len(atoms)) + np.finfo(float).eps * size)
-    yield {
-        "sum": "net force (eV/Å)",
-        "found": float(np.linalg.norm(forces.sum(axis=0))),
-        "rounding explains": float(allowed),
-    }
+    net = float(np.linalg.norm(forces.sum(axis=0)))
+    yield {"sum": "net force (eV/Å)", "found": net, "rounding explains": float(allowed)}
     if not atoms.pbc.any() and len(atoms) > 1:
         arms = atoms.positions - atoms.positions.mean(axis=0)
         reach = float(np.max(np.linalg.norm(arms, axis=1)))
-        yield {
-            "sum": "net torque (eV)",
-            "found": float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))),
-            "rounding explains": float(allowed * max(reach, 1.0)),
-        }
+        torque, allowed = float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))), allowed * max(reach, 1.0)
+        yield {"sum": "net torque (eV)", "found": torque, "rounding explains": float(allowed)}
 
 
 def _judged_sums(sums: list[dict[str, Any]], scale: float) -> Iterator[Observed]:
@@ -315,18 +292,11 @@ def _judged(slopes: list[Slope], scale: float) -> Iterator[Observed]:
     if wrong := [one for one in slopes if not one.agrees and not one.jump]:
         worst = max(wrong, key=lambda one: one.gap)
         yield finding(
-            "FORCES_NOT_GRADIENT",
-            "error" if worst.gap > _SMALL * scale else "warning",
-            direction=worst.direction,
-            difference=-worst.difference,
-            step=worst.step,
-            error=worst.error,
-            force=-worst.force,
-            gap=worst.gap,
-            share=worst.gap / scale if scale else float("inf"),
-            wrong=len(wrong),
-            directions=len(slopes),
-        )
+            "FORCES_NOT_GRADIENT", "error" if worst.gap > _SMALL * scale else "warning",
+            direction=worst.direction, difference=-worst.difference, step=worst.step, error=worst.error,
+            force=-worst.force, gap=worst.gap, share=worst.gap / scale if scale else float("inf"),
+            wrong=len(wrong), directions=len(slopes),
+        )  # fmt: skip
 
 
 def _row(one: Slope) -> dict[str, Any]:
@@ -362,13 +332,11 @@ def _two_energies(
     """A finding where `energy` and `free_energy` differ by what is not constant.
 
     Every other check is about the free energy, which forces belong to by ASE's definition; where the two
-    differ by a constant at most, what they find holds for both.
+    differ by a constant at most, what they find holds for both. What has been asked so far counts as well.
 
     Args:
-        subject: what has been asked about it so far counts as well.
         atoms: a structure away from thresholds.
-        line: a displacement of it, per Å.
-        along: the slope along it.
+        line: a displacement of it, per Å; along: the slope along it.
     """
     if subject.energies(atoms)[1] is None:
         return
@@ -379,11 +347,11 @@ def _two_energies(
 
     # where it may not change: between ways to write a structure down, and at a threshold of two particles
     rng = np.random.default_rng(0)
-    kinds = (transformations.translated, transformations.imaged, transformations.permuted)
+    kinds = (invariance.translated, invariance.imaged, invariance.permuted)
     changes: list[tuple[str, float]] = []
     for same in (one for kind in kinds for one in islice(kind(atoms, rng), 1)):
         try:
-            with only_trying(subject):
+            with subject.trying():
                 changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
         except CalculatorError:
             continue  # reported elsewhere
@@ -402,13 +370,7 @@ def _two_energies(
     belong = "both" if free and other else "free" if free else "energy" if other else "neither"
     wrong = [f"{what}, by {size:.3g} eV" for what, size in changes if size > _LARGE_OFFSET * subject.kT]
     yield finding(
-        "TWO_ENERGIES",
-        "error" if wrong else "warning",
-        belong,
-        "wrong" if wrong else None,
-        formula=worst.formula,
-        offset=worst.first,
-        change=worst.change,
+        "TWO_ENERGIES", "error" if wrong else "warning", belong, "wrong" if wrong else None,
+        formula=worst.formula, offset=worst.first, change=worst.change, places="; ".join(wrong),
         kT=abs(worst.change) / subject.kT if subject.kT else None,
-        places="; ".join(wrong),
-    )
+    )  # fmt: skip

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from ase import Atoms
+from jaxtyping import Float, Int
 
-from mdnum.audit import transformations
-from mdnum.audit.base import TIME_UP, CheckResult, Observed, Progress, TimeUp, finding
-from mdnum.audit.check import AuditCheck, ask_each
-from mdnum.audit.noise import NoiseFloor, along_a_line, settled, under_jitter
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, Forces, rms
-from mdnum.audit.transformations import Same
+from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
+from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
+from mdnum.audit.structures import group, nearest_distance
+from mdnum.audit.subject import CalculatorSubject, Forces, largest, rms
 
 #: How many times the measured noise a difference may be: the largest of some hundred forces is seen, noise is
 #: a standard deviation, and another order of summation scatters more than moving along a line.
@@ -24,6 +24,31 @@ _SMALL = 1e-3
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
 #: rectangular cells alone, or molecules by the order of their atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
+
+
+#: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
+#: one that is lost when it is added to a cell's length, and half an ulp of 1.
+_TINY = (1e-52, 1e-17, 2.0**-53)
+
+
+@dataclass(frozen=True)
+class Same:
+    """A structure that is the same as another, written down otherwise."""
+
+    what: str  # how it differs
+    code: str  # of the finding when the calculator gives it another answer
+    atoms: Atoms  # the other way
+    order: Int[np.ndarray, "same"]  # atom of the structure that each of its atoms is
+    copies: int = 1  # how many times the structure it holds
+    # a rotation or reflection R, new positions being R x
+    turn: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    rounding: float = 0.0  # Å by which writing it down moved an atom, at most
+    before: Atoms | None = None  # compare with this instead of the structure itself
+
+
+def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
+    """The atoms of a structure in its order, rounded like its coordinates."""
+    return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
 @dataclass(frozen=True)
@@ -45,13 +70,10 @@ class _Difference:
 
     def row(self) -> dict[str, Any]:
         return {
-            "the structure": self.same.what,
-            "energy differs by (eV)": self.energy,
-            "allowed": self.allowed.energy,
-            "forces differ by (eV/Å)": self.force,
-            "allowed for forces": self.allowed.force,
-            "same": self.agrees,
-        }
+            "the structure": self.same.what, "energy differs by (eV)": self.energy,
+            "allowed": self.allowed.energy, "forces differ by (eV/Å)": self.force,
+            "allowed for forces": self.allowed.force, "same": self.agrees,
+        }  # fmt: skip
 
 
 class InvarianceCheck(AuditCheck):
@@ -64,57 +86,52 @@ class InvarianceCheck(AuditCheck):
 
     name, title, order = "invariance", "Invariance", 10
     needed_to = ("run",)
-    seed = 0
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One structure, written down in many ways."""
         rng = np.random.default_rng(self.seed)
         judge = _Judge(subject, rng)
-        same = _in_turns(transformations.all_of(judge.atoms, subject.atoms, rng))
+        same = _in_turns(all_of(judge.atoms, subject.atoms, rng))
         refused: list[tuple[Same, CalculatorError]] = []
-        late: list[tuple[str, str]] = []
+        ways = Ways()
 
-        def failed(place: int, error: CalculatorError) -> None:
-            if same[place].code == "NARROW_CELL" and error.cause is not None:
-                late.append((same[place].what, error.message))
+        def failed(one: Same, error: CalculatorError) -> None:
+            if one.code == "NARROW_CELL" and error.cause is not None:
+                ways.skip(one.what, error.message)
                 # a calculator that takes four atoms in a wide cell only is safe
-                if not isinstance(subject.fresh().try_both(same[place].atoms), CalculatorError):
-                    values = {"what": same[place].what, "why": error.message}
+                if not isinstance(subject.fresh().try_both(one.atoms), CalculatorError):
+                    values = {"what": one.what, "why": error.message}
                     judge.notes.append(finding("NARROW_CELL_REFUSED", "info", **values))
             else:
-                refused.append((same[place], error))
+                refused.append((one, error))
 
-        ways = [(one.what, lambda one=one: judge(one)) for one in same]
-        found = ask_each(subject, ways, progress, self.name, late, failed=failed)
-        unasked = sum(why == TIME_UP for _, why in late)
-        if unasked == len(ways):
-            raise TimeUp
+        found = ways.each(
+            subject, same, lambda one: one.what, judge, progress, self.name, required=True, failed=failed
+        )
         differences = list(found.values())
         wrong = [one for one in differences if not one.agrees]
         worst = max(wrong or differences, key=lambda one: one.energy, default=None)
-        values: dict[str, Any] = {
+        values = {
             "ways": len(differences), "wrong": len(wrong), "refused": len(refused),
             "noise": judge.noise.energy, "energy": worst.energy if worst else 0.0,
             "worst": worst.same.what if worst else "",
             "force": max((one.force for one in wrong), default=0.0),
+        }  # fmt: skip
+        numbers = {
+            "ways": len(differences), "told_apart": len(wrong), "refused": len(refused),
+            "noise_energy": judge.noise.energy, "noise_force": judge.noise.force,
+            "largest": max((one.energy for one in differences), default=0.0),
+            "largest_force": max((one.force for one in differences), default=0.0),
         }  # fmt: skip
         says = "invariance_wrong" if wrong else "invariance_right" if differences else "invariance_none"
         return CheckResult(
             says=([says, "invariance_refused"] if refused else [says], values),
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
-            numbers={
-                "ways": len(differences),
-                "told_apart": len(wrong),
-                "refused": len(refused),
-                "noise_energy": judge.noise.energy,
-                "noise_force": judge.noise.force,
-                "largest": max((one.energy for one in differences), default=0.0),
-                "largest_force": max((one.force for one in differences), default=0.0),
-            },
-            skipped=[*((one.what, error.message) for one, error in refused), *late],
-            asked=len(ways) - unasked,
-            possible=len(ways),
+            numbers=numbers,
+            skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
+            asked=ways.asked,
+            possible=ways.possible,
         )
 
     def _findings(
@@ -127,8 +144,8 @@ class InvarianceCheck(AuditCheck):
         if "ORDER" in wrong or any(same.code == "ORDER" for same, _ in refused):
             wrong = self._without_topology(wrong, judge)
         yield from judge.notes
-        for code, group in wrong.items():
-            worst = max(group, key=lambda one: one.excess)
+        for code, cases in wrong.items():
+            worst = max(cases, key=lambda one: one.excess)
             slug = code.lower().replace("_", "-")
             before = judge.before(worst.same)
             self.structures |= {f"{slug}-before": before, f"{slug}-after": worst.same.atoms}
@@ -140,23 +157,17 @@ class InvarianceCheck(AuditCheck):
                 code,
                 # of a narrow cell, the structure itself is answered for as it should be
                 "error" if large and code != "NARROW_CELL" else "warning",
-                what=worst.same.what,
-                energy=worst.energy,
-                kT=kT,
-                allowed=worst.allowed.energy,
-                force=worst.force,
-                allowed_force=worst.allowed.force,
-                differ=len(group),
+                what=worst.same.what, energy=worst.energy, kT=kT, allowed=worst.allowed.energy,
+                force=worst.force, allowed_force=worst.allowed.force, differ=len(cases), slug=slug,
                 tried=sum(one.same.code == code for one in differences),
-                slug=slug,
-            )
+            )  # fmt: skip
 
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
         """Differences without those that belong to what the calculator is: a topology made from the order."""
         rng = np.random.default_rng(self.seed + 1)
-        grouped = transformations.by_molecule(judge.atoms, rng)
+        grouped = by_molecule(judge.atoms, rng)
         try:
             if grouped is None or not judge(grouped).agrees:
                 return wrong
@@ -168,15 +179,15 @@ class InvarianceCheck(AuditCheck):
             values |= {"single": worst.same.what, "energy": worst.energy, "force": worst.force}
         severity, variant = ("warning", "silent") if worst else ("info", None)
         judge.notes.append(finding("TOPOLOGY_BY_ORDER", severity, variant, **values))
-        kept = {code: group for code, group in wrong.items() if code != "ORDER"}
-        whole = transformations.images_by_molecule(judge.atoms, rng)
+        kept = {code: cases for code, cases in wrong.items() if code != "ORDER"}
+        whole = images_by_molecule(judge.atoms, rng)
         if "IMAGES" not in kept or whole is None or not judge(whole).agrees:
             return kept
         worst = max(kept["IMAGES"], key=lambda one: one.energy)
         values = {"what": worst.same.what, "energy": worst.energy}
         judge.notes.append(finding("WHOLE_MOLECULES", "warning", **values))
         # an atom on a face is cut from its molecule as well
-        return {code: group for code, group in kept.items() if code not in ("IMAGES", "FACES")}
+        return {code: cases for code, cases in kept.items() if code not in ("IMAGES", "FACES")}
 
 
 class _Judge:
@@ -209,8 +220,8 @@ class _Judge:
     def _compared(
         self, worker: CalculatorSubject, same: Same, energy: float, forces: Forces, allowed: NoiseFloor
     ) -> tuple[_Difference, tuple[float, Forces]]:
-        answer = worker.energy(same.atoms), worker.forces(same.atoms)
-        force = float(np.max(np.abs(answer[1] - forces[same.order] @ same.turn.T), initial=0.0))
+        answer = worker.both(same.atoms)
+        force = largest(answer[1] - forces[same.order] @ same.turn.T)
         return _Difference(same, abs(answer[0] / same.copies - energy), force, allowed), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
@@ -231,7 +242,7 @@ class _Judge:
                 if rounding:
                     noise = noise.louder(under_jitter(worker, base, 2.0**power, self._rng))
                 allowed = NoiseFloor(_ALLOWED * noise.energy, _ALLOWED * noise.force)
-            self._known[key] = worker.energy(base), worker.forces(base), allowed
+            self._known[key] = *worker.both(base), allowed
         return self._known[key]
 
 
@@ -243,9 +254,9 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
             groups.setdefault("NOT_FINITE", []).append((same, error))
         elif same.code in _MUST_ANSWER:
             groups.setdefault("FAILS", []).append((same, error))
-    for code, group in groups.items():
-        same, error = group[0]
-        values = {"what": same.what, "why": error.message, "ways": len(group)}
+    for code, cases in groups.items():
+        same, error = cases[0]
+        values = {"what": same.what, "why": error.message, "ways": len(cases)}
         values["file"] = error.structure.name if error.structure else ""
         yield finding(code, "error", "rewritten", "saved" if error.structure else None, **values)
 
@@ -258,3 +269,234 @@ def _in_turns(ways: Iterable[Same]) -> list[Same]:
         seen[same.code] = seen.get(same.code, -1) + 1
         turns.append((seen[same.code], same))
     return [same for _, same in sorted(turns, key=lambda one: one[0])]
+
+
+# -- other ways to write down the same structure ---------------------------------------------------
+
+
+def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Every way that applies to a structure.
+
+    Args:
+        atoms: no distance of it on a threshold by design.
+        given: the structure as it was given, where one may be.
+    """
+    yield from translated(atoms, rng)
+    yield from imaged(atoms, rng)
+    yield from on_a_face(atoms, rng)
+    yield from permuted(atoms, rng)
+    yield from by_an_ulp(atoms, given)
+    yield from repeated(atoms)
+    yield from narrow(atoms, rng)
+    yield from skewed(atoms)
+    yield from turned(atoms, rng)
+    yield from without_periods(atoms)
+
+
+def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """All atoms moved together, by lattice vectors and by anything."""
+    same = partial(_same, "TRANSLATION", atoms)
+    if atoms.pbc.any():
+        for count, words in ((1, "one lattice vector"), (-3, "three lattice vectors back")):
+            by = count * atoms.cell.array[atoms.pbc].sum(axis=0)
+            yield same(f"all atoms moved by {words} along each periodic axis", displaced(atoms, by))
+        for _ in range(2):
+            what = "all atoms moved by fractions of the lattice vectors"
+            there = displaced(atoms, (rng.uniform(0, 1, 3) * atoms.pbc) @ atoms.cell)
+            yield same(what, there)
+            yield _same("IMAGES", there, f"{what} and wrapped", _wrapped(there))
+    free = ~atoms.pbc
+    if free.any():
+        axes = "the free axes" if atoms.pbc.any() else "x, y, z"
+        for length in (7.3, -250.0):
+            there = displaced(atoms, length * _outward(atoms, free))
+            yield same(f"all atoms moved by {length:g} Å along {axes}", there)
+
+
+def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Each atom in a box of its own choice: unwrapped trajectories look like this."""
+    if not atoms.pbc.any():
+        return
+    same = partial(_same, "IMAGES", atoms)
+    yield same("atoms wrapped into the cell", _wrapped(atoms))
+    for most in (1, 3, 20):
+        boxes = rng.integers(-most, most + 1, (len(atoms), 3)) * atoms.pbc
+        there = displaced(atoms, boxes @ atoms.cell.array)
+        yield same(f"each atom moved by lattice vectors of its own, up to {most} of them", there)
+
+
+def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """One atom on the face of the cell, a hair outside, and on the opposite face."""
+    if not atoms.pbc.any():
+        return
+    axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
+    corner = cell[axes].sum(axis=0)
+    for who in dict.fromkeys((0, int(rng.integers(len(atoms))))):
+        base = displaced(atoms, -atoms.positions[who])
+
+        def placed(where: str, position: object, extra: float = 0.0, base: Atoms = base, who: int = who):
+            there = base.copy()
+            there.positions[who] = position
+            return _same("FACES", atoms, f"atom {who} {where}", there, rounding=ulp(base, atoms) + extra)
+
+        zero = np.zeros(3)
+        yield placed("at 0", zero)
+        yield placed("at L on every periodic axis", corner)
+        for axis in axes:
+            yield placed(f"at L along {'abc'[axis]}", cell[axis])
+        yield placed("one ulp short of L", np.nextafter(corner, 0.0))
+        for tiny in _TINY:
+            yield placed(f"at {-tiny:.0e} Å", np.where(atoms.pbc, -tiny, zero), extra=tiny)
+        yield placed("at -0", np.where(atoms.pbc, -0.0, zero))
+
+
+def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Atoms in another order."""
+    if len(atoms) < 2:
+        return
+    for _ in range(2):
+        order = rng.permutation(len(atoms))
+        yield Same("atoms in another order", "ORDER", atoms[order], order)
+    order = np.arange(len(atoms))[::-1].copy()
+    yield Same("atoms in reverse order", "ORDER", atoms[order], order)
+    # with another species at the head of the list: some number species as they meet them
+    for number in list(dict.fromkeys(atoms.numbers))[1:3]:
+        order = np.argsort(atoms.numbers != number, kind="stable")
+        yield Same(f"atoms of {Atoms([number]).symbols[0]} first", "ORDER", atoms[order], order)
+
+
+def by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
+    """Whole molecules in another order, where the atoms come in molecules; None where they do not."""
+    size = group(atoms)
+    if size is None:
+        return None
+    order = (rng.permutation(len(atoms) // size)[:, None] * size + np.arange(size)).ravel()
+    return Same(f"molecules of {size} atoms in another order", "ORDER", atoms[order], order)
+
+
+def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
+    """Whole molecules moved by lattice vectors of their own; None as for `by_molecule`."""
+    size = group(atoms)
+    if size is None or not atoms.pbc.any():
+        return None
+    boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
+    there = displaced(atoms, np.repeat(boxes, size, axis=0) @ atoms.cell.array)
+    return _same("IMAGES", atoms, f"molecules of {size} atoms moved by lattice vectors of their own", there)
+
+
+def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
+    """The cell an ulp larger and smaller, atoms where they were."""
+    if not atoms.pbc.any():
+        return
+    for what, base in (("", atoms), (", of the structure as it was given", given)):
+        cell = base.cell.array
+        rounding = 2 * float(np.spacing(np.max(np.abs(cell))))
+        for toward, word in ((np.inf, "larger"), (0.0, "smaller")):
+            # away from zero, whatever the sign, and zeros stay zeros
+            there = _in_cell(base, np.where(cell == 0, cell, np.nextafter(cell, np.copysign(toward, cell))))
+            yield _same("CELL_ULP", base, f"cell one ulp {word}{what}", there, rounding=rounding, before=base)
+
+
+def repeated(atoms: Atoms) -> Iterator[Same]:
+    """Supercells."""
+    wanted = [tuple(2 if n == axis else 1 for n in range(3)) for axis in np.flatnonzero(atoms.pbc)]
+    if len(wanted) > 1 and len(atoms) <= 64:
+        wanted.append(tuple(2 if repeats else 1 for repeats in atoms.pbc))
+    for counts in wanted:
+        there = atoms.repeat(counts)
+        copies = len(there) // len(atoms)
+        order = np.tile(np.arange(len(atoms)), copies)
+        what = f"{' x '.join(map(str, counts))} supercell"
+        yield Same(what, "EXTENSIVE", there, order, copies=copies, rounding=ulp(there, atoms))
+
+
+def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """A cell of four atoms as near to one another as in the structure, beside its supercell.
+
+    A structure with room for two cutoffs never asks for a second image of a pair. Of one species alone: what
+    a calculator makes of others in such a cell is another question.
+    """
+    nearest = nearest_distance(atoms)
+    if not atoms.pbc.all() or len(set(atoms.numbers)) > 1 or nearest == 0.0:
+        return
+    edge = nearest * np.sqrt(2.0)
+    places = edge * np.array([[0, 0, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
+    # wider by the most that two atoms may approach, so that none is nearer than in the structure
+    places = 1.1 * places + 0.02 * nearest * rng.uniform(-1, 1, (4, 3))
+    few = Atoms([atoms.symbols[0]] * 4, places, cell=[1.1 * edge] * 3, pbc=True)
+    there, order = few.repeat(3), np.tile(np.arange(4), 27)
+    what = f"a cell of four atoms, {1.1 * edge:.3g} Å wide, repeated three times along each axis"
+    yield Same(what, "NARROW_CELL", there, order, copies=27, rounding=ulp(there, few), before=few)
+
+
+def skewed(atoms: Atoms) -> Iterator[Same]:
+    """The same lattice from other lattice vectors, a left-handed cell among them."""
+    if not atoms.pbc.all():
+        return
+    for what, matrix in (
+        ("b replaced by a + b", [[1, 0, 0], [1, 1, 0], [0, 0, 1]]),
+        ("c replaced by c - a + b", [[1, 0, 0], [0, 1, 0], [-1, 1, 1]]),
+        ("a, b, c replaced by b, c, a", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+        ("a and b exchanged", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+    ):
+        there = _in_cell(atoms, np.array(matrix) @ atoms.cell.array)
+        yield _same("LATTICE", atoms, f"the same lattice, {what}", there)
+
+
+def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Structure and cell turned together, by anything, by axes, and mirrored."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    anyhow = q * np.sign(np.diag(r))
+    anyhow *= np.sign(np.linalg.det(anyhow))
+    cyclic = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for what, code, turn in (
+        ("structure and cell rotated", "ROTATION", anyhow),
+        ("x, y, z exchanged in a cycle", "ROTATION", cyclic),
+        ("structure and cell mirrored", "MIRROR", np.diag([-1.0, 1.0, 1.0])),
+    ):
+        there = _in_cell(atoms, atoms.cell.array @ turn.T)
+        there.positions = atoms.positions @ turn.T
+        yield _same(code, atoms, what, there, factor=4, turn=turn)
+
+
+def without_periods(atoms: Atoms) -> Iterator[Same]:
+    """A cluster in cells that do not repeat: what is written in them must not matter."""
+    base = _in_cell(atoms, np.zeros((3, 3)))
+    base.pbc = False
+    span = np.ptp(base.positions, axis=0).max() + 30.0
+    for what, cell in (
+        ("a large one", np.diag([span] * 3)),
+        ("one shorter than the cluster", np.diag([2.0, 3.0, 4.0])),
+        ("a skewed one", np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 2.0, 6.0]])),
+    ):
+        what = f"without periods, in {what}"
+        yield _same("DUMMY_CELL", base, what, _in_cell(base, cell), rounding=0.0, before=base)
+
+
+def _wrapped(atoms: Atoms) -> Atoms:
+    there = atoms.copy()
+    there.wrap(eps=0)
+    return there
+
+
+def _in_cell(atoms: Atoms, cell: np.ndarray) -> Atoms:
+    there = atoms.copy()
+    there.set_cell(cell)
+    return there
+
+
+def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
+    """A direction along the axes that do not repeat, of unit length, and across those that do."""
+    if free.all():
+        return np.array([1.0, -0.7, 0.4]) / np.linalg.norm([1.0, -0.7, 0.4])
+    if not atoms.cell.array[~free].any():
+        return np.eye(3)[free][0]
+    # perpendicular to the lattice vectors that repeat
+    _, _, basis = np.linalg.svd(atoms.cell.array[~free])
+    return basis[-1]
+
+
+def ulp(*structures: Atoms) -> float:
+    """An ulp of the largest coordinate or cell entry of some structures, Å."""
+    parts = (part for one in structures for part in (one.positions, one.cell.array))
+    return float(np.spacing(max(map(largest, parts))))

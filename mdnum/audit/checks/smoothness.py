@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
-from mdnum.audit.check import AuditCheck
-from mdnum.audit.crowds import Crowd, crowd
+from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, finding
 from mdnum.audit.curve import SMOOTH
-from mdnum.audit.environments import EnvironmentWalks, Event, walk_surroundings
-from mdnum.audit.pairs import FARTHEST
+from mdnum.audit.structures import FARTHEST
 from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.surroundings import Crowd, EnvironmentWalks, Event, crowd, walk_surroundings
 from mdnum.audit.thresholds import BESIDE, PairThreshold, PairWalk, PairWalks, find_thresholds, walk_pairs
 
 ORDERS = (
@@ -44,14 +43,12 @@ class SmoothnessCheck(AuditCheck):
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
         find_thresholds(subject)
-        around = walk_surroundings(subject, progress, routes=self.routes)
-        late: list[tuple[str, str]] = []
-        crowds = crowd(subject, progress, late, self.neighbors)
-        skipped = [*walks.skipped, *around.skipped, *late]
-        if not crowds and not late:
-            skipped.append(
-                ("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
-            )
+        ways = deepcopy(walks.ways)
+        around = walk_surroundings(subject, progress, ways, routes=self.routes)
+        left = len(ways.skipped)
+        crowds = crowd(subject, progress, ways, self.neighbors)
+        if not crowds and len(ways.skipped) == left:
+            ways.skip("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
         kT = subject.kT
         return CheckResult(
             says=summary(walks, around, crowds, kT),
@@ -64,9 +61,7 @@ class SmoothnessCheck(AuditCheck):
             tables=_tables(walks, around, crowds, kT),
             charts=_charts(walks, crowds, subject),
             numbers=_numbers(walks, around, crowds, kT),
-            skipped=skipped,
-            asked=walks.possible - walks.left + around.asked + len(crowds),
-            possible=walks.possible + around.possible + len(crowds) + len(late),
+            **vars(ways),
         )
 
 
@@ -153,22 +148,15 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
         }  # fmt: skip
         among: list[float] = []
         if order == 0:
-            among = [
-                abs(one.jump.energy) for one in around.events if one.threshold in same and one.jump.order == 0
-            ]
+            events = (one for one in around.events if one.threshold in same and one.jump.order == 0)
+            among = [abs(one.jump.energy) for one in events]
             values |= {"among": 1e3 * max(among, default=0.0), "among_kT": max(among, default=0.0) / kT}
             size = max([size, *(one / kT for one in among)])
             severity = "error" if size > _LARGE else "warning" if size > _SMALL else "info"
         elif order == 1:
             severity = "warning" if size > _SMALL_FORCE else "info"
-        yield finding(
-            code,
-            severity,
-            None if worst.dies else "within",
-            "among" if among else None,
-            "others" if rest else None,
-            **values,
-        )
+        variants = None if worst.dies else "within", "among" if among else None, "others" if rest else None
+        yield finding(code, severity, *variants, **values)
 
 
 def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
@@ -177,20 +165,11 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
         size = abs(worst.jump.energy) / kT if worst.jump.order == 0 else 0.0
         center, k = worst.ties[0] if worst.ties else (None, None)
         yield finding(
-            "JUMP_AMONG_MANY",
-            "error" if size > _LARGE else "warning",
-            "tie" if worst.ties else None,
-            "not_walked" if not_walked else None,
-            route=worst.route,
-            at=f"{worst.at:.12g}",
-            energy=1e3 * worst.jump.energy,
-            force=worst.force,
-            k=k,
-            atom=center,
-            not_walked=", ".join(not_walked),
-            places=len(sharp),
-            routes=len(around.routes),
-        )
+            "JUMP_AMONG_MANY", "error" if size > _LARGE else "warning",
+            "tie" if worst.ties else None, "not_walked" if not_walked else None,
+            route=worst.route, at=f"{worst.at:.12g}", energy=1e3 * worst.jump.energy, force=worst.force, k=k,
+            atom=center, not_walked=", ".join(not_walked), places=len(sharp), routes=len(around.routes),
+        )  # fmt: skip
     if bent := [one for one in around.unexplained if one.jump.order == 2]:
         worst = max(bent, key=lambda one: abs(one.jump.curvature))
         values = {"route": worst.route, "at": f"{worst.at:.8g}", "curvature": worst.jump.curvature}
@@ -201,28 +180,15 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         yield finding(
-            "NEIGHBOR_CAP",
-            "error",
-            "energy" if one.energy else None,
-            **values,
-            kept=one.kept,
-            neighbors=one.neighbors,
-            distance=one.distance,
-            force=one.force,
-            energy=1e3 * one.energy,
+            "NEIGHBOR_CAP", "error", "energy" if one.energy else None, **values, kept=one.kept,
+            neighbors=one.neighbors, distance=one.distance, force=one.force, energy=1e3 * one.energy,
             kT=one.energy / kT,
-        )
+        )  # fmt: skip
     if one.order_from:
         yield finding(
-            "NEIGHBOR_CAP_BY_ORDER",
-            "error",
-            **values,
-            neighbors=one.order_from,
-            fewer=one.order_from - 1,
-            energy=1e3 * one.order_energy,
-            kT=one.order_energy / kT,
-            force=one.order_force,
-        )
+            "NEIGHBOR_CAP_BY_ORDER", "error", **values, neighbors=one.order_from, fewer=one.order_from - 1,
+            energy=1e3 * one.order_energy, kT=one.order_energy / kT, force=one.order_force,
+        )  # fmt: skip
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
@@ -234,17 +200,10 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
         if further is not None:
             how = "lost" if not further.left else "falls" if np.isfinite(further.left) else "constant"
         yield finding(
-            "NO_CUTOFF",
-            "info",
-            how,
-            pair=walk.pair.name,
-            scanned=walk.scanned,
-            farthest=FARTHEST,
-            reached=further.reached if further else None,
-            force=abs(further.force) if further else None,
-            left=1e3 * further.left if further else None,
-            kT=further.left / kT if further and kT else None,
-        )
+            "NO_CUTOFF", "info", how, pair=walk.pair.name, scanned=walk.scanned, farthest=FARTHEST,
+            reached=further.reached if further else None, force=abs(further.force) if further else None,
+            left=1e3 * further.left if further else None, kT=further.left / kT if further and kT else None,
+        )  # fmt: skip
     steep = _steepness(walk)
     if steep is not None and steep[0] > _STEEP:
         yield finding("STEEP_SWITCH", "warning", pair=walk.pair.name, times=steep[0], at=steep[1])
@@ -278,58 +237,53 @@ def _first_to_jump(event: Event) -> str:
 def _tables(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> dict[str, list[dict[str, Any]]]:
+    thresholds = [
+        {
+            "pair": "-".join(one.species), "distance (Å)": place(one),
+            "what": "the end" if one.dies else "a change", "first to jump": ORDERS[one.order],
+            "energy (meV)": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
+            "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
+            "force (eV/Å)": one.jumps[1] if one.order <= 1 else 0.0,
+            "curvature (eV/Å²)": one.jumps[2] if one.order <= 2 else 0.0,
+            "third derivative (eV/Å³)": one.third or None,
+            "last before": repr(one.inside), "first beyond": repr(one.outside),
+        }
+        for one in _all(walks)
+    ]  # fmt: skip
+    events = [
+        {
+            "moved": one.route,
+            "pair distance (Å)": f"{one.threshold.radius:.10g}" if one.threshold else "none fits",
+            "first to jump": _first_to_jump(one),
+            "energy (meV)": 1e3 * one.jump.energy if one.jump.order == 0 else 0.0,
+            "in kT": abs(one.jump.energy) / kT if one.jump.order == 0 else 0.0,
+            "largest force (eV/Å)": one.force if one.jump.order <= 1 else 0.0,
+            "curvature (eV/Å²)": one.jump.curvature if one.jump.order == 2 else None,
+        }
+        for one in around.events
+    ]
+    steps = [
+        {
+            "pair": "-".join(walk.pair.species), "from (Å)": walk.steps[0], "to (Å)": walk.steps[1],
+            "everywhere, above (eV/Å)": walk.steps[3], "over half of the way, above (eV/Å)": walk.steps[2],
+        }
+        for walk in walks.walks
+        if walk.steps
+    ]  # fmt: skip
+    crowded = [
+        {
+            "element": one.species, "neighbors given": one.neighbors, "within (Å)": one.radius,
+            "nearest that are kept": one.kept, "order of atoms matters from": one.order_from,
+            "energy (meV)": 1e3 * max(one.energy, one.order_energy),
+            "force (eV/Å)": max(one.force, one.order_force),
+        }
+        for one in crowds
+    ]  # fmt: skip
     return {
-        "Thresholds found by walking pairs": [
-            {
-                "pair": "-".join(one.species),
-                "distance (Å)": place(one),
-                "what": "the end" if one.dies else "a change",
-                "first to jump": ORDERS[one.order],
-                "energy (meV)": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
-                "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
-                "force (eV/Å)": one.jumps[1] if one.order <= 1 else 0.0,
-                "curvature (eV/Å²)": one.jumps[2] if one.order <= 2 else 0.0,
-                "third derivative (eV/Å³)": one.third or None,
-                "last before": repr(one.inside),
-                "first beyond": repr(one.outside),
-            }
-            for one in _all(walks)
-        ],
-        "The same among the others of the structure, and what only shows there": [
-            {
-                "moved": one.route,
-                "pair distance (Å)": f"{one.distance:.10g}" if one.threshold else "none fits",
-                "first to jump": _first_to_jump(one),
-                "energy (meV)": 1e3 * one.jump.energy if one.jump.order == 0 else 0.0,
-                "in kT": abs(one.jump.energy) / kT if one.jump.order == 0 else 0.0,
-                "largest force (eV/Å)": one.force if one.jump.order <= 1 else 0.0,
-                "curvature (eV/Å²)": one.jump.curvature if one.jump.order == 2 else None,
-            }
-            for one in around.events
-        ],
-        "Smallest step of the force that is found": [
-            {
-                "pair": "-".join(walk.pair.species),
-                "from (Å)": walk.steps[0],
-                "to (Å)": walk.steps[1],
-                "everywhere, above (eV/Å)": walk.steps[3],
-                "over half of the way, above (eV/Å)": walk.steps[2],
-            }
-            for walk in walks.walks
-            if walk.steps
-        ],
-        "Crowded atoms": [
-            {
-                "element": one.species,
-                "neighbors given": one.neighbors,
-                "within (Å)": one.radius,
-                "nearest that are kept": one.kept,
-                "order of atoms matters from": one.order_from,
-                "energy (meV)": 1e3 * max(one.energy, one.order_energy),
-                "force (eV/Å)": max(one.force, one.order_force),
-            }
-            for one in crowds
-        ],
+        "Thresholds found by walking pairs": thresholds,
+        "The same among the others of the structure, and what only shows there": events,
+        "Smallest step of the force that is found": steps,
+        "Crowded atoms": crowded,
     }
 
 
@@ -344,22 +298,17 @@ def _numbers(
     forces += [max(one.force, one.order_force) for one in crowds]
     orders = [one.order for one in thresholds] + [one.jump.order for one in around.events]
     return {
-        "pairs": len(walks.walks),
-        "pairs_not_walked": list(walks.not_walked),
-        "thresholds": len(thresholds),
+        "pairs": len(walks.walks), "pairs_not_walked": list(walks.not_walked), "thresholds": len(thresholds),
         "cutoffs": {"-".join(walk.pair.species): walk.cutoff for walk in walks.walks},
-        "order": min(orders, default=None),
-        "largest_energy_jump": max(steps, default=0.0),
+        "order": min(orders, default=None), "largest_energy_jump": max(steps, default=0.0),
         "largest_energy_jump_kT": max(steps, default=0.0) / kT if kT else None,
-        "largest_force_jump": max(forces, default=0.0),
+        "largest_force_jump": max(forces, default=0.0), "crossings_measured": around.measured,
         "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
-        "crossings_measured": around.measured,
-        "routes": len(around.routes),
-        "unexplained": sum(one.threshold is None for one in around.events),
+        "routes": len(around.routes), "unexplained": sum(one.threshold is None for one in around.events),
         "neighbors_kept": min((one.kept for one in crowds if one.kept), default=None),
         "order_matters_from": min((one.order_from for one in crowds if one.order_from), default=None),
         "neighbors_tried": max((one.neighbors for one in crowds), default=0),
-    }
+    }  # fmt: skip
 
 
 def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubject) -> list[Chart]:
@@ -371,11 +320,9 @@ def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubjec
     for one in crowds:
         if one.kept:
             title = f"{one.species} with {one.neighbors} neighbors: what jumps when another passes the k-th"
-            lines = {"force": [force for _, force in one.jumps]}
-            k = [float(k) for k, _ in one.jumps]
-            found.append(
-                Chart(title, "k", "largest jump of a force (eV/Å)", k, lines, {"kept": float(one.kept)})
-            )
+            k, forces = zip(*one.jumps, strict=True)
+            what, kept = "largest jump of a force (eV/Å)", {"kept": float(one.kept)}
+            found.append(Chart(title, "k", what, [float(n) for n in k], {"force": list(forces)}, kept))
     return found
 
 
@@ -384,17 +331,12 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
-    return Chart(
-        f"Two particles: {walk.pair.name}",
-        "distance (Å)",
-        "energy (eV)",
-        walk.distance[first:].tolist(),
-        {"energy": walk.energy[first:].tolist()},
-        {
-            f"{'the interaction ends' if one.dies else 'the law changes'} at {one.radius:.6g} Å": one.radius
-            for one in walk.thresholds[-4:]
-        },
-    )
+    marks = {
+        f"{'the interaction ends' if one.dies else 'the law changes'} at {one.radius:.6g} Å": one.radius
+        for one in walk.thresholds[-4:]
+    }
+    title, lines = f"Two particles: {walk.pair.name}", {"energy": walk.energy[first:].tolist()}
+    return Chart(title, "distance (Å)", "energy (eV)", walk.distance[first:].tolist(), lines, marks)
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
@@ -405,11 +347,11 @@ def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubje
         above.append(float(np.nextafter(above[-1], np.inf)))
     row = threshold.order
     values = walk.pair.curve(subject).many([*below[::-1], *above])[row]
-    what = ("energy", "force")[row]
+    what, unit = (("energy", "eV"), ("force", "eV/Å"))[row]
     return Chart(
         f"{walk.pair.name} at {threshold.outside!r} Å, distance by representable distance",
         "representable distances from the jump",
-        f"{what} ({('eV', 'eV/Å')[row]})",
+        f"{what} ({unit})",
         [*np.arange(-_ULPS, 0.0), *np.arange(0.0, _ULPS)],
         {what: (values - (values[-1] if row == 0 else 0.0)).tolist()},
     )

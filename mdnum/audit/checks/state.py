@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import TIME_UP, CheckResult, Observed, Progress, TimeUp, finding
-from mdnum.audit.check import AuditCheck
+from mdnum.audit.base import (
+    TIME_UP,
+    AuditCheck,
+    CalculatorError,
+    CheckResult,
+    Observed,
+    Progress,
+    Skipped,
+    TimeUp,
+    finding,
+)
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
-from mdnum.audit.pairs import molecules, pairs, whole
-from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, Forces, not_repeatable, only_trying, rms
+from mdnum.audit.structures import Pair, molecules, pairs, whole
+from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -32,9 +41,13 @@ _HARMLESS = 1e-7
 #: take long over an empty one.
 _FAR, _BOX = 60.0, 75.0
 _CLUSTER = 12
-
-#: Energy and forces, or why there are none.
-Answered = tuple[float, Forces] | CalculatorError
+#: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
+#: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
+_BEYOND = tuple(0.15 * 1.5**n for n in range(8))
+_STEPS = 8
+#: Å inside the cutoff at which they are asked about.
+_INSIDE = (0.02, 0.1, 0.25)
+_EPS = np.finfo(float).eps
 
 
 class StateCheck(AuditCheck):
@@ -45,7 +58,6 @@ class StateCheck(AuditCheck):
 
     name, title, order = "state", "Memory", 50
     needed_to = ("run",)
-    seed = 0
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One object, asked again and again, beside new ones."""
@@ -55,17 +67,17 @@ class StateCheck(AuditCheck):
         approached, skipped = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
         total, done = sum(map(len, sequences.values())), 0
-        rows: list[dict[str, Any]] = []
-        for word, sequence in sequences.items():
+        rows: list[Comparison] = []
+        for name, sequence in sequences.items():
             compared = len(rows)
             try:
                 with subject.meter.limited():
-                    for reached, row in _through(subject, sequence, noise, word):
+                    for reached, row in _through(subject, sequence, noise, name):
                         rows.append(row)
                         progress(done + reached, total, {"phase": "state", "unit": "structures"})
             except TimeUp:
                 left = sum(one.compared for one in sequence) - (len(rows) - compared)
-                skipped.append((f"{left} questions of the sequence “{word}”", TIME_UP))
+                skipped.append((f"{left} questions of the sequence “{name}”", TIME_UP))
             done += len(sequence)
         if not rows and any(why == TIME_UP for _, why in skipped):
             raise TimeUp
@@ -73,101 +85,125 @@ class StateCheck(AuditCheck):
         tolerance = _tolerance(subject, atoms)
         alone = Alone(subject, atoms, noise)
         self.structures |= alone.structures
-        broken = [row for row in rows if row["remembers"] and row["broken"]]
-        stale = [row for row in rows if row["remembers"] and not row["broken"]]
+        stale = [row for row in rows if row.remembers and not row.broken]
         chance: dict[str, Any] = {}
         if stale and not _again(subject, sequences, stale):
             # another object on the same way does not go astray: it is chance, and no memory
-            worst = max(stale, key=lambda row: row["energy"])
-            chance = {"answers": len(stale), "energy": worst["energy"], "force": worst["force"]}
+            worst = max(stale, key=lambda row: row.energy)
+            chance = {"answers": len(stale), "energy": worst.energy, "force": worst.force}
             stale = []
-        refused = [row for row in rows if row["refused"] and not row["remembers"]]
+        refused = [row for row in rows if row.refused and not row.remembers]
         identical = repeats["bit-identical"], repeats["bit-identical between objects"]
-        largest = [row["energy"] for row in stale if np.isfinite(row["energy"])]
-        says = "failing" if stale and not largest else "stale" if stale else "chance" if chance else "none"
+        finite = [row.energy for row in stale if np.isfinite(row.energy)]
+        says = "failing" if stale and not finite else "stale" if stale else "chance" if chance else "none"
         how = "not_repeated" if not identical[0] else "repeated" if identical[1] else "not_between"
         values: dict[str, Any] = {
-            "rows": len(rows), "stale": len(stale), "sequences": len({row["sequence"] for row in rows}),
-            "answers": chance.get("answers", 0), "energy": max(largest, default=chance.get("energy", 0.0)),
+            "rows": len(rows), "stale": len(stale), "sequences": len({row.sequence for row in rows}),
+            "answers": chance.get("answers", 0), "energy": max(finite, default=chance.get("energy", 0.0)),
+        }  # fmt: skip
+        numbers = {
+            "structures": len(rows), "remembered": len(stale), "bit_identical": identical[0],
+            "largest": max((row.energy for row in rows), default=0.0),
+            "bit_identical_objects": identical[1], "kept_within": tolerance,
         }  # fmt: skip
         return CheckResult(
             says=([f"state_{says}", f"state_{how}"], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
-                *self._stale(stale),
+                *self._memory(stale),
                 *_kept(tolerance, atoms),
-                *_broken(broken),
-                *self._not_finite(refused),
+                *self._failures(rows),
                 *_changed_input(subject, atoms),
                 *alone.findings(),
             ],
             tables={
-                "One object, asked again and again, beside new ones": [_row(row) for row in rows],
+                "One object, asked again and again, beside new ones": [row.row() for row in rows],
                 "The same question again": [repeats],
                 "Atoms alone": alone.rows,
             },
-            numbers={
-                "structures": len(rows),
-                "remembered": len(stale),
-                "largest": max((row["energy"] for row in rows), default=0.0),
-                "bit_identical": identical[0],
-                "bit_identical_objects": identical[1],
-                "kept_within": tolerance,
-            },
+            numbers=numbers,
             skipped=[
                 *skipped,
-                *((row["structure"], row["refused"].message) for row in refused),
+                *((row.what, row.why) for row in refused),
                 *((what, error.message) for what, error in alone.refused),
             ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
 
-    def _stale(self, stale: list[dict[str, Any]]) -> Iterator[Observed]:
+    def _memory(self, stale: list[Comparison]) -> Iterator[Observed]:
         if stale:
-            worst = max(stale, key=lambda row: row["energy"])
-            self.structures |= {"stale-before": worst["before"], "stale-after": worst["atoms"]}
+            worst = max(stale, key=lambda row: row.energy)
+            self.structures |= {"stale-before": worst.before, "stale-after": worst.atoms}
             yield finding(
-                "STALE_STATE",
-                "error",
-                "refused" if worst["refused"] else None,
-                step=worst["structure"],
-                energy=worst["energy"],
-                force=worst["force"],
-                allowed=worst["allowed"],
-                why=worst["refused"].message if worst["refused"] else "",
-                questions=len(stale),
-                sequences=", ".join(sorted({row["sequence"] for row in stale})),
-            )
+                "STALE_STATE", "error", "refused" if worst.refused else None, step=worst.what,
+                energy=worst.energy, force=worst.force, allowed=worst.allowed, why=worst.why,
+                questions=len(stale), sequences=", ".join(sorted({row.sequence for row in stale})),
+            )  # fmt: skip
 
-    def _not_finite(self, refused: list[dict[str, Any]]) -> Iterator[Observed]:
-        empty = [row for row in refused if row["refused"].cause is None]
-        if empty:
-            self.structures["not-finite"] = empty[0]["atoms"]
-            why = empty[0]["refused"].message
-            yield finding("NOT_FINITE", "error", step=empty[0]["structure"], why=why)
+    def _failures(self, rows: list[Comparison]) -> Iterator[Observed]:
+        for row in [row for row in rows if row.remembers and row.broken][:1]:
+            yield finding("BROKEN_BY_FAILURE", "info", step=row.what, why=row.why)
+        empty = (row for row in rows if row.refused and not row.remembers and row.refused.cause is None)
+        if row := next(empty, None):
+            self.structures["not-finite"] = row.atoms
+            yield finding("NOT_FINITE", "error", step=row.what, why=row.why)
 
 
-def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], list[tuple[str, str]]]:
+@dataclass
+class Comparison:
+    """An answer of an object in use, beside that of a new one.
+
+    Attributes:
+        energy, force: by which the answers differ, eV and eV/Å; infinite where the object in use
+            fails alone.
+    """
+
+    sequence: str  # in which it was asked
+    what: str  # happened to the structure
+    before: Atoms  # what the object had been asked about before
+    atoms: Atoms
+    old: Answered
+    new: Answered
+    broken: bool  # whether it had failed then, and fails since
+    energy: float = 0.0
+    force: float = 0.0
+    allowed: float = 0.0  # of the energy, eV
+    remembers: bool = False  # whether they differ by more than noise
+
+    @property
+    def refused(self) -> CalculatorError | None:
+        """The failure; of both, what the new object says."""
+        return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
+
+    @property
+    def why(self) -> str:
+        return self.refused.message if self.refused else ""
+
+    def row(self) -> dict[str, Any]:
+        return {
+            "sequence": self.sequence, "what happened": self.what, "energy differs by (eV)": self.energy,
+            "allowed": self.allowed, "forces differ by (eV/Å)": self.force, "same": not self.remembers,
+        }  # fmt: skip
+
+
+def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], list[Skipped]]:
     """Sequences of two atoms at the cutoff; what could not be, and why."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
-        with only_trying(subject):
+        with subject.trying():
             found = pairs(subject)[0]
     except CalculatorError as error:
         return {}, [(what, error.message)]
-    for pair in found[:1]:
-        radii = [one.radius for one in thresholds if set(one.species) == set(pair.species)]
-        if radii:
-            return dict(approaches(pair, max(radii))), []
-    return {}, [(what, "no cutoff was found")]
+    radii = [one.radius for one in thresholds if found and set(one.species) == set(found[0].species)]
+    return (dict(approaches(found[0], max(radii))), []) if radii else ({}, [(what, "no cutoff was found")])
 
 
 def _through(
-    subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, word: str
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """One object through a sequence: a row for each answer, compared with that of a new object."""
+    subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
+) -> Iterator[tuple[int, Comparison]]:
+    """One object through a sequence: each answer, compared with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -184,54 +220,44 @@ def _through(
         new = known[id(asked.atoms)]
         # broken by a structure that every object refuses, which is another thing than a memory
         failed = failed and (isinstance(new, CalculatorError) or was_broken)
-        row: dict[str, Any] = {
-            "sequence": word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
-            "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
-            "old": old, "new": new, "broken": was_broken and isinstance(old, CalculatorError),
-        }  # fmt: skip
+        broken = was_broken and isinstance(old, CalculatorError)
+        row = Comparison(name, asked.what, previous, asked.atoms, old, new, broken)
         if isinstance(new, CalculatorError):
-            row["refused"] = new  # what nobody can answer says nothing about memory
+            pass  # what nobody can answer says nothing about memory
         elif isinstance(old, CalculatorError):
-            row |= {"remembers": True, "energy": float("inf"), "force": float("inf"), "refused": old}
+            row.remembers, row.energy, row.force = True, np.inf, np.inf
         else:
             size = size or abs(new[0])
             # a larger energy has more noise than was measured
             share = max(1.0, abs(new[0]) / size) if size else 1.0
-            energy, force = _differences(old, new)
-            rounding = np.finfo(float).eps * max(1.0, float(np.max(np.abs(new[1]), initial=0.0)))
-            allowed = _ALLOWED * noise.energy * share
-            remembers = energy > allowed or force > _ALLOWED * share * max(noise.force, rounding)
-            row |= {"energy": energy, "force": force, "allowed": allowed, "remembers": remembers}
+            row.energy, row.force = differences(old, new)
+            row.allowed = _ALLOWED * noise.energy * share
+            force = _ALLOWED * share * max(noise.force, _EPS * max(1.0, largest(new[1])))
+            row.remembers = row.energy > row.allowed or row.force > force
         yield place + 1, row
 
 
-def _differences(one: tuple[float, Forces], other: tuple[float, Forces]) -> tuple[float, float]:
-    return abs(one[0] - other[0]), float(np.max(np.abs(one[1] - other[1]), initial=0.0))
-
-
 def _again(
-    subject: CalculatorSubject, sequences: Mapping[str, list[SequenceStep]], stale: list[dict[str, Any]]
+    subject: CalculatorSubject, sequences: Mapping[str, list[SequenceStep]], stale: list[Comparison]
 ) -> bool:
     """Whether another object, on the way on which the worst difference showed, answers as that one did."""
-    worst = max(stale, key=lambda row: row["energy"])
+    worst = max(stale, key=lambda row: row.energy)
     used = subject.used()
     answer: Answered | None = None
-    for asked in sequences[worst["sequence"]]:
+    for asked in sequences[worst.sequence]:
         answer = used.try_both(asked.atoms)
-        if asked.atoms is worst["atoms"] and asked.what == worst["structure"]:
+        if asked.atoms is worst.atoms and asked.what == worst.what:
             break
-    if isinstance(answer, CalculatorError) or isinstance(worst["old"], CalculatorError):
-        return isinstance(answer, CalculatorError) and isinstance(worst["old"], CalculatorError)
-    new = subject.fresh().try_both(worst["atoms"])
-    if isinstance(new, CalculatorError):
+    if isinstance(answer, CalculatorError) or isinstance(worst.old, CalculatorError):
+        return isinstance(answer, CalculatorError) and isinstance(worst.old, CalculatorError)
+    new = subject.fresh().try_both(worst.atoms)
+    if isinstance(new, CalculatorError) or isinstance(worst.new, CalculatorError) or answer is None:
         return False
-    assert answer is not None
     # both must come again: what objects in use answer, and what new ones do
-    for now, before in ((answer, worst["old"]), (new, worst["new"])):
-        energy, force = _differences(now, before)
-        if force > 0.5 * worst["force"] or energy > 0.5 * worst["energy"]:
-            return False
-    return True
+    return all(
+        force <= 0.5 * worst.force and energy <= 0.5 * worst.energy
+        for energy, force in (differences(answer, worst.old), differences(new, worst.new))
+    )
 
 
 def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
@@ -240,17 +266,14 @@ def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     within = []
     for number in range(_AT_ONCE + _BETWEEN):
-        within.append((used.energy(atoms), used.forces(atoms)))
+        within.append(used.both(atoms))
         if number >= _AT_ONCE:
             used.energy(aside)
         else:
             used.forget()
-    objects = [within[0]]
-    for _ in range(_NEW - 1):
-        new = subject.fresh()
-        objects.append((new.energy(atoms), new.forces(atoms)))
+    objects = [within[0], *(subject.fresh().both(atoms) for _ in range(_NEW - 1))]
 
-    def spread(answers: list[tuple[float, Forces]]) -> tuple[bool, float, float]:
+    def spread(answers: list[tuple[float, np.ndarray]]) -> tuple[bool, float, float]:
         (energy, forces), *others = answers
         same = all(one[0] == energy and one[1].tobytes() == forces.tobytes() for one in others)
         force = np.max(np.ptp([one[1] for one in answers], axis=0), initial=0.0)
@@ -272,10 +295,10 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
     within = not repeats["bit-identical"]
     if not within and repeats["bit-identical between objects"] and not chance:
         return
-    energy = max(
-        repeats["energies scatter by"], repeats["energies between objects"], chance.get("energy", 0.0)
+    energy, force = (
+        max(repeats[f"{what} scatter by"], repeats[f"{what} between objects"], chance.get(one, 0.0))
+        for what, one in (("energies", "energy"), ("forces", "force"))
     )
-    force = max(repeats["forces scatter by"], repeats["forces between objects"], chance.get("force", 0.0))
     how = "chance" if chance else "within" if within else "between"
     yield not_repeatable(how, energy, force, repeats["typical force"], kT, answers=chance.get("answers", 0))
 
@@ -317,16 +340,12 @@ def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[fl
     rate = np.abs(values[-1] - values[0]) / places[-1]
     read = digits(values[:, :-1])
     # forces are the finer measure; the smallest of them may have lost its digits to others
-    last = max(2.0**-read.bits * float(np.max(np.abs(values[0, :-1]), initial=0.0)), read.quantum)
+    last = max(2.0**-read.bits * largest(values[0, :-1]), read.quantum)
     felt = float(np.max(rate[:-1], initial=0.0)) * sizes > _KEPT * last
     if read.bits <= 24:  # who answers in single precision may read positions so
         felt &= sizes > 4 * _grain(at(0.0))
-    kept = [
-        moved
-        for moved, seen, before, after in zip(sizes, felt, values, values[1:], strict=False)
-        if seen and (before == after).all()
-    ]
-    return float(max(kept, default=0.0))
+    same = (values[1:] == values[:-1]).all(axis=1)
+    return float(np.max(sizes[felt & same], initial=0.0))
 
 
 def _grain(atoms: Atoms) -> float:
@@ -340,36 +359,19 @@ def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
         yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
 
 
-def _broken(broken: list[dict[str, Any]]) -> Iterator[Observed]:
-    if broken:
-        step, why = broken[0]["structure"], broken[0]["refused"].message
-        yield finding("BROKEN_BY_FAILURE", "info", step=step, why=why)
-
-
 def _changed_input(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
     for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other = subject.fresh()
         try:
-            with only_trying(other):
+            with other.trying():
                 changed = other.writes(there)
         except CalculatorError:
             continue  # reported elsewhere
         if changed:
             yield finding("CHANGED_INPUT", "error", what=what, changed=" and ".join(changed))
             return
-
-
-def _row(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "sequence": row["sequence"],
-        "what happened": row["structure"],
-        "energy differs by (eV)": row["energy"],
-        "allowed": row["allowed"],
-        "forces differ by (eV/Å)": row["force"],
-        "same": not row["remembers"],
-    }
 
 
 class Alone:
@@ -394,14 +396,13 @@ class Alone:
         self.rows: list[dict[str, Any]] = []
         self.refused: list[tuple[str, CalculatorError]] = []
         self.structures: dict[str, Atoms] = {}
-        self._subject, self._noise = subject, noise
-        ask = lambda there: subject.fresh().try_both(there)  # noqa: E731
+        self._ask, self._noise = lambda there: subject.fresh().try_both(there), noise
         species = list(dict.fromkeys(atoms.symbols))
         single: dict[str, float] = {}
         for symbol in species:
             for periodic in (False, True):
                 one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-                answer = ask(one)
+                answer = self._ask(one)
                 if not isinstance(answer, CalculatorError):
                     single.setdefault(symbol, answer[0])
                 what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
@@ -409,17 +410,17 @@ class Alone:
         two = (species[0], species[-1])
         pair = Atoms(two, positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]], cell=[_BOX] * 3)
         expected = single[two[0]] + single[two[1]] if set(two) <= set(single) else None
-        self._add(f"{two[0]} and {two[1]} {_FAR:g} Å apart", ask(pair), expected, pair)
+        self._add(f"{two[0]} and {two[1]} {_FAR:g} Å apart", self._ask(pair), expected, pair)
         cluster = atoms[: min(len(atoms), _CLUSTER)]
         cluster.pbc = False
         cluster.positions += 1.0 - cluster.positions.min(axis=0)
         cluster.set_cell([_BOX + float(np.ptp(cluster.positions, axis=0).max())] * 3)
-        near = ask(cluster)
+        near = self._ask(cluster)
         failed = isinstance(near, CalculatorError)
         # one that knows whole molecules alone takes nothing of which an atom is gone; one that fails on an
         # atom without neighbors may fail on the cluster, and takes the structure with a vacancy
         fewer = (atoms[:-1],) if failed else (cluster[:-1], atoms[:-1])
-        self.takes_atoms = any(not isinstance(ask(one), CalculatorError) for one in fewer)
+        self.takes_atoms = any(not isinstance(self._ask(one), CalculatorError) for one in fewer)
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
         elif not self.takes_atoms:
@@ -427,7 +428,7 @@ class Alone:
         else:
             symbol = str(atoms.symbols[0])
             far = cluster + Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-            both = ask(far)
+            both = self._ask(far)
             if not isinstance(both, CalculatorError):
                 both = both[0], both[1][-1:]
             expected = near[0] + single[symbol] if symbol in single else None
@@ -438,11 +439,10 @@ class Alone:
         one = whole(atoms, molecules(atoms)[0])
         one.positions += [1.0, 2.0, 3.0]
         one.set_cell([_BOX] * 3)
-        other = one.copy()
-        other.positions[:, 0] += _FAR
+        other = displaced(one, np.array([_FAR, 0.0, 0.0]))
         formula, energy = one.get_chemical_formula(), None
         for what, there in ((f"one {formula}", one), (f"two {formula} {_FAR:g} Å apart", one + other)):
-            answer = self._subject.fresh().try_both(there)
+            answer = self._ask(there)
             if not isinstance(answer, CalculatorError):
                 # within a molecule there are forces, on it as a whole there is none
                 answer = answer[0], answer[1].reshape(-1, len(one), 3).sum(axis=1)
@@ -450,25 +450,19 @@ class Alone:
             self._add(what, answer, None if energy is None else energy * len(there) / len(one), there)
 
     def _add(self, what: str, answer: Answered, expected: float | None, atoms: Atoms) -> None:
-        """Takes note of an answer; without an expected energy, only of its force."""
+        """Take note of an answer; without an expected energy, only of its force."""
         if isinstance(answer, CalculatorError):
             self.refused.append((what, answer))
             if answer.cause is None:
                 self.structures["alone-failed"] = atoms
             return
-        force, eps = float(np.max(np.abs(answer[1]), initial=0.0)), np.finfo(float).eps
-        expected = answer[0] if expected is None else expected
-        allowed = _ALLOWED * max(self._noise.energy, eps * abs(expected))
-        self.rows.append(
-            {
-                "atoms": what,
-                "energy (eV)": answer[0],
-                "expected": expected,
-                "force (eV/Å)": force,
-                "adds up": abs(answer[0] - expected) <= allowed,
-                "no force": force <= _ALLOWED * max(self._noise.force, eps),
-            }
-        )
+        force, expected = largest(answer[1]), answer[0] if expected is None else expected
+        allowed = _ALLOWED * max(self._noise.energy, _EPS * abs(expected))
+        self.rows.append({
+            "atoms": what, "energy (eV)": answer[0], "expected": expected, "force (eV/Å)": force,
+            "adds up": abs(answer[0] - expected) <= allowed,
+            "no force": force <= _ALLOWED * max(self._noise.force, _EPS),
+        })  # fmt: skip
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""
@@ -484,3 +478,160 @@ class Alone:
             energies = f"{worst['energy (eV)']:.10g}", f"{worst['expected']:.10g}"
             values = {"what": worst["atoms"], "energy": energies[0], "expected": energies[1], "far": _FAR}
             yield finding("LONELY_ENERGY", "warning", **values)
+
+
+# -- structures that one object is asked about one after another: what a neighbor list can miss ----
+
+
+class SequenceStep(NamedTuple):
+    """A structure in a sequence, how it differs from the one before, and whether its answer is compared."""
+
+    what: str
+    atoms: Atoms
+    compared: bool = True
+
+
+def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
+    """Sequences that begin with a structure, by name; those without anything in them left out."""
+    sequences = {
+        "sizes": _sizes(atoms, rng),
+        "a slow drift": _slow_drift(atoms, rng),
+        "two atoms head on": _head_on(atoms),
+        "strain": _strain(atoms),
+        "wrapping": _wrapping(atoms, rng),
+    }
+    made = {name: [SequenceStep(*step) for step in sequence] for name, sequence in sequences.items()}
+    return {name: sequence for name, sequence in made.items() if sequence}
+
+
+def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """More atoms, fewer atoms, more and fewer neighbors, other species' places, other periodicity."""
+    yield "the structure", atoms
+    if len(atoms) <= 64 and atoms.pbc.any():
+        yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
+        yield "it shrank back", atoms
+    if len(atoms) > 2:
+        yield "its last third was removed", atoms[: max(1, 2 * len(atoms) // 3)]
+        yield "all but two atoms were removed", atoms[:2]
+        yield "all atoms came back", atoms
+    yield "all distances grew by half: fewer neighbors", _scaled(atoms, 1.5)
+    yield "they shrank again: more neighbors", atoms
+    yield "all distances shrank by 6 %: more neighbors", _scaled(atoms, 0.94)
+    yield "they grew again: fewer neighbors", atoms
+    if len(atoms) > 1:
+        yield "the atoms came in another order", atoms[rng.permutation(len(atoms))]
+        yield "they came in the first order", atoms
+    if atoms.pbc.any():
+        cluster = atoms.copy()
+        cluster.pbc = False
+        yield "the periods were switched off", cluster
+        yield "they were switched on", atoms
+    if len(set(atoms.numbers)) > 1:
+        swapped = atoms.copy()
+        swapped.numbers = np.roll(atoms.numbers, 1)
+        yield "the species changed places", swapped
+        yield "they changed back", atoms
+
+
+def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
+    there = atoms
+    heading = rng.standard_normal((len(atoms), 3))
+    heading /= np.linalg.norm(heading, axis=1)[:, None]
+    yield "the structure", there
+    for number in range(12):
+        # there and back, so that atoms do not run into one another
+        there = displaced(there, (0.04 if number < 6 else -0.04) * heading)
+        yield f"all atoms moved by 0.04 Å, {number + 1} times", there
+
+
+def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
+    """One atom, then two, move toward another in steps: what a criterion without its half misses."""
+    if len(atoms) < 2:
+        return
+    yield "the structure", atoms
+    distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
+    other = 1 + int(np.argmax(np.linalg.norm(distances, axis=1)))
+    line = distances[other - 1] / np.linalg.norm(distances[other - 1])
+    for moving, word in (((0,), "one atom"), ((0, other), "two atoms")):
+        there = atoms
+        for number in range(5):
+            step = np.zeros((len(atoms), 3))
+            for who in moving:
+                step[who] = (0.09 if who == 0 else -0.09) * line
+            there = displaced(there, step)
+            yield f"{word} moved by 0.09 Å toward another, {number + 1} times", there
+        yield "the structure", atoms
+
+
+def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
+    """The cell changes with the atoms, and without them."""
+    if not atoms.pbc.any():
+        return
+    yield "the structure", atoms
+    for scaled, word in ((True, "cell and atoms"), (False, "the cell alone")):
+        there = atoms
+        for number in range(4):
+            there = there.copy()
+            there.set_cell(there.cell.array * 0.985, scale_atoms=scaled)
+            yield f"{word} shrank by 1.5 %, {number + 1} times", there
+        yield "the structure", atoms
+    sheared = atoms.copy()
+    sheared.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]), scale_atoms=True)
+    yield "cell and atoms were sheared by 5 %", sheared
+    yield "the structure", atoms
+
+
+def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """Atoms jump to other images between calls, as codes that wrap positions make them."""
+    if not atoms.pbc.any():
+        return
+    there = atoms
+    yield "the structure", there
+    for number in range(4):
+        boxes = rng.integers(-1, 2, (len(atoms), 3)) * atoms.pbc
+        there = displaced(there, boxes @ atoms.cell.array + 0.02 * rng.uniform(-1, 1, (len(atoms), 3)))
+        yield f"atoms moved a little and were put into other boxes, {number + 1} times", there
+    folded = there.copy()
+    folded.wrap(eps=0)
+    yield "all atoms were wrapped", folded
+
+
+def _scaled(atoms: Atoms, factor: float) -> Atoms:
+    there = atoms.copy()
+    there.set_cell(factor * atoms.cell.array)
+    there.positions = factor * atoms.positions
+    return there
+
+
+def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
+    """Two particles that come into one another's reach: sequences by name, each for an object of its own.
+
+    Args:
+        radius: beyond which they do not feel one another, Å.
+    """
+    apart, count = "the two apart", len(pair.first)
+    for beyond in _BEYOND:
+        # both move, in small steps: neither further than half of what the distance changes by
+        start = pair.at(radius + beyond)
+        sequence = [SequenceStep(apart, start, compared=False)]
+        for moved in (*np.linspace(0, beyond, _STEPS + 1)[1:], *(beyond + inside for inside in _INSIDE)):
+            there = start.copy()
+            there.positions[:count, 0] += 0.5 * moved
+            there.positions[count:, 0] -= 0.5 * moved
+            what = f"each moved by {0.5 * moved:.3g} Å toward the other"
+            sequence.append(SequenceStep(what, there, compared=bool(moved > beyond)))
+        yield f"two atoms from {beyond:.2g} Å beyond the cutoff", sequence
+    if len(pair.first) == len(pair.second) == 1:
+        # atoms stand still while the cell brings an image of one into the other's reach: across the face they
+        # are 0.05 Å beyond the cutoff at first
+        shrinking = []
+        for moved in (0.0, 0.03, 0.06, 0.09, 0.12, 0.16):
+            there = pair.at(2.0 * radius - 0.05)
+            there.set_cell([3.0 * radius - moved] * 3)
+            there.pbc = True
+            what = f"the cell shrank by {moved:.2g} Å" if moved else apart
+            shrinking.append(SequenceStep(what, there, compared=moved > 0.05))
+        yield "a cell that shrinks around two atoms", shrinking
+        near = SequenceStep("one atom jumped next to the other", pair.at(0.95 * radius))
+        yield "one atom that jumps", [SequenceStep(apart, pair.at(3.0 * radius), compared=False), near]

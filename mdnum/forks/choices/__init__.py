@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-from mdnum.forks.choices.arithmetic import PrecisionChoice, Stopping, Summation
-from mdnum.forks.choices.base import CHOICES, Choice, parse, shipped, twin_of, unavailable, world_of
-from mdnum.forks.choices.decisions import ContactStep, Inverted, Iterations
-from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
-from mdnum.forks.choices.inputs import Cap, EnergyShift, NoiseChoice, StartUlp, Ulps
-from mdnum.forks.choices.lists import Builder, FormatChoice, Order, RebuildChoice, Skin
+# they register themselves
+from mdnum.forks.choices import arithmetic, ball, start  # noqa: F401
+from mdnum.forks.choices.base import (
+    CHOICES,
+    Choice,
+    parse,
+    shipped,
+    twin_of,
+    twin_or_reason,
+    unavailable,
+    world_of,
+)
 
-__all__ = [
-    "CHOICES",
-    "Builder",
-    "Cap",
-    "Choice",
-    "ContactStep",
-    "EnergyShift",
-    "FormatChoice",
-    "Images",
-    "Inverted",
-    "Iterations",
-    "NoiseChoice",
-    "Order",
-    "PrecisionChoice",
-    "RebuildChoice",
-    "Relabel",
-    "Rotate",
-    "Skin",
-    "StartUlp",
-    "Stopping",
-    "Summation",
-    "Translate",
-    "Ulps",
-    "parse",
-    "shipped",
-    "twin_of",
-    "unavailable",
-    "world_of",
-]
+__all__ = ["CHOICES", "Choice", "parse", "shipped", "twin_of", "twin_or_reason", "unavailable", "world_of"]

@@ -1,38 +1,43 @@
-"""Choices of arithmetic: which float plays which role, how sums are made, what stops a solver."""
+"""Choices of arithmetic: which float plays which role, and the order of sums.
+
+An order is chosen as a reduction, or by what lists hold first: how and when they are built. None of these
+changes which pairs interact, as long as a list is rebuilt before its skin is used up. With sums that have no
+order they must change nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.forks.choices.base import (
+    ORDERLESS,
     Choice,
+    Summed,
+    applies,
     built,
+    check,
     choice,
     is_pairwise,
+    number,
     simulations,
-    summed,
+    summing,
     world_of,
 )
-from mdnum.forks.worlds import not_possible, twin
+from mdnum.forks.worlds import ROLES, program_of, twin, varied
 from mdnum.numerics import reductions
 from mdnum.numerics.roles import ALL, WIDE, check_role
 from mdnum.program import Twin
-from mdnum.systems.ball import FixedRule, RelativeRule, SumRule
+from mdnum.systems import System
+from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
 
-ROLES = {
-    "md": ("state", "force", "decision", "accumulate"),
-    "ball": ("state", "arithmetic", "decision", "accumulate"),
-}
 #: What "precision" without a role means: of molecular dynamics all but what is carried from step to step.
 _DEFAULT = {"md": ("force", "decision", "accumulate"), "ball": ROLES["ball"]}
-#: Rules that a tolerance of metres belongs to.
-RULES = {
-    "sum": "the sum of the residuals of all balls",
-    "per-instance": "each ball's own residual",
-    "maximum": "the largest residual of the batch",
-}
+#: As jax-md names its formats.
+FORMATS = ("dense", "sparse", "ordered-sparse")
 
 
 @choice("precision")
@@ -48,19 +53,27 @@ class PrecisionChoice(Choice):
         dtype: "float64", "float32", "float16" or "bfloat16".
     """
 
+    screened: ClassVar = {
+        "md": " ".join(("precision", *(f"precision.{role}" for role in ROLES["md"])))
+        + " precision.force=bfloat16",
+        "ball": " ".join(
+            f"{family}={dtype}"
+            for family in ("precision", *(f"precision.{role}" for role in ROLES["ball"]))
+            for dtype in ALL
+        ),
+    }
     role: str | None = None
     dtype: str = "float32"
 
     def __post_init__(self):
         known = dict.fromkeys((*ROLES["md"], *ROLES["ball"]))
-        if self.role is not None and self.role not in known:
-            raise InputError(
-                f"no role {self.role!r}; there are {', '.join(known)}",
-                where="precision",
-                remedy="Write precision, or precision.state=bfloat16",
-            )
-        if self.dtype not in ALL:
-            raise InputError(f"unknown dtype {self.dtype!r}; known are {', '.join(ALL)}", where=self.name)
+        check(
+            self.role is None or self.role in known,
+            f"no role {self.role!r}; there are {', '.join(known)}",
+            "precision",
+            "Write precision, or precision.state=bfloat16",
+        )
+        check(self.dtype in ALL, f"unknown dtype {self.dtype!r}; known are {', '.join(ALL)}", self.name)
 
     @property
     def name(self) -> str:
@@ -72,13 +85,6 @@ class PrecisionChoice(Choice):
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
         return cls(role or None, argument or "float32")
 
-    @classmethod
-    def shipped(cls, world: str) -> Iterable[Choice]:
-        roles = (None, *ROLES[world])
-        if world == "ball":
-            return [cls(role, dtype) for role in roles for dtype in ALL]
-        return [*(cls(role) for role in roles), cls("force", "bfloat16")]
-
     def _roles(self, world: str) -> tuple[str, ...]:
         if self.role is not None:
             return (self.role,)
@@ -87,35 +93,23 @@ class PrecisionChoice(Choice):
     def describe(self, world: str = "md") -> str:
         return f"{', '.join(self._roles(world))} in {self.dtype}"
 
-    def reason_unavailable(self, system: Any) -> str | None:
-        world = world_of(system)
-        roles = self._roles(world)
-        if missing := [role for role in roles if role not in ROLES[world]]:
-            return f"it has no role {missing[0]}; there are {', '.join(ROLES[world])}"
-        if world == "md" and not is_pairwise(system):
-            return "many-body potentials are evaluated in float64 only"
-        if all(getattr(system.spec.precision, role) == self.dtype for role in roles):
-            return f"{', '.join(roles)} {'is' if len(roles) == 1 else 'are'} {self.dtype} already"
-        if world == "md":
-            try:
-                for role in roles:
-                    check_role(role, self.dtype)
-            except InputError as error:
-                return error.message
-            return None
-        if roles == ("accumulate",) and (reason := nothing_summed(system)) is not None:
-            return reason
-        return not_possible(system, self._keys(world), self.name)
-
-    def _keys(self, world: str) -> dict[str, str]:
-        return {f"precision.{role}": self.dtype for role in self._roles(world)}
-
     def make(self, system: Any) -> Twin:
-        world = world_of(system)
+        world, own = world_of(system), system.spec.precision
         roles = self._roles(world)
-        before = ", ".join(sorted({getattr(system.spec.precision, role) for role in roles}))
-        difference = f"{', '.join(roles)} in {self.dtype}, not {before}"
-        return twin(system, self._keys(world), self.name, difference)
+        missing = [role for role in roles if role not in ROLES[world]]
+        applies(not missing, f"it has no role {'.'.join(missing)}; there are {', '.join(ROLES[world])}")
+        if world == "md":
+            applies(is_pairwise(system), "many-body potentials are evaluated in float64 only")
+        before = {getattr(own, role) for role in roles}
+        verb = "is" if len(roles) == 1 else "are"
+        applies(before != {self.dtype}, f"{', '.join(roles)} {verb} {self.dtype} already")
+        if world == "md":
+            for role in roles:
+                check_role(role, self.dtype)
+        elif roles == ("accumulate",):
+            sums_residuals(system)
+        values = {f"precision.{role}": self.dtype for role in roles}
+        return twin(system, values, self.name, f"{self.describe(world)}, not {', '.join(sorted(before))}")
 
 
 @choice("reduction")
@@ -126,85 +120,259 @@ class Summation(Choice):
         word: as `mdnum.numerics.reductions.parse` reads it: "exact", "permuted:3", "blocked:8".
     """
 
+    screened = " ".join(f"reduction={word}" for word in reductions.BY_NAME)
     shown = True
     word: str = "exact"
 
     def __post_init__(self):
         reductions.parse(self.word)
 
-    @classmethod
-    def shipped(cls, world: str) -> Iterable[Choice]:
-        return [cls(word) for word in reductions.BY_NAME]
-
     def describe(self, world: str = "md") -> str:
         return f"{'force sums' if world == 'md' else 'the residuals of all balls summed'} {self.word}"
 
-    def reason_unavailable(self, system: Any) -> str | None:
-        if world_of(system) == "ball":
-            if (reason := nothing_summed(system)) is not None:
-                return reason
-            if system.balls == 1:
-                return "the residual of one ball is no sum"
-        elif not is_pairwise(system):
-            return "the sums of a many-body potential have one order"
-        if self.word == system.spec.precision.reduction:
-            return f"the system sums {self.word} already"
-        return None
-
     def make(self, system: Any) -> Twin:
-        before = system.spec.precision.reduction
-        if world_of(system) == "ball":
+        is_ball, before = world_of(system) == "ball", system.spec.precision.reduction
+        if is_ball:
+            sums_residuals(system)
+            applies(system.balls > 1, "the residual of one ball is no sum")
+        b = None if is_ball else built(system, self.word)
+        applies(self.word != before, f"the system sums {self.word} already")
+        if is_ball:
             values = {"precision.reduction": self.word}
             return twin(system, values, self.name, f"residuals summed {self.word}, not {before}")
-        a = built(system)
-        return simulations(a, summed(a, self.word), f"force sums {self.word}, not {before}")
+        return simulations(built(system), b, f"force sums {self.word}, not {before}")
 
 
-@choice("stop")
-class Stopping(Choice):
-    """Another rule that stops the solver, with the same tolerance.
+def sums_residuals(system: Any) -> None:
+    """Refuse a ball's system whose steps sum nothing over several balls, with an `InputError`."""
+    stop = system.spec.stop
+    applies(stop is not None, "its steps solve nothing, so there is no residual to sum")
+    reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"
+    applies(isinstance(stop, SumRule | RelativeRule), reason)
+
+
+# --- what lists hold, in which order --------------------------------------------------------------------
+
+
+@choice("order")
+class Order(Summed):
+    """The neighbors of each atom, or the balls of the batch, in another order.
 
     Attributes:
-        rule: "sum", "per-instance" or "maximum".
+        both: reduction of both runs; of a ball "exact" sums of residuals, or "alone": each ball stopped by
+            itself; None for the system's own.
+        seed: of the shuffle.
     """
 
-    worlds = ("ball",)
-    shown = True
-    rule: str = "per-instance"
+    worlds = ("md", "ball")
+    screened: ClassVar = {
+        "md": "order order@exact order@fixed-point",
+        "ball": "order order@exact order@alone",
+    }
+    seed: int = 1
 
     def __post_init__(self):
-        if self.rule not in RULES:
-            raise InputError(f"no rule {self.rule!r}; there are {', '.join(RULES)}", where="stop")
+        if self.both != "alone":
+            super().__post_init__()
+        check(self.seed >= 0, f"seed {self.seed} is negative", "order")
 
-    @classmethod
-    def shipped(cls, world: str) -> Iterable[Choice]:
-        return [cls(rule) for rule in RULES]
+    @property
+    def must_hold(self) -> bool:  # type: ignore[override]
+        """Sums without an order, and balls that are stopped by themselves, do not depend on it."""
+        return self.both in (*ORDERLESS, "alone")
 
-    def describe(self, world: str = "ball") -> str:
-        return f"the solver is stopped by {RULES[self.rule]}"
-
-    def reason_unavailable(self, system: Any) -> str | None:
-        stop = system.spec.stop
-        if stop is None:
-            return "its steps solve nothing, so nothing stops a solver"
-        if isinstance(stop, FixedRule):
-            return "its solver makes a fixed number of iterations and has no tolerance"
-        if isinstance(stop, RelativeRule):
-            return "its tolerance is a share of the first residual and not a height"
-        if stop.rule == self.rule:
-            return f"the rule is {self.rule} already"
-        return not_possible(system, {"stop.rule": self.rule}, self.name)
+    def describe(self, world: str = "md") -> str:
+        if world == "md":
+            return "neighbors of each atom shuffled" + summing(self.both)
+        both = {
+            "exact": ", both runs with exact sums of residuals",
+            "alone": ", each ball stopped by itself in both runs",
+        }
+        return f"the balls of the batch in another order{both.get(self.both or '', '')}"
 
     def make(self, system: Any) -> Twin:
-        difference = f"stopped by the rule {self.rule}, not {system.spec.stop.rule}"
-        return twin(system, {"stop.rule": self.rule}, self.name, difference)
+        if world_of(system) == "ball":
+            return self._of_balls(system)
+        from mdnum.forks.reordered import ReorderedSimulation
+
+        applies(self.both != "alone", "@alone is for balls")
+        a = built(system, self.both)
+        b = ReorderedSimulation.of(a, self.seed)
+        return self.twin(a, b, f"neighbors of each atom shuffled with seed {self.seed}")
+
+    def _of_balls(self, system: Any) -> Twin:
+        applies(self.both in (None, "exact", "alone"), "of a ball there are order@exact and order@alone")
+        applies(system.balls > 1, "there is one ball")
+        own, stop, difference = (
+            system.spec.precision.reduction,
+            system.spec.stop,
+            "the balls in another order",
+        )
+        if self.both == "alone":
+            reason = "its tolerance is a share of the first residual of all balls"
+            applies(not isinstance(stop, RelativeRule), reason)
+            if isinstance(stop, SumRule | MaximumRule):
+                system = varied(system, {"stop.rule": "per-instance"}, self.name)
+                difference += " (both with each ball stopped by itself)"
+        else:
+            try:
+                sums_residuals(system)
+            except InputError as error:
+                rest = "" if self.both else ": order@alone must hold"
+                raise InputError(error.message + rest) from None
+            without = own.partition(":")[0] in (*ORDERLESS, "sorted")
+            reason = f"sums are {own}, which have no order: order@exact must hold"
+            applies(self.both is not None or not without, reason)
+            if self.both == "exact" and own != "exact":
+                system = varied(system, {"precision.reduction": "exact"}, self.name)
+                difference += " (both with exact sums)"
+        a: Any = program_of(system)
+        rng = np.random.default_rng(self.seed)
+        order = rng.permutation(system.balls)
+        while np.array_equal(order, np.arange(system.balls)):
+            order = rng.permutation(system.balls)
+        start = {}
+        for name in ("y0", "v0"):
+            value = np.asarray(getattr(a.problem, name))
+            start[name] = value[order] if value.ndim == 1 and value.size > 1 else value
+        b = replace(a, problem=replace(a.problem, **start), order=tuple(order.tolist()))
+        return Twin(a, b, difference)
 
 
-def nothing_summed(system: Any) -> str | None:
-    """Why the steps of a ball's system sum nothing over several balls; None where they do."""
-    stop = system.spec.stop
-    if stop is None:
-        return "its steps solve nothing, so there is no residual to sum"
-    if not isinstance(stop, SumRule | RelativeRule):
-        return f"its solver is stopped by the rule {stop.rule}, which sums nothing"
-    return None
+@choice("format")
+class FormatChoice(Summed):
+    """The neighbors of each atom in the order in which another format of the list adds them.
+
+    Attributes:
+        both: reduction of both runs; None for the system's own.
+        word: "dense", "sparse" or "ordered-sparse", as jax-md names its formats.
+    """
+
+    screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
+    shown = True
+    word: str = "ordered-sparse"
+
+    def __post_init__(self):
+        super().__post_init__()
+        check(self.word in FORMATS, f"no format {self.word!r}; there are {', '.join(FORMATS)}", "format")
+
+    def describe(self, world: str = "md") -> str:
+        return f"pair terms added in the order of {self.word} lists{summing(self.both)}"
+
+    def make(self, system: System) -> Twin:
+        from mdnum.forks.reordered import ReorderedSimulation
+
+        a, own = built(system, self.both), system.spec.precision.reduction
+        if self.both is None:
+            applies(is_pairwise(system), "a many-body potential has a format of its own")
+            applies(own == "sequential", f"a format is the order of a loop, and sums are {own} here")
+        b = ReorderedSimulation.of(a, self.word)
+        return self.twin(a, b, f"pair terms in the order of {self.word} lists, not of the search's")
+
+
+@choice("builder")
+class Builder(Summed):
+    """Lists by another search for neighbors.
+
+    Attributes:
+        both: reduction of both runs.
+        word: "host" or "jax-md"; None for the one that the system does not use.
+    """
+
+    screened = "builder builder@exact"
+    word: str | None = None
+
+    def __post_init__(self):
+        from mdnum.md.neighbors import BUILDERS
+
+        super().__post_init__()
+        known = f"no list builder {self.word!r}; there are {', '.join(BUILDERS)}"
+        check(self.word is None or self.word in BUILDERS, known, "builder")
+
+    def make(self, system: System) -> Twin:
+        from mdnum.md.neighbors import BUILDERS
+
+        a = built(system, self.both)
+        word = self.word or next(name for name in BUILDERS if name != a.builder)
+        applies(word != a.builder, f"the lists are {word}'s already")
+        b = built(varied(system, {"neighbors.builder": word}), self.both)
+        return self.twin(a, b, f"lists by {word}, not {a.builder}")
+
+
+@choice("skin")
+class Skin(Summed):
+    """Another skin: more or fewer pairs that do not interact, found at other times.
+
+    Attributes:
+        both: reduction of both runs.
+        length: of the skin; None for half as much again, or three quarters where the box has no room.
+    """
+
+    screened = "skin skin@exact"
+    length: float | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        good = self.length is None or self.length >= 0
+        check(good, f"skin = {self.length}; expected a length of 0 or more", "skin")
+
+    def make(self, system: System) -> Twin:
+        a, own, length = built(system, self.both), system.spec.skin, self.length
+        if length is None:
+            room = float(np.min(a.cell.widths)) / 2 - a.r_cut
+            length = 1.5 * own if 1.5 * own <= room else 0.75 * own
+        applies(length != own, f"the skin is {own:g} already")
+        b = built(varied(system, {"neighbors.skin": length}), self.both)
+        return self.twin(a, b, f"skin {length:g}, not {own:g}")
+
+
+@choice("rebuild")
+class RebuildChoice(Summed):
+    """Another rule for when a list is rebuilt.
+
+    Attributes:
+        both: reduction of both runs.
+        every: rebuild blindly every so many steps; None: when an atom has moved by half the skin.
+    """
+
+    screened = "rebuild=every:1 rebuild=every:10 rebuild=half-skin rebuild=every:1@exact"
+    every: int | None = 1
+
+    def __post_init__(self):
+        super().__post_init__()
+        good = self.every is None or self.every >= 1
+        check(good, f"every {self.every} steps; expected at least 1", "rebuild")
+
+    @property
+    def argument(self) -> str:
+        return "half-skin" if self.every is None else f"every:{self.every}"
+
+    @property
+    def must_hold(self) -> bool:  # type: ignore[override]
+        """A list that is always fresh, or rebuilt in time, holds the pairs; a blind one may lose some."""
+        return super().must_hold and self.every in (1, None)
+
+    @classmethod
+    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
+        rule, _, count = argument.partition(":")
+        check(rule in ("", "half-skin", "every"), f"no rule {argument!r}", "rebuild",
+              "Write every:10 or half-skin")  # fmt: skip
+        return cls(both, number(count, int, "rebuild") if rule == "every" else None if rule else 1)
+
+    def describe(self, world: str = "md") -> str:
+        return f"lists rebuilt {self._when}{summing(self.both)}"
+
+    @property
+    def _when(self) -> str:
+        if self.every is None:
+            return "when half the skin is used up"
+        return "at every step" if self.every == 1 else f"blindly every {self.every} steps"
+
+    def make(self, system: System) -> Twin:
+        own, every = system.spec.neighbors.rebuild, self.every or 1
+        # where nothing is checked, a delay holds back a rebuild like an interval does
+        same = own.check and own.delay <= 1 if self.every is None else not own.check and own.delay <= every
+        applies(not (same and own.every == every), f"lists are rebuilt {self._when} already")
+        rule = {"every": every, "delay": 0, "check": self.every is None}
+        other = varied(system, {f"neighbors.rebuild.{key}": value for key, value in rule.items()})
+        return self.twin(built(system, self.both), built(other, self.both), f"lists rebuilt {self._when}")

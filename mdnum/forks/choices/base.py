@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -13,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
-from mdnum.registry import Registry
+from mdnum.registry import Registry, unknown
 from mdnum.systems import BallSystem, System
 
 #: Reductions whose result does not depend on the order of their terms.
@@ -21,6 +20,8 @@ ORDERLESS = ("exact", "fixed-point")
 #: What `mdnum fork processes` varies, and people may look for here.
 _PROGRAMS = ("jit", "eager", "vmap", "grad", "xla")
 _WORLDS = {"md": "of molecular dynamics", "ball": "of a ball"}
+#: Fields that are written with their sign.
+_SIGNED = ("ulps", "more")
 
 
 class Choice:
@@ -28,33 +29,35 @@ class Choice:
 
     To add one, write a subclass and decorate it with `choice("family")`, the word before "=". A package
     outside gives its own a `family`, decorates it with `choice(None)` and names it by an entry point of the
-    group "mdnum.choices". Its first field but `both` is what is written after "=", and `both`, where there is
-    one, what is written after "@".
+    group "mdnum.choices". Its fields but `both` are what is written after "=", with ":" between them, and
+    `both`, where there is one, is what is written after "@". The first line of its docstring describes it.
 
     Attributes:
         family: the word before "=".
         worlds: "md" and "ball", or one of them.
+        screened: words of the choices that are screened when all are asked for, of each world where they are
+            not the same; the family's own where there are none.
+        shown: whether arguments are a part of the name where they are the defaults.
         must_hold: whether it cannot change a bit of the trajectory by design, so that a fork is a finding.
-        shown: whether its argument is a part of its name where it is the default.
     """
 
     family: ClassVar[str] = ""
     worlds: ClassVar[tuple[str, ...]] = ("md", "ball")
-    must_hold: bool = False
+    screened: ClassVar[str | Mapping[str, str]] = ""
     shown: ClassVar[bool] = False
+    must_hold: bool = False
 
     @classmethod
-    def _field(cls) -> Any:
-        return next((one for one in fields(cls) if one.name != "both"), None)  # type: ignore[arg-type]
+    def _fields(cls) -> list[Any]:
+        return [one for one in fields(cls) if one.name != "both"]  # type: ignore[arg-type]
 
     @property
     def argument(self) -> str:
         """What is written after "="."""
-        field = self._field()
-        value = None if field is None else getattr(self, field.name)
-        if value is None or (field and value == field.default and not self.shown):
+        values = {one.name: getattr(self, one.name) for one in self._fields()}
+        if not self.shown and all(values[one.name] == one.default for one in self._fields()):
             return ""
-        return f"{value:g}" if isinstance(value, float) else str(value)
+        return ":".join(_written(name, value) for name, value in values.items() if value is not None)
 
     @property
     def name(self) -> str:
@@ -74,27 +77,26 @@ class Choice:
         Raises:
             InputError: an argument that it cannot have.
         """
-        field = cls._field()
-        if argument and field is None:
+        own = cls._fields()
+        if argument and not own:
             raise InputError(f"{cls.family} has no argument", where=f"{cls.family}={argument}")
-        values = {"both": both} if both else {}
-        if argument:
-            kind = {"int": int, "float": float}.get(str(field.type).partition(" ")[0])
-            values[field.name] = number(argument, kind, cls.family) if kind else argument
+        values: dict[str, Any] = {"both": both} if both else {}
+        for one, part in zip(own, argument.split(":", len(own) - 1) if argument else (), strict=False):
+            kind = {"int": int, "float": float}.get(str(one.type).partition(" ")[0])
+            values[one.name] = number(part, kind, cls.family) if kind else part
         return cls(**values)
 
-    @classmethod
-    def shipped(cls, world: str) -> Iterable[Choice]:
-        """The choices of this family that are screened when all are asked for."""
-        return (cls(),)
-
-    def reason_unavailable(self, system: Any) -> str | None:
-        """Why it does not apply to a system of its worlds; None where it does."""
-        return None
-
     def make(self, system: Any) -> Twin:
-        """The two programs; called where it applies."""
+        """The two programs, of a system of one of its worlds.
+
+        Raises:
+            InputError: it does not apply to the system; the message is the reason.
+        """
         raise NotImplementedError
+
+
+def _written(name: str, value: Any) -> str:
+    return f"{value:+d}" if name in _SIGNED else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
@@ -121,17 +123,30 @@ def world_of(system: Any) -> str:
 
 def shipped(world: str) -> dict[str, Choice]:
     """The choices of a world that are screened when all are asked for, by name."""
-    families = (CHOICES[family] for family in CHOICES)
-    every = (choice for one in families if world in one.worlds for choice in one.shipped(world))
-    return {choice.name: choice for choice in every}
+
+    def of_family(kind: type[Choice]) -> Iterable[Choice]:
+        words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
+        return [parse(word) for word in words.split()] if words else [kind()]
+
+    kinds = [kind for kind in (CHOICES[family] for family in CHOICES) if world in kind.worlds]
+    return {choice.name: choice for kind in kinds for choice in of_family(kind)}
 
 
 def unavailable(choice: Choice, system: Any) -> str | None:
     """Why a choice does not apply to a system; None where it does."""
-    world = world_of(system)
-    if world not in choice.worlds:
+    made = twin_or_reason(choice, system)
+    return made if isinstance(made, str) else None
+
+
+def twin_or_reason(choice: Choice, system: System | BallSystem) -> Twin | str:
+    """The two programs of a choice, or why it does not apply to the system."""
+    if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
-    return choice.reason_unavailable(system)
+    try:
+        return choice.make(system)
+    except InputError as error:
+        # the choice is named where this is printed
+        return error.message.removeprefix(f"variant {choice.name!r}: ")
 
 
 def twin_of(choice: Choice, system: System | BallSystem) -> Twin:
@@ -140,14 +155,14 @@ def twin_of(choice: Choice, system: System | BallSystem) -> Twin:
     Raises:
         InputError: it does not apply to the system.
     """
-    reason = unavailable(choice, system)
-    if reason is not None:
+    made = twin_or_reason(choice, system)
+    if isinstance(made, str):
         raise InputError(
-            f"does not apply to {system.name}: {reason}",
+            f"does not apply to {system.name}: {made}",
             where=choice.name,
             remedy="Choose another: `mdnum fork` lists them",
         )
-    return choice.make(system)
+    return made
 
 
 def parse(text: str) -> Choice:
@@ -179,23 +194,26 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    known = dict.fromkeys([*CHOICES, *shipped("md"), *shipped("ball")])
-    close = difflib.get_close_matches(text, known, n=3)
-    near = f"Did you mean {' or '.join(close)}? " if close else ""
-    raise InputError(
-        f"no choice {text!r}", remedy=f"{near}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
-    )
+    raise unknown("choice", text, CHOICES)
 
 
 # --- for the choices ----------------------------------------------------------------------------------
 
 
-def number(text: str, kind: type, where: str) -> Any:
-    """A number from a choice's argument.
+def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
+    """Refuse an argument that is not good, with an `InputError`."""
+    if not is_good:
+        raise InputError(message, where=where, remedy=remedy)
 
-    Raises:
-        InputError: it is none.
-    """
+
+def applies(is_so: bool, reason: str) -> None:
+    """Say, with an `InputError`, why a choice does not apply to a system, where it does not."""
+    if not is_so:
+        raise InputError(reason)
+
+
+def number(text: str, kind: type, where: str) -> Any:
+    """A number from a choice's argument; an `InputError` where it is none."""
     try:
         return kind(text)
     except ValueError:
@@ -203,14 +221,14 @@ def number(text: str, kind: type, where: str) -> Any:
         raise InputError(f"{text!r} is not {what}", where=where) from None
 
 
-def some_ulps(count: int, where: str) -> None:
-    """Refuse 0 ulps or iterations.
+def some(count: int, where: str) -> None:
+    """Refuse 0 ulps or iterations, with an `InputError`."""
+    check(count != 0, "0 change nothing", where, "Write +1 or -1")
 
-    Raises:
-        InputError: it is 0.
-    """
-    if count == 0:
-        raise InputError("0 change nothing", where=where, remedy="Write +1 or -1")
+
+def plural(count: int, noun: str) -> str:
+    """The noun, with an s where there are several."""
+    return noun if abs(count) == 1 else f"{noun}s"
 
 
 def is_pairwise(system: System) -> bool:
@@ -223,33 +241,25 @@ def is_langevin(system: System) -> bool:
     return system.spec.dynamics.kind == "langevin"
 
 
-def no_sums(system: System, both: str | None) -> str | None:
-    """Why both runs cannot have a reduction; None where they can, or where none was asked for."""
-    if both is None or is_pairwise(system):
-        return None
-    return "the sums of a many-body potential have one order"
-
-
 def summing(both: str | None) -> str:
     """The end of a sentence that says how both runs sum."""
     return "" if both is None else f" (both with {both} sums)"
 
 
-def summed(simulation: Any, word: str | None) -> Any:
-    """The same simulation with another order of its force sums, such as "exact" or "permuted:3"."""
-    if word is None:
-        return simulation
-    system = simulation.system
-    if ":" not in word:
-        # the system then says what runs; a file has no words for the number of a reduction
-        system = varied(system, {"precision.reduction": word})
-    return replace(simulation, system=system, reduction=reductions.parse(word))
-
-
 def built(system: System, both: str | None = None) -> Any:
-    """A system's simulation, with the reduction that both programs of a twin have."""
+    """A system's simulation, with another order of its force sums, such as "exact" or "permuted:3".
+
+    A many-body potential has none: an `InputError`.
+    """
+    if both is not None:
+        applies(is_pairwise(system), "the sums of a many-body potential have one order")
     program: Any = program_of(system)
-    return summed(program.simulation, both)
+    if both is None:
+        return program.simulation
+    if ":" not in both:
+        # the system then says what runs; a file has no words for the number of a reduction
+        system = varied(system, {"precision.reduction": both})
+    return replace(program.simulation, system=system, reduction=reductions.parse(both))
 
 
 def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
@@ -257,3 +267,28 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
     from mdnum.rollout.program import MdProgram
 
     return Twin(MdProgram(a), MdProgram(b, frame=frame), difference, changes(a.system, b.system))
+
+
+@choice(None)
+class Summed(Choice):
+    """A choice of molecular dynamics whose two runs may be given a reduction: without an order it must hold.
+
+    Attributes:
+        both: reduction of both runs; None for the system's own.
+    """
+
+    worlds = ("md",)
+    both: str | None = None
+
+    def __post_init__(self):
+        if self.both is not None:
+            reductions.parse(self.both)
+
+    @property
+    def must_hold(self) -> bool:  # type: ignore[override]
+        """Sums without an order do not depend on what is chosen."""
+        return self.both in ORDERLESS
+
+    def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
+        """The twin of two simulations with the reduction of both."""
+        return simulations(a, b, difference + summing(self.both), frame)

@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mdnum.references.conformance.adoption import NeighborListConformance
     from mdnum.references.conformance.case import Case, Still
-    from mdnum.references.conformance.lists import LISTS, KeptList, ListLimits, PairList
-    from mdnum.references.conformance.loading import from_object, installed, known, load
+    from mdnum.references.conformance.judge import Report
+    from mdnum.references.conformance.lists import LISTS, KeptList, ListLimits, PairList, from_object
+    from mdnum.references.conformance.peers import installed, known, load
     from mdnum.references.conformance.questions import boxes, cases
     from mdnum.references.conformance.reproduction import script
-    from mdnum.references.conformance.results import Report
     from mdnum.references.conformance.suite import examine
 
 # no module here has the name of what is exported: importing it would put the module in its place
 _HOMES = {
     "adoption": ("NeighborListConformance",),
     "case": ("Case", "Still"),
-    "lists": ("LISTS", "KeptList", "ListLimits", "PairList"),
-    "loading": ("from_object", "installed", "known", "load"),
+    "judge": ("Report",),
+    "lists": ("LISTS", "KeptList", "ListLimits", "PairList", "from_object"),
+    "peers": ("installed", "known", "load"),
     "questions": ("boxes", "cases"),
     "reproduction": ("script",),
-    "results": ("Report",),
     "suite": ("examine",),
 }
 

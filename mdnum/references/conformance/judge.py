@@ -1,69 +1,56 @@
-"""An answer against the truth: what is missing, too much, duplicated, misplaced or mismeasured."""
+"""An answer against the truth: missing, extra, duplicated, misplaced, mismeasured; and the tally of many."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import re
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, Literal, get_args
 
 import numpy as np
 from annotated_types import Ge
 from numpy import ndarray
+from pydantic import FiniteFloat
 
+from mdnum.errors import InputError
 from mdnum.references.conformance.answer import Answer
 from mdnum.references.conformance.case import Case
-from mdnum.references.oracle import all_pairs, completed, exactly_inside, rounding_bound
+from mdnum.references.conformance.lists import PairList
+from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
 
+Count = Annotated[int, Ge(0)]
+Seconds = Annotated[FiniteFloat, Ge(0)]
 SINGLE, DOUBLE = 2.0**-24, 2.0**-53
 _NAMED = 3  # pairs in a message
 #: Ways to be wrong, by how bad they are: the first make energies wrong without a word.
 Code = Literal[
-    "CRASHED",
-    "MISSING",
-    "EXTRA",
-    "DUPLICATE",
-    "SELF",
-    "RANGE",
-    "ONE_SIDED",
-    "SHIFTS",
-    "DISTANCES",
-    "VECTORS",
-    "MALFORMED",
-    "NO_ANSWER",
-    "CHANGED_INPUT",
-    "RAISED",
-]
+    "CRASHED", "MISSING", "EXTRA", "DUPLICATE", "SELF", "RANGE", "ONE_SIDED", "SHIFTS", "DISTANCES",
+    "VECTORS", "MALFORMED", "NO_ANSWER", "CHANGED_INPUT", "RAISED",
+]  # fmt: skip
 CODES: tuple[Code, ...] = get_args(Code)
 #: Those of cases in which nothing came back.
 SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
 
 
 @dataclass(frozen=True)
-class Truth:
-    """Pairs in and around the cutoff at one still.
+class Truth(PairSet):
+    """Pairs in and around the cutoff at one still, out to the reach that was asked for.
 
     Attributes:
         positions, cell: as the list was given them; rows of axes that do not repeat are zero.
-        i, j, shift, distance: as in `PairSet`, out to the reach that was asked for.
         tie: the pairs at exactly r_cut.
         r_cut: length.
         scale: `rounding_bound` for a unit roundoff of 1, times what fractional coordinates of a skewed cell
             lose: how far a distance can be off, by the roundoff of the arithmetic.
         reach: pairs as far as this may be listed, length; the cutoff unless a list holds a skin.
-        inside: by real arithmetic, r < r_cut.
     """
 
     positions: ndarray
     cell: ndarray
-    i: ndarray
-    j: ndarray
-    shift: ndarray
-    distance: ndarray
     tie: ndarray
     r_cut: float
     scale: float
     reach: float
-    inside: ndarray
 
     def needed(self, unit: float) -> ndarray:
         """The pairs that a list of this roundoff cannot be excused for lacking."""
@@ -96,15 +83,15 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
         i, j, shift = int(pairs.i[row]), int(pairs.j[row]), pairs.shift[row]
         tie[row] = exactly_inside(positions, cell, i, j, shift, r_cut, closed=True)
     return Truth(
-        positions, cell, pairs.i, pairs.j, pairs.shift, pairs.distance, tie, r_cut, scale, reach, pairs.inside
+        **vars(pairs), positions=positions, cell=cell, tie=tie, r_cut=r_cut, scale=scale, reach=reach
     )
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
     """What going through fractional coordinates and back can multiply a rounding error by; at least 1.
 
-    Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 7.1: the condition number
-    of the periodic lattice vectors, each scaled to length 1 because lengths alone cost nothing.
+    Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
+    vectors, each scaled to length 1 because lengths alone cost nothing.
     """
     if not pbc.any():
         return 1.0
@@ -115,9 +102,7 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
     """One whole number for each row, equal where rows are: of these rows and of others, (i, j, shift) each.
 
-    Args:
-        count: atoms.
-        shift: None to tell rows by their atoms alone.
+    Of `count` atoms; without shifts rows are told by their atoms alone.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
@@ -156,14 +141,23 @@ class Failure:
     Attributes:
         code: one of `CODES`.
         text: what was seen, with atoms and numbers.
-        count: how many rows.
         step: at which still.
     """
 
     code: Code
     text: str
-    count: Annotated[int, Ge(0)] = 1
-    step: Annotated[int, Ge(0)] = 0
+    step: Count = 0
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """What a smaller case has to show: the code; of an exception or a crash also its words."""
+        text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
+        return self.code, without_numbers(text)
+
+
+def without_numbers(text: str) -> str:
+    """What messages about different numbers have in common."""
+    return re.sub(r"[-+\d.e]+", "#", text)
 
 
 def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
@@ -184,7 +178,7 @@ def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
             f"{int(outside.sum())} of {len(answer)} rows name atoms outside 0 ... {n - 1}: row {row} is "
             f"({answer.i[row]}, {answer.j[row]})"
         )
-        return [Failure("RANGE", text, int(outside.sum()))]
+        return [Failure("RANGE", text)]
     found = _compare(answer, truth, how)
     # nothing that shifts would mend: a pair listed once, an atom that is its own neighbor where it stands
     plain = {failure.code for failure in found} <= {"ONE_SIDED", "SELF"}
@@ -202,15 +196,9 @@ def _compare(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     right = _both(truth) if how.full else (truth.i, truth.j, truth.shift)
     if not how.full:
         i, j, shift = _one_way(i, j, shift)
-    key, right_key, turned, own = keys(
-        len(truth.positions),
-        i,
-        j,
-        shift if shifts else None,
-        right,
-        (j, i, -shift),
-        (i, i, np.zeros_like(shift)),
-    )
+    own = (i, i, np.zeros_like(shift))
+    told = (i, j, shift if shifts else None)
+    key, right_key, turned, own = keys(len(truth.positions), *told, right, (j, i, -shift), own)
     needed_rows, allowed_rows = (
         np.tile(rows, 2 if how.full else 1) for rows in (truth.needed(how.unit), truth.allowed(how.unit))
     )
@@ -236,19 +224,14 @@ def _compare(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     one_sided = (lacking > 0) & (mirrored > have) & how.full
     gone = lacking * ~one_sided
     if gone.any():
-        text = missing(gone, f"missing inside r_cut = {truth.r_cut:.9g}")
-        found.append(Failure("MISSING", text, int(gone.sum())))
+        found.append(Failure("MISSING", missing(gone, f"missing inside r_cut = {truth.r_cut:.9g}")))
     if one_sided.any():
         found.append(Failure("ONE_SIDED", missing(one_sided * 1, "from one of its atoms only")))
     excess = surplus[mine] > 0
     selfs = excess & (key == own) & (shifts or allowed[mine] == 0)
     repeated = excess & ~selfs & (allowed[mine] > 0)
-    kinds: tuple[tuple[Code, ndarray], ...] = (
-        ("EXTRA", excess & ~selfs & ~repeated),
-        ("DUPLICATE", repeated),
-        ("SELF", selfs),
-    )
-    for code, rows in kinds:
+    kinds: dict[Code, ndarray] = {"EXTRA": excess & ~selfs & ~repeated, "DUPLICATE": repeated, "SELF": selfs}
+    for code, rows in kinds.items():
         if not rows.any():
             continue
         first = int(np.argmax(rows))
@@ -263,13 +246,11 @@ def _compare(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
             text = f"{a}-{b}{image} is listed {times} times instead of {right_times}; {count} rows too many"
         else:
             text = f"atoms that are their own neighbors: {count}, first {a}"
-        found.append(Failure(code, text, count))
+        found.append(Failure(code, text))
     if not found and how.full and not np.array_equal(have, mirrored):
         row = int(np.argmax((have != mirrored)[mine]))
-        text = (
-            f"within rounding of the cutoff, {i[row]} has {j[row]} as a neighbor, and not the other way round"
-        )
-        found.append(Failure("ONE_SIDED", text, int((have != mirrored).sum())))
+        has = f"{i[row]} has {j[row]} as a neighbor, and not the other way round"
+        found.append(Failure("ONE_SIDED", f"within rounding of the cutoff, {has}"))
     return found
 
 
@@ -298,28 +279,21 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
 def _shift_hint(answer: Answer, truth: Truth, how: Conventions) -> str:
     """What the shifts may have been meant for."""
     assert answer.shift is not None
-    for text, other in (
-        ("; added to the other atom they are right", replace(how, sign=-how.sign)),
-        ("; they are right for positions wrapped into the box", how),
-    ):
-        shift = answer.shift
-        if other is how:
-            axes = np.any(truth.cell != 0, axis=1)
-            home = np.where(
-                axes, np.floor(np.linalg.solve(completed(truth.cell, axes).T, truth.positions.T).T), 0
-            )
-            shift = shift + how.sign * (home[answer.i] - home[answer.j]).astype(np.int64)
-        if not _compare(replace(answer, shift=shift), truth, other):
-            return text
-    return ""
+    if not _compare(answer, truth, replace(how, sign=-how.sign)):
+        return "; added to the other atom they are right"
+    axes = np.any(truth.cell != 0, axis=1)
+    home = np.where(axes, np.floor(np.linalg.solve(completed(truth.cell, axes).T, truth.positions.T).T), 0)
+    shift = answer.shift + how.sign * (home[answer.i] - home[answer.j]).astype(np.int64)
+    right = not _compare(replace(answer, shift=shift), truth, how)
+    return "; they are right for positions wrapped into the box" if right else ""
 
 
 def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     """Distances and vectors of rows that are all right."""
     if answer.distance is None and answer.vector is None:
         return []
-    n, bound = len(truth.positions), how.unit * truth.scale
-    found = []
+    # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
+    bound, bent, found = 2 * how.unit * truth.scale, None, []
     if answer.shift is not None:
         shift = how.sign * answer.shift
         right = truth.positions[answer.j] - truth.positions[answer.i] + shift @ truth.cell
@@ -328,21 +302,17 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
         bent = None if answer.vector is None else np.abs(how.toward * answer.vector - right).max(axis=1)
     else:
         # without shifts a row is any of the images of its two atoms: the one whose length is nearest
-        pairs = _both(truth)
-        mine, theirs = keys(n, answer.i, answer.j, None, pairs)
+        mine, theirs = keys(len(truth.positions), answer.i, answer.j, None, _both(truth))
         told = answer.distance
         if told is None:
             assert answer.vector is not None
             told = np.linalg.norm(answer.vector, axis=1)
         off = _nearest(mine, told, theirs, np.tile(truth.distance, 2))
-        bent = None
-    # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
-    bound = 2 * bound
-    measured: tuple[tuple[Code, ndarray | None, str], ...] = (
-        ("DISTANCES", off, "distance"),
-        ("VECTORS", bent, "vector"),
-    )
-    for code, error, what in measured:
+    measured: dict[Code, tuple[ndarray | None, str]] = {
+        "DISTANCES": (off, "distance"),
+        "VECTORS": (bent, "vector"),
+    }
+    for code, (error, what) in measured.items():
         if error is None or not (wrong := ~(error <= bound)).any():
             continue
         row = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
@@ -350,7 +320,7 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
             f"{int(wrong.sum())} of {len(answer)} rows have a {what} that is off by more than {bound:.2g}, "
             f"most {answer.i[row]}-{answer.j[row]} by {error[row]:.3g}"
         )
-        found.append(Failure(code, text, int(wrong.sum())))
+        found.append(Failure(code, text))
     return found
 
 
@@ -373,3 +343,246 @@ def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> 
         ok = here < last
         best[ok] = np.minimum(best[ok], np.abs(told[ok] - length[here[ok]]))
     return np.where(np.isnan(told), np.nan, best)
+
+
+# --- what becomes of the cases that a list is asked ---
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What became of a question.
+
+    Attributes:
+        case: its name.
+        failures: what was wrong at the first step at which anything was.
+        refused: the step and the exception by which the list refused it.
+        ties: pairs at exactly r_cut (counted, not counted).
+        aliased: a call wrote to the arrays of the answer before it.
+        single: it was decided as float32 does and float64 would not.
+        seconds: that the list took.
+    """
+
+    case: str
+    failures: tuple[Failure, ...] = ()
+    refused: tuple[Count, str] | None = None
+    ties: tuple[Count, Count] = (0, 0)
+    aliased: bool = False
+    single: bool = False
+    seconds: Seconds = 0.0
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A case that a list failed, on a few atoms where it was shrunk.
+
+    Attributes:
+        case: up to the step that failed; its name and area are those of the question.
+        failures: what was wrong at that step.
+        alone: it fails when it is the first that a new process is asked; else what was asked before matters.
+    """
+
+    case: Case
+    failures: tuple[Failure, ...]
+    alone: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
+            raise ValueError("no failure at a step of its case")
+
+    @property
+    def worst(self) -> Failure:
+        """The failure that is reported."""
+        return min(self.failures, key=lambda failure: CODES.index(failure.code))
+
+    @property
+    def code(self) -> str:
+        """Its code."""
+        return self.worst.code
+
+
+@dataclass
+class CaseAnswers:
+    """Everything that a list was asked, by the number of the question, and what was shrunk of its failures.
+
+    Questions are drawn again when an examination is resumed, the same for the same seed; so none is kept.
+    """
+
+    cases: dict[str, CaseResult] = field(default_factory=dict)
+    shrunk: dict[str, Failed] = field(default_factory=dict)
+
+    def of(self, number: int, case: Case) -> CaseResult | None:
+        """What became of a question; None where it was not asked yet. InputError where it was another one."""
+        result = self.cases.get(str(number))
+        if result is None:
+            return None
+        steps = [failure.step for failure in result.failures]
+        steps += [result.refused[0]] if result.refused is not None else []
+        if result.case != case.name or any(step >= case.steps for step in steps):
+            raise InputError(
+                f"question {number} was {result.case!r} and is {case.name!r} now, with {case.steps} steps",
+                remedy="Begin again in a new folder: the questions are those of another version",
+            )
+        return result
+
+
+@dataclass(frozen=True)
+class RefusalKind:
+    """A kind of question that a list refuses.
+
+    Attributes:
+        exception: in words.
+        case: the smallest question that met it, up to the step that was refused.
+        uneven: how the same question was put and answered where no list has a reason to treat it differently.
+        answers: how it was put and answered where a list may treat it differently: another unit of length,
+            other images of the atoms.
+    """
+
+    exception: str
+    case: Case
+    uneven: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()
+
+
+@dataclass
+class AreaTally:
+    """What became of the questions of one area.
+
+    Attributes:
+        asked, refused, skipped: cases; refused by the list itself, skipped because of its limits.
+        codes: failed cases by code of their worst failure.
+        why: reasons of refusing and skipping, with how often.
+    """
+
+    asked: int = 0
+    refused: int = 0
+    skipped: int = 0
+    codes: dict[str, int] = field(default_factory=dict)
+    why: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> int:
+        """Cases answered wrongly, or not at all."""
+        return sum(self.codes.values())
+
+    @property
+    def silent(self) -> int:
+        """Failed cases in which nothing came back that could be wrong."""
+        return sum(self.codes.get(code, 0) for code in SILENT)
+
+    @property
+    def passed(self) -> int:
+        """Cases answered correctly."""
+        return self.asked - self.failed - self.refused
+
+
+@dataclass
+class Report:
+    """What the suite found out about a list.
+
+    Attributes:
+        tested: the list.
+        how: its conventions, as declared or found out.
+        found_out: which of them were found out rather than declared.
+        single: a case that it decides as float32 does and float64 would not, where that was found out.
+        ties: (counted, not counted) pairs at exactly r_cut.
+        keeps_order: whether the same question gives the same rows in the same order.
+        superset: pairs beyond the cutoff are part of what it gives.
+        padding: out to which a list that is kept has all pairs, in units of the skin that it is given; None
+            where it neither states nor shows it.
+        stated: it states it, rather than shows it.
+        shifts: whether it gives the images that pairs are through.
+        areas: tallies by area.
+        aliased: the first case in which a call wrote to the arrays of the answer before it, or None.
+        refusals: kinds of refusals, and what each depends on.
+        failed: the first failure of each kind and area, in the order in which they were met.
+        seconds: in all.
+        large: (atoms, seconds) of its largest question.
+        questions: cases that there are, those that it does not claim to do included.
+        motions: against its rebuild rule, that it was asked; and calls: of it in those.
+        whole: all failures were shrunk as far as they are.
+    """
+
+    tested: PairList
+    how: Conventions = field(default_factory=Conventions)
+    found_out: list[str] = field(default_factory=list)
+    single: Case | None = None
+    ties: tuple[int, int] = (0, 0)
+    keeps_order: bool | None = None
+    superset: bool = False
+    padding: float | None = None
+    stated: bool = False
+    shifts: bool = False
+    areas: dict[str, AreaTally] = field(default_factory=dict)
+    aliased: str | None = None
+    refusals: list[RefusalKind] = field(default_factory=list)
+    failed: list[Failed] = field(default_factory=list)
+    seconds: float = 0.0
+    large: tuple[int, float] | None = None
+    questions: int = 0
+    motions: int = 0
+    calls: int = 0
+    whole: bool = True
+
+    def skip(self, case: Case, why: str) -> None:
+        """Counts a case that is not asked."""
+        tally = self.areas.setdefault(case.area, AreaTally())
+        tally.skipped += 1
+        tally.why[why] = tally.why.get(why, 0) + 1
+
+    def take(self, case: Case, result: CaseResult) -> None:
+        """Counts what became of a case."""
+        tally = self.areas.setdefault(case.area, AreaTally())
+        tally.asked += 1
+        self.ties = (self.ties[0] + result.ties[0], self.ties[1] + result.ties[1])
+        if result.aliased and self.aliased is None:
+            self.aliased = case.name
+        if result.single and self.single is None:
+            # from here on it is taken for a list in float32
+            self.how, self.single = replace(self.how, unit=SINGLE), case.until(1)
+            self.found_out.append("float32")
+        if case.area == "large":
+            self.large = (case.atoms, result.seconds)
+        if case.motions:
+            self.motions += case.motions
+            self.calls += case.steps
+        if result.failures:
+            failed = Failed(case.until(result.failures[0].step + 1), result.failures)
+            tally.codes[failed.code] = tally.codes.get(failed.code, 0) + 1
+            if (failed.code, case.area) not in {(other.code, other.case.area) for other in self.failed}:
+                self.failed.append(failed)
+        elif result.refused is not None:
+            tally.refused += 1
+            tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
+
+    def reach(self, case: Case) -> float:
+        """How far the pairs may be that a list with pairs beyond the cutoff gives, length.
+
+        What is listed may have come as far as the skin lets it, from either side.
+        """
+        usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
+        own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
+        return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
+
+    def total(self, count: str) -> int:
+        """Cases of all areas by an attribute of their tallies."""
+        return sum(getattr(tally, count) for tally in self.areas.values())
+
+    @property
+    def asked(self) -> int:
+        """Cases that were asked."""
+        return self.total("asked")
+
+    @property
+    def left(self) -> int:
+        """Cases that were neither asked nor skipped."""
+        return self.questions - self.asked - self.total("skipped")
+
+    @property
+    def wrong(self) -> int:
+        """Cases that failed."""
+        return self.total("failed")
+
+    @property
+    def conforms(self) -> bool:
+        """Whether it was asked and no case failed."""
+        return self.wrong == 0 and self.asked > self.total("refused")

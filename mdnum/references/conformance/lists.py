@@ -1,22 +1,23 @@
-"""A neighbor list under test: how it is called, and what it does not claim to do."""
+"""A neighbor list under test: how it is called, what it does not claim to do, and what makes one."""
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from importlib import metadata
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy import ndarray
 
+from mdnum.errors import InputError
 from mdnum.references.conformance.case import Case
 from mdnum.references.oracle import completed, widths
 from mdnum.registry import Registry
 
 
-@runtime_checkable
 class KeptList(Protocol):
     """A list that is kept and brought up to date. Both calls return pairs as `answer.read` takes them.
 
@@ -36,6 +37,12 @@ class KeptList(Protocol):
         The arrays may be those of the call before with other numbers in them: keep numbers, not arrays.
         """
         ...
+
+
+#: What a function, and the calls of a list that is kept, are given, in order.
+_GIVEN = ("positions", "cell", "pbc", "r_cut")
+_GIVEN_TO_KEPT = {"allocate": (*_GIVEN, "skin"), "update": ("positions", "cell")}
+_WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 
 @dataclass(frozen=True)
@@ -74,61 +81,50 @@ class ListLimits:
     whole_cell: bool = False
     fixed_atoms: bool = True
     atoms: int = 0
-    most_atoms: int | None = None
+    most_atoms: float = np.inf
     least_cutoff: float = 0.0
-    roomy: float | None = None
+    roomy: float = np.inf
 
     def refusal(self, case: Case) -> str | None:
         """Why a case is not asked, or None when it is."""
-        pbc = np.array(case.pbc)
+        return next((why for beyond, why in self._beyond(case) if beyond), None)
+
+    def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
+        """(whether a case is beyond a limit, the limit in words), the cheap ones first."""
+        pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
-        if least < self.atoms:
-            return f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
-        if self.most_atoms is not None and case.atoms > self.most_atoms:
-            return f"at most {self.most_atoms} atoms"
-        if case.r_cut < self.least_cutoff:
-            return f"no cutoff below {self.least_cutoff:g}"
-        if self.periodic and not pbc.any():
-            return "no free atoms"
-        if self.free and pbc.any():
-            return "free atoms only"
-        if self.whole_cell and any(np.linalg.matrix_rank(still.cell) < 3 for still in case.stills):
-            return "no cell that lacks a vector"
+        yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
+        yield case.atoms > self.most_atoms, f"at most {self.most_atoms} atoms"
+        yield case.r_cut < self.least_cutoff, f"no cutoff below {self.least_cutoff:g}"
+        yield self.periodic and not pbc.any(), "no free atoms"
+        yield self.free and bool(pbc.any()), "free atoms only"
+        lacks = self.whole_cell and any(np.linalg.matrix_rank(cell) < 3 for cell in cells)
+        yield lacks, "no cell that lacks a vector"
         if not pbc.any():
-            return None
-        if self.all_axes and not pbc.all():
-            return "no periodicity axis by axis"
-        before = case.stills[0].cell
-        for still in case.stills:
-            if (why := self._box(still.cell, pbc, case.r_cut + case.skin)) is not None:
-                return why
-            if self.fixed_cell and not still.fresh and not np.array_equal(still.cell, before):
-                return "no box that changes"
-            before = still.cell
+            return
+        yield self.all_axes and not pbc.all(), "no periodicity axis by axis"
+        for still, before in zip(case.stills, [cells[0], *cells], strict=False):
+            yield from self._beyond_box(still.cell, pbc, case.r_cut + case.skin)
+            changed = self.fixed_cell and not still.fresh and not np.array_equal(still.cell, before)
+            yield changed, "no box that changes"
             if self.wrapped:
                 fractional = np.linalg.solve(completed(still.cell, pbc).T, still.positions.T).T[:, pbc]
-                if not ((fractional >= 0) & (fractional < 1)).all():
-                    return "atoms inside the box only"
-        return None
+                inside = bool(((fractional >= 0) & (fractional < 1)).all())
+                yield not inside, "atoms inside the box only"
 
-    def _box(self, cell: ndarray, pbc: ndarray, reach: float) -> str | None:
+    def _beyond_box(self, cell: ndarray, pbc: ndarray, reach: float) -> Iterator[tuple[bool, str]]:
         used = cell[pbc]
         products = used @ used.T
-        if self.orthorhombic and np.count_nonzero(products - np.diag(np.diag(products))):
-            return "right angles only"
+        leans = bool(np.count_nonzero(products - np.diag(np.diag(products))))
+        yield self.orthorhombic and leans, "right angles only"
         elsewhere = np.count_nonzero(used - np.where(np.eye(3, dtype=bool), cell, 0.0)[pbc])
-        if self.along_axes and (elsewhere or (np.diag(cell)[pbc] <= 0).any()):
-            return "cells along x, y and z only"
-        if self.right_handed and pbc.all() and np.linalg.det(cell) < 0:
-            return "no left-handed cell"
-        if self.lower_triangular and np.count_nonzero(np.triu(cell, 1)):
-            return "lower triangular cells only"
+        turned = bool(elsewhere or (np.diag(cell)[pbc] <= 0).any())
+        yield self.along_axes and turned, "cells along x, y and z only"
+        yield self.right_handed and bool(pbc.all()) and np.linalg.det(cell) < 0, "no left-handed cell"
+        yield self.lower_triangular and bool(np.triu(cell, 1).any()), "lower triangular cells only"
         width = widths(completed(cell, pbc))[pbc]
-        if self.minimum_image and reach >= 0.5 * width.min():
-            return "minimum image only"
-        if self.roomy is not None and np.prod(width / reach) > self.roomy:
-            return f"no box of more than {self.roomy:.0e} cells"
-        return None
+        yield self.minimum_image and reach >= 0.5 * width.min(), "minimum image only"
+        yield bool(np.prod(width / reach) > self.roomy), f"no box of more than {self.roomy:.0e} cells"
 
 
 #: ListLimits that are declared by a word, such as "minimum-image".
@@ -148,10 +144,10 @@ class PairList:
         unit: roundoff of its arithmetic; None to find out.
         superset: pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept.
         limits: what it does not claim to do.
-        known: what is known of why it fails, by code of the failure.
         source: lines that define or import it, for a script without mdnum.
         call: an expression that is the function, or the class of lists that are kept, in that script.
         affords: the share of the random cases that it is asked: slow ones take 0.01.
+        known: what is known of why it fails, by code of the failure.
         description: one line.
         word: what `load` finds it by in another process; empty where it cannot.
     """
@@ -189,32 +185,43 @@ class PairList:
 LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
-def peer(name: str, package: str, *helpers: Any, **declared: Any) -> Callable[[Any], Any]:
+def peer(
+    name: str,
+    package: str,
+    *helpers: Any,
+    given: Mapping[str, Any] | None = None,
+    about: str = "",
+    **declared: Any,
+) -> Callable[[Any], Any]:
     """Decorates a function, or a class of lists that are kept, which `LISTS` then has by this name.
 
     Args:
         package: distribution whose version counts.
         helpers: what its lines need beside themselves, for a script without mdnum.
+        given: arguments by keyword, where one function is several lists.
+        about: one line; the first of the docstring by default.
         declared: attributes of `PairList`.
     """
 
     def register(made: Any) -> Any:
         kept = inspect.isclass(made)
-        lines = "\n\n".join(source_of(one) for one in (*helpers, made))
-        make = made if kept else lambda: made
-        about = (inspect.getdoc(made) or "").partition("\n")[0].rstrip(".")
+        called, call = made, made.__name__
+        if given:
+            called = functools.partial(made, **given)
+            arguments = ", ".join(f"{word}={value!r}" for word, value in given.items())
+            call = f"(lambda *given: {call}(*given, {arguments}))"
         listed = PairList(
             name,
-            make,
+            called if kept else lambda: called,
             kept,
             package,
-            source=lines,
-            call=made.__name__,
-            description=about,
+            source="\n\n".join(source_of(one) for one in (*helpers, made)),
+            call=call,
+            description=about or (inspect.getdoc(made) or "").partition("\n")[0].rstrip("."),
             word=name,
             **declared,
         )
-        LISTS.add(name, listed, description=about)
+        LISTS.add(name, listed, description=listed.description)
         return made
 
     return register
@@ -228,3 +235,66 @@ def source_of(made: Any) -> str:
         return ""
     first = next((n for n, line in enumerate(lines) if line.lstrip().startswith(("def ", "class "))), 0)
     return "".join(lines[first:])
+
+
+def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
+    """A list from a function, from a class of lists that are kept, or from such a list.
+
+    What it is declared to be is read from attributes of it, where it has them: `full` (bool), `unit`
+    (roundoff), `superset` (bool), `limits` (`ListLimits`).
+
+    Raises:
+        InputError: it is none of these.
+    """
+    if isinstance(made, PairList):
+        return made
+    name = str(name or getattr(made, "__name__", type(made).__name__))
+    lacks = [word for word in _GIVEN_TO_KEPT if not callable(getattr(made, word, None))]
+    if lacks and not callable(made):
+        message = f"{name} is neither a function nor an object with allocate and update"
+        raise InputError(message, remedy=_WANTED)
+    if lacks and inspect.isclass(made):
+        remedy = "A list that is kept needs allocate and update" if len(lacks) < 2 else _WANTED
+        raise InputError(f"{name} is a class without {' and '.join(lacks)}", remedy=remedy)
+    _check_signatures(made, name, not lacks)
+    declared = {
+        word: getattr(made, word)
+        for word in ("full", "unit", "superset", "limits")
+        if hasattr(made, word) and not callable(getattr(made, word))
+    }
+    return PairList(
+        name,
+        made if inspect.isclass(made) else lambda: made,
+        not lacks,
+        source=source_of(made) if source is None else source,
+        call=str(getattr(made, "__name__", None) or name.rpartition(":")[2]),
+        **declared,
+    )
+
+
+def _check_signatures(made: Any, name: str, kept: bool) -> None:
+    """Raises InputError where a signature cannot take what the suite gives; what has none is let pass."""
+    is_class = inspect.isclass(made)
+    calls: list[tuple[str, Any, tuple[str, ...]]] = []
+    if is_class or not kept:
+        calls.append(("", made, () if kept else _GIVEN))
+    for word, given in _GIVEN_TO_KEPT.items() if kept else ():
+        # of a class this is a function whose first argument is the object
+        plain = is_class and inspect.isfunction(inspect.getattr_static(made, word))
+        function = getattr(made, word)
+        calls.append((f".{word}", functools.partial(function, None) if plain else function, given))
+    for word, function, given in calls:
+        try:
+            signature = inspect.signature(function)
+        except (TypeError, ValueError):
+            continue
+        try:
+            signature.bind(*given)
+        except TypeError as error:
+            order = (
+                "Let it take these, in this order" if given else "Give a class that is made without arguments"
+            )
+            raise InputError(
+                f"{name}{word}{signature} cannot be called with ({', '.join(given)}): {error}",
+                remedy=order if kept else _WANTED,
+            ) from error

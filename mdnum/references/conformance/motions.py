@@ -17,8 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray
 
-from mdnum.references.conformance.case import Case, sequence
-from mdnum.references.conformance.catalog import gas
+from mdnum.references.conformance.case import Case, gas, grid, sequence
 
 _R, _SKIN, _L = 1.0, 0.3, 6.0
 #: What a pair starts beyond the padding and ends inside the cutoff by, in paddings.
@@ -199,37 +198,35 @@ def motions(padding: float | None = None) -> Iterator[Case]:
     room = _SKIN * (padding or 1.0)
     edge = max(6.0, 2.6 * (_R + room))
     ways = _ways()
+    numbered = list(enumerate(ways))
     for share in _SHARES:
         words = f"the smallest motions of a pair, {share:.0%} by its first atom"
-        yield _chain(words, (_meeting(room, way, share, edge, n) for n, way in enumerate(ways)), edge)
-    some = [ways[n] for n in (0, 2, 5, 9, 13)]
+        yield _sequence(words, (_walk(room, way, share, edge, n) for n, way in numbered), edge)
+    some = [(n, ways[k]) for n, k in enumerate((0, 2, 5, 9, 13))]
     for share in (0.5, 1.0):
-        paths = [_walk(room, way, share, edge, n, np.linspace(0, 1, 8)) for n, way in enumerate(some)]
+        paths = (_walk(room, way, share, edge, n, np.linspace(0, 1, 8)) for n, way in some)
         yield _sequence(f"pairs that creep together, {share:.0%} by the first atom", paths, edge)
     back = (0.0, 0.45, -0.45, 0.9, -0.9, 1.0)
-    paths = [_walk(room, way, 0.5, edge, n, back) for n, way in enumerate(some)]
+    paths = (_walk(room, way, 0.5, edge, n, back) for n, way in some)
     yield _sequence("pairs that go back and forth, then together", paths, edge)
     for share in (0.5, 1.0):
         words = f"a pair among 40 atoms at rest, {share:.0%} by its first atom"
-        yield _chain(words, (_among(room, way, share, edge, n) for n, way in enumerate(ways)), edge)
-    yield _chain(
-        "a pair comes together while all atoms drift",
-        (_adrift(room, way, edge, n) for n, way in enumerate(ways)),
-        edge,
-    )
+        yield _sequence(words, (_among(room, way, share, edge, n) for n, way in numbered), edge)
+    paths = (_adrift(room, way, edge, n) for n, way in numbered)
+    yield _sequence("a pair comes together while all atoms drift", paths, edge)
     for share in (0.5, 0.3):
         words = f"twelve pairs at once, {share:.0%} by their first atoms"
-        yield _chain(words, (_dozen(room, way, share, n) for n, way in enumerate(ways[::2])), 12.0)
+        yield _sequence(words, (_dozen(room, way, share, n) for n, way in enumerate(ways[::2])), 12.0)
     yield _in_turn(room, ways)
     leaning = edge * np.array([[1.0, 0, 0], [0.45, 1.0, 0], [-0.35, 0.4, 1.0]])
     for cell, word in ((leaning, "a skewed box"), (np.diag([4 * edge, edge, edge]), "a long box")):
         along = [*ways, *(row / np.linalg.norm(row) for row in cell)]
-        pairs = (_meeting(room, way, 0.5, edge, n) for n, way in enumerate(along))
-        yield _chain(f"the smallest motions of a pair, {word}", pairs, cell)
+        paths = (_walk(room, way, 0.5, edge, n) for n, way in enumerate(along))
+        yield _sequence(f"the smallest motions of a pair, {word}", paths, cell)
     if padding is None or abs(padding - 1.0) < 0.02:
         for skin in (0.08, 1.0):
-            pairs = (_meeting(skin, way, 0.5, edge, n) for n, way in enumerate(ways))
-            yield _chain(f"the smallest motions of a pair, a skin of {skin}", pairs, edge, skin)
+            paths = (_walk(skin, way, 0.5, edge, n) for n, way in numbered)
+            yield _sequence(f"the smallest motions of a pair, a skin of {skin}", paths, edge, skin)
     for n in (0, 4, 9, 13) if padding is None else (9,):
         yield _ladder(room, ways[n], n)
         for share in (1.0, 0.5):
@@ -244,82 +241,69 @@ def _ways() -> list[ndarray]:
     return [way / np.linalg.norm(way) for way in ways]
 
 
-def _apart(room: float) -> float:
-    """Where a pair starts: beyond the list, by a hair."""
-    return _R + (1 + HAIR) * room
-
-
 def _closing(room: float) -> float:
-    """What takes it inside the cutoff, by a hair."""
+    """What takes a pair from beyond the list to inside the cutoff, by a hair each."""
     return (1 + 2 * HAIR) * room
 
 
-def _meeting(room: float, way: ndarray, share: float, edge: float, n: int) -> tuple[ndarray, ndarray]:
-    """Two atoms somewhere, before and after they came together."""
-    path = _walk(room, way, share, edge, n, (0.0, 1.0))
-    return path[0], path[1]
+def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
+    """Pairs that start beyond the list, by a hair: all first atoms, then all second ones."""
+    half = (_R + (1 + HAIR) * room) / 2 * way
+    return np.vstack([middle - half, middle + half])
 
 
 def _walk(
-    room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float]
+    room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
     """Two atoms somewhere, closed by so many of the smallest motion."""
-    middle = edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3)
-    start = np.array([middle - _apart(room) / 2 * way, middle + _apart(room) / 2 * way])
+    start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
 
 
-def _among(room: float, way: ndarray, share: float, edge: float, n: int) -> tuple[ndarray, ndarray]:
+def _among(room: float, way: ndarray, share: float, edge: float, n: int) -> list[ndarray]:
     """Two atoms that come together, wherever they are in the file, and 40 at rest."""
     first, second = (n * 11) % 42, (n * 17 + 23) % 42
     second = (second + 1) % 42 if second == first else second
-    start = gas(42, edge, 160 + n)
-    pair = _walk(room, way, share, edge, n, (0.0, 1.0))
-    start[[first, second]] = pair[0]
-    end = start.copy()
-    end[[first, second]] = pair[1]
-    return start, end
+    return _with(gas(42, edge, 160 + n), [first, second], _walk(room, way, share, edge, n))
 
 
-def _adrift(room: float, way: ndarray, edge: float, n: int) -> tuple[ndarray, ndarray]:
+def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
     """The same among ten atoms, all of which drift: across the motion, along it, by much and by little."""
-    start = gas(12, edge, 180 + n)
-    pair = _walk(room, way, 0.5, edge, n, (0.0, 1.0))
-    start[4:6] = pair[0]
-    end = start.copy()
-    end[4:6] = pair[1]
+    start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
-    drift = (4 * across, 0.5 * way, 4 * way, 0.5 * across)[n % 4]
-    return start, end + room * drift
+    return [start, end + room * (4 * across, 0.5 * way, 4 * way, 0.5 * across)[n % 4]]
 
 
-def _dozen(room: float, way: ndarray, share: float, n: int) -> tuple[ndarray, ndarray]:
+def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarray]:
+    """A path of some atoms among others at rest."""
+    stills = [others.copy() for _ in path]
+    for still, place in zip(stills, path, strict=True):
+        still[atoms] = place
+    return stills
+
+
+def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
     """Twelve pairs in places of their own, all of which do the same."""
-    places = _places(12, 12.0, n)
-    start = np.vstack([places - _apart(room) / 2 * way, places + _apart(room) / 2 * way])
-    moves = _closing(room) * np.vstack([np.tile(share * way, (12, 1)), np.tile((share - 1.0) * way, (12, 1))])
-    return start, start + moves
+    start = _around(_places(12, 12.0, n), room, way)
+    moves = _closing(room) * np.repeat([share * way, (share - 1.0) * way], 12, axis=0)
+    return [start, start + moves]
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
     """25 pairs, whose 50 atoms go one after the other: who is not looked at is found."""
     count = 25
-    places = _places(count, 15.0, 0)
     way = np.array([ways[n % len(ways)] for n in range(count)])
-    start = np.vstack([places - _apart(room) / 2 * way, places + _apart(room) / 2 * way])
+    start = _around(_places(count, 15.0, 0), room, way)
     # a pair that has come together is far from its next turn: the second atom comes from beyond again
     path = [start]
     for atom in range(2 * count):
-        moved = path[-1].copy()
-        pair, sign = atom % count, 1.0 if atom < count else -1.0
         if atom == count:
             # all anew, so that every rule rebuilds
-            moved = start + np.array([2.0, 1.0, -1.5])
-            path.append(moved)
-            moved = moved.copy()
-        moved[atom] += sign * _closing(room) * way[pair]
+            path.append(start + np.array([2.0, 1.0, -1.5]))
+        moved = path[-1].copy()
+        moved[atom] += (1.0 if atom < count else -1.0) * _closing(room) * way[atom % count]
         path.append(moved)
     case = sequence("50 atoms, each of them comes to another in its turn", "rule", path, 15.0)
     return replace(case, motions=2 * count)
@@ -327,27 +311,23 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
     """Pairs from near and far creep together: each comes inside when its own start is just used up."""
-    places = _places(len(_RUNGS), 12.0, n)
-    rungs = room * _RUNGS[:, None]
-    path = []
-    for closed in (0.0, *_RUNGS):
-        half = (_R + (1 + HAIR) * rungs - (1 + 2 * HAIR) * room * closed) / 2 * way
-        path.append(np.vstack([places - half, places + half]))
+    start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
+    inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
+    path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]
     case = sequence(f"pairs from near and far creep together, {_direction(way)}", "rule", path, 12.0)
     return replace(case, motions=_BEYOND)
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
     """The same pair by pair, each back to its place before the next: by one atom of it, or by both."""
-    places, count = _places(len(_RUNGS), 12.0, n + 1), len(_RUNGS)
-    half = (_R + (1 + HAIR) * room * _RUNGS[:, None]) / 2 * way
-    start = np.vstack([places - half, places + half])
+    count = len(_RUNGS)
+    start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]
     for rung, far in enumerate(_RUNGS):
         moved = start.copy()
         turned = (rung + n) % 2
         first, second = (rung, rung + count) if turned else (rung + count, rung)
-        toward = (1.0 if turned else -1.0) * (1 + 2 * HAIR) * room * far * way
+        toward = (1.0 if turned else -1.0) * _closing(room) * far * way
         moved[first] += share * toward
         moved[second] -= (1 - share) * toward
         path.append(moved)
@@ -362,17 +342,11 @@ def _direction(way: ndarray) -> str:
 def _places(count: int, edge: float, n: int) -> ndarray:
     """Places of their own for pairs, in an order that is not that of space."""
     side = int(np.ceil(count ** (1 / 3)))
-    grid = (np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / side
-    return edge * np.random.default_rng(200 + n).permutation(grid)[:count]
+    return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
-def _chain(
-    name: str, pairs: Iterable[tuple[ndarray, ndarray]], cell: float | ndarray, skin: float = _SKIN
-) -> Case:
+def _sequence(name: str, paths: Iterable[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
     """Motions one after the other: between them all atoms go elsewhere, which no rule overlooks."""
-    return _sequence(name, [[start, end] for start, end in pairs], cell, skin)
-
-
-def _sequence(name: str, paths: list[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
+    paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

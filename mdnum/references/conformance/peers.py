@@ -1,4 +1,4 @@
-"""Libraries' neighbor searches by name: functions of (positions, cell, pbc, r_cut), and lists that are kept.
+"""Libraries' neighbor searches by name, and from a word to a list: theirs, or anybody's `module:function`.
 
 Every function and class here imports what it needs and names nothing outside itself, because its lines are
 printed in scripts that reproduce a failure without mdnum. It calls its library as a user would and mends
@@ -10,9 +10,12 @@ nothing: atoms outside the box, odd cells and few atoms go in as they are.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
-from mdnum.references.conformance.lists import LISTS as LISTS
-from mdnum.references.conformance.lists import ListLimits, peer
+from mdnum.errors import InputError
+from mdnum.references.conformance.lists import LISTS, ListLimits, PairList, from_object, peer
+from mdnum.references.load import place
+from mdnum.registry import nearest
 
 _SINGLE = 2.0**-24
 #: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
@@ -29,28 +32,14 @@ _JAX_MD_KNOWN = {
 _OF_JAX_MD = ListLimits(
     minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, most_atoms=5_000
 )
+_NUMPY = "Plain numpy, one image of every pair"
+_FEW = ListLimits(minimum_image=True, most_atoms=5_000)
 
 
-@peer("numpy-r2", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
-def numpy_r2(positions, cell, pbc, r_cut):
-    """Plain numpy, one image of every pair: r² < r_cut²."""
-
-    import numpy as np
-
-    i, j = np.triu_indices(len(positions), 1)
-    d = positions[j] - positions[i]
-    if pbc.any():
-        box = np.where(pbc[:, None], cell, 0.0)
-        fraction = d @ np.linalg.pinv(box)
-        d = d - np.where(pbc, np.rint(fraction), 0.0) @ box
-    squared = (d * d).sum(axis=1)
-    inside = squared < r_cut * r_cut
-    return {"i": i[inside], "j": j[inside]}
-
-
-@peer("numpy", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
-def numpy_r(positions, cell, pbc, r_cut):
-    """Plain numpy, one image of every pair: r < r_cut."""
+@peer("numpy", "numpy", full=False, limits=_FEW, about=f"{_NUMPY}: r < r_cut")
+@peer("numpy-r2", "numpy", full=False, limits=_FEW, given={"squared": True}, about=f"{_NUMPY}: r² < r_cut²")
+def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
+    """Plain numpy, one image of every pair."""
 
     import numpy as np
 
@@ -60,8 +49,8 @@ def numpy_r(positions, cell, pbc, r_cut):
         box = np.where(pbc[:, None], cell, 0.0)
         fraction = d @ np.linalg.pinv(box)
         d = d - np.where(pbc, np.rint(fraction), 0.0) @ box
-    squared = (d * d).sum(axis=1)
-    inside = np.sqrt(squared) < r_cut
+    r2 = (d * d).sum(axis=1)
+    inside = r2 < r_cut * r_cut if squared else np.sqrt(r2) < r_cut
     return {"i": i[inside], "j": j[inside]}
 
 
@@ -77,48 +66,56 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("ase-primitive", "ase", affords=0.3, limits=ListLimits(atoms=1, most_atoms=20_000))
+@peer("ase-skin", "ase", affords=0.1, limits=ListLimits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
+class AseSkinList:
+    """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
+
+    kept = pbc = None
+
+    def __init__(self, primitive="NewPrimitiveNeighborList"):
+        self.primitive = primitive
+
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        from ase import neighborlist
+
+        self.pbc = pbc
+        self.kept = neighborlist.NeighborList(
+            [r_cut / 2] * len(positions),
+            skin=skin / 2,
+            self_interaction=False,
+            bothways=True,
+            primitive=getattr(neighborlist, self.primitive),
+        )
+        return self.update(positions, cell)
+
+    def update(self, positions, cell):
+        import numpy as np
+        from ase import Atoms
+
+        atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=self.pbc)
+        self.kept.update(atoms)
+        rows = [self.kept.get_neighbors(atom) for atom in range(len(positions))]
+        i = np.repeat(np.arange(len(rows)), [len(row[0]) for row in rows])
+        j = np.concatenate([row[0] for row in rows] or [np.zeros(0, int)])
+        shift = np.concatenate([row[1].reshape(-1, 3) for row in rows] or [np.zeros((0, 3), int)])
+        return {"i": i, "j": j, "shift": shift}
+
+
+@peer("ase-primitive", "ase", AseSkinList, affords=0.3, limits=ListLimits(atoms=1, most_atoms=20_000))
 def ase_primitive_list(positions, cell, pbc, r_cut):
     """the list under ASE's LennardJones, EAM and Tersoff."""
-
-    import numpy as np
-    from ase import Atoms
-    from ase.neighborlist import NeighborList, PrimitiveNeighborList
-
-    atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=pbc)
-    kept = NeighborList(
-        [r_cut / 2] * len(positions),
-        skin=0.0,
-        self_interaction=False,
-        bothways=True,
-        primitive=PrimitiveNeighborList,
-    )
-    kept.update(atoms)
-    rows = [kept.get_neighbors(atom) for atom in range(len(positions))]
-    i = np.repeat(np.arange(len(rows)), [len(row[0]) for row in rows])
-    j = np.concatenate([row[0] for row in rows] or [np.zeros(0, int)])
-    shift = np.concatenate([row[1].reshape(-1, 3) for row in rows] or [np.zeros((0, 3), int)])
-    return {"i": i, "j": j, "shift": shift}
+    return AseSkinList("PrimitiveNeighborList").allocate(positions, cell, pbc, r_cut, 0.0)
 
 
+@peer("vesin-half", "vesin", given={"half": True}, about="vesin, every pair once")
 @peer("vesin", "vesin")
-def vesin_cells(positions, cell, pbc, r_cut):
+def vesin_cells(positions, cell, pbc, r_cut, half=False):
     """vesin's cell list, every pair from both atoms."""
 
     from vesin import NeighborList
 
-    listed = NeighborList(cutoff=r_cut, full_list=True, algorithm="cell_list")
-    i, j, shift, distance, vector = listed.compute(positions, cell, pbc, "ijSdD")
-    return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
-
-
-@peer("vesin-half", "vesin")
-def vesin_half(positions, cell, pbc, r_cut):
-    """vesin, every pair once."""
-
-    from vesin import NeighborList
-
-    listed = NeighborList(cutoff=r_cut, full_list=False)
+    # half a list is found by the algorithm that vesin chooses
+    listed = NeighborList(cutoff=r_cut, full_list=not half, algorithm="auto" if half else "cell_list")
     i, j, shift, distance, vector = listed.compute(positions, cell, pbc, "ijSdD")
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
@@ -156,19 +153,6 @@ def pymatgen_points(positions, cell, pbc, r_cut):
     return {"i": i[other], "j": j[other], "shift": shift[other].astype(int), "distance": distance[other]}
 
 
-@peer("mdanalysis", "MDAnalysis", full=False, unit=_SINGLE, affords=0.3, limits=_OF_MDANALYSIS)
-def mdanalysis_nsgrid(positions, cell, pbc, r_cut):
-    """MDAnalysis, nsgrid."""
-
-    import numpy as np
-    from MDAnalysis.lib.distances import self_capped_distance
-    from MDAnalysis.lib.mdamath import triclinic_box
-
-    box = triclinic_box(*cell) if pbc.all() else None
-    pairs, distance = self_capped_distance(np.asarray(positions, np.float32), r_cut, box=box, method="nsgrid")
-    return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
-
-
 @peer(
     "mdanalysis-brute",
     "MDAnalysis",
@@ -176,18 +160,19 @@ def mdanalysis_nsgrid(positions, cell, pbc, r_cut):
     unit=_SINGLE,
     affords=0.3,
     limits=replace(_OF_MDANALYSIS, most_atoms=20_000),
+    given={"method": "bruteforce"},
+    about="MDAnalysis, bruteforce",
 )
-def mdanalysis_brute_force(positions, cell, pbc, r_cut):
-    """MDAnalysis, bruteforce."""
+@peer("mdanalysis", "MDAnalysis", full=False, unit=_SINGLE, affords=0.3, limits=_OF_MDANALYSIS)
+def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
+    """MDAnalysis, nsgrid."""
 
     import numpy as np
     from MDAnalysis.lib.distances import self_capped_distance
     from MDAnalysis.lib.mdamath import triclinic_box
 
     box = triclinic_box(*cell) if pbc.all() else None
-    pairs, distance = self_capped_distance(
-        np.asarray(positions, np.float32), r_cut, box=box, method="bruteforce"
-    )
+    pairs, distance = self_capped_distance(np.asarray(positions, np.float32), r_cut, box=box, method=method)
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
@@ -258,38 +243,6 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut):
         return_neighbor_list=True,
     )
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
-
-
-@peer("ase-skin", "ase", affords=0.1, limits=ListLimits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
-class AseSkinList:
-    """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
-
-    kept = pbc = None
-
-    def allocate(self, positions, cell, pbc, r_cut, skin):
-        from ase.neighborlist import NeighborList, NewPrimitiveNeighborList
-
-        self.pbc = pbc
-        self.kept = NeighborList(
-            [r_cut / 2] * len(positions),
-            skin=skin / 2,
-            self_interaction=False,
-            bothways=True,
-            primitive=NewPrimitiveNeighborList,  # type: ignore
-        )
-        return self.update(positions, cell)
-
-    def update(self, positions, cell):
-        import numpy as np
-        from ase import Atoms
-
-        atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=self.pbc)
-        self.kept.update(atoms)
-        rows = [self.kept.get_neighbors(atom) for atom in range(len(positions))]
-        i = np.repeat(np.arange(len(rows)), [len(row[0]) for row in rows])
-        j = np.concatenate([row[0] for row in rows] or [np.zeros(0, int)])
-        shift = np.concatenate([row[1].reshape(-1, 3) for row in rows] or [np.zeros((0, 3), int)])
-        return {"i": i, "j": j, "shift": shift}
 
 
 @peer(
@@ -401,3 +354,61 @@ class MdnumVerletList:
 def mdnum_host_list(positions, cell, pbc, r_cut):
     """mdnum's own cell list."""
     return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)
+
+
+# --- from a word to a list ---------------------------------------------------------------------------
+
+
+def known() -> tuple[PairList, ...]:
+    """Every list that has a name here, installed or not."""
+
+    def named(name: str) -> PairList:
+        listed = LISTS[name]
+        if not isinstance(listed, PairList):
+            package = LISTS.package(name)
+            listed = replace(from_object(listed, name), package=package, description=LISTS.description(name))
+        return replace(listed, word=name)
+
+    return tuple(map(named, LISTS))
+
+
+def installed() -> tuple[PairList, ...]:
+    """Those whose packages are there."""
+    return tuple(listed for listed in known() if listed.version is not None)
+
+
+def load(word: str) -> PairList:
+    """The list that a word names.
+
+    Args:
+        word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`; see
+            `mdnum.references.load`. The function takes (positions, cell, pbc, r_cut) and returns pairs as
+            `answer.read` takes them; a class or an object with `allocate` and `update` is a list that is kept
+            (`KeptList`).
+
+    Raises:
+        InputError: there is no such list, or it cannot be imported.
+    """
+    by_name = {listed.name: listed for listed in known()}
+    if word in by_name:
+        listed = by_name[word]
+        if listed.version is None:
+            message = f"{word} needs {listed.package}, which is not installed"
+            raise InputError(message, remedy=f"Run python3 -m pip install {listed.package}")
+        return listed
+    where = place(word)
+    if where is None:
+        close = nearest(word, by_name)
+        meant = f"Did you mean {close}? " if close else ""
+        raise InputError(
+            f"{word!r} is no list that is known here",
+            remedy=f"{meant}Give {', '.join(sorted(by_name))}, package.module:function or file.py:function",
+        )
+    made = where.find()
+    lines, call = where.source()
+    listed = from_object(made, f"{Path(where.home).stem}:{where.call}" if where.is_file else word, lines)
+    if "(" not in call:
+        return replace(listed, word=word, call=call)
+    # an object, or a function that another made: made anew for each life
+    call = f"(lambda: {call})" if listed.kept else call
+    return replace(listed, word=word, call=call, make=where.find)

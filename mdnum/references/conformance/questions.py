@@ -1,4 +1,4 @@
-"""The cases that a list is asked: named ones, sequences of motion, crowds, and those drawn by hypothesis.
+"""The cases that a list is asked: named ones that lists have failed, crowds, lattices, and random ones.
 
 For a library's own tests: `@given(cases())` gives cases of boxes of every kind, atoms in every place and
 cutoffs on and off the shells; `boxes()` gives (cell, pbc, words) alone.
@@ -15,25 +15,301 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from mdnum.references.conformance.case import Case, Pbc, once
-from mdnum.references.conformance.catalog import LARGE_EDGE, SMALL_EDGE, catalog, crowds, lattice, vast
+from mdnum.references.conformance.case import Case, Pbc, Still, gas, grid, once
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.motions import motions, movers, sequences
-from mdnum.references.oracle import completed, widths
+from mdnum.references.oracle import PairSet, completed, widths
+
+#: (name, positions, cell, pbc, r_cut), of which the last ones may be left out as in `once`.
+Named = Iterator[tuple[Any, ...]]
+
+#: Atoms along an edge of the lattices: some 5,000 atoms, and 100,000.
+SMALL_EDGE, LARGE_EDGE = 17, 47
+
+_TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
+
+
+def catalog() -> Iterator[Case]:
+    """Every named case at one moment, small ones first."""
+    areas = (
+        ("few", _few), ("boxes", _boxes), ("axes", _axes), ("images", _narrow), ("outside", _outside),
+        ("ties", _ties), ("coincident", _coincident),
+    )  # fmt: skip
+    for area, named in areas:
+        yield from (once(name, area, *rest) for name, *rest in named())
+
+
+def crowds() -> Iterator[Case]:
+    """Clusters with more neighbors than lists like to give an atom, alone and in a thin gas."""
+    return (once(name, "crowded", *rest) for name, *rest in _crowds())
+
+
+def _few() -> Named:
+    yield "no atoms, periodic", np.zeros((0, 3)), 5.0
+    yield "no atoms, free", np.zeros((0, 3))
+    yield "one atom, periodic", [[1.0, 2.0, 3.0]], 5.0
+    yield "one atom, free", [[1.0, 2.0, 3.0]]
+    yield "one atom at the origin", [[0.0, 0.0, 0.0]], 5.0
+    yield "two atoms, free, inside", [[0.0, 0, 0], [0.5, 0.5, 0.5]]
+    yield "two atoms, free, outside", [[0.0, 0, 0], [0.8, 0.8, 0.8]]
+    yield "two atoms through each face", [[0.1, 0.1, 0.1], [4.7, 4.8, 4.9]], 5.0
+    yield "two atoms, no neighbors", [[1.0, 1, 1], [3.5, 3.5, 3.5]], 5.0
+    yield "two atoms, free, far from the origin", [[1e3, -1e3, 1e3], [1e3, -1e3, 1e3 + 0.75]]
+    yield "three free atoms in a line", [[0.0, 0, 0], [0.75, 0, 0], [1.5, 0, 0]]
+    yield "free atoms in one plane", gas(12, [3.0, 3.0, 0.0], 1)
+
+
+def _boxes() -> Named:
+    for edge in (2.1, 2.5, 3.0, 3.9, 4.0, 4.1, 7.3):
+        yield f"cube of {edge} cutoffs", gas(24, edge, 2), edge
+    for share in (2.0 - 1e-9, 2.0 + 1e-9, 3.0 - 1e-9, 3.0 + 1e-9, 3.0, 4.0 - 1e-12):
+        # the number of cells along an axis changes here, and rounding may take it from one to the other
+        name = f"a box a hair from {round(share)} cells"
+        yield name, gas(30, [share, 4.5, 3.5], 3), [share, 4.5, 3.5]
+    for edge in (0.1, 0.3, 0.7):
+        yield "edges that no double holds", gas(20, 3 * edge, 4), 3 * edge, True, edge * 1.2
+    skewed = np.array([[4.0, 0, 0], [1.9, 4.0, 0], [-1.7, 1.5, 4.0]])
+    yield "skewed", gas(30, skewed, 5), skewed
+    strong = np.array([[4.0, 0, 0], [9.5, 4.0, 0], [-13.0, 7.0, 4.0]])
+    yield "skewed by more than two edges", gas(30, strong, 6), strong
+    flat = np.array([[8.0, 0, 0], [7.6, 2.4, 0], [0, 0, 5.0]])
+    yield "edges are long, widths are not", gas(30, flat, 7), flat
+    hexagonal = np.array([[4.0, 0, 0], [-2.0, 2.0 * np.sqrt(3), 0], [0, 0, 5.0]])
+    yield "hexagonal", gas(30, hexagonal, 8), hexagonal
+    yield "turned", gas(30, skewed @ _TURN, 9), skewed @ _TURN
+    yield "left-handed", gas(30, skewed[[1, 0, 2]], 10), skewed[[1, 0, 2]]
+    yield "vectors that point backward", gas(30, -skewed, 11), -skewed
+    yield "upper triangular", gas(30, skewed.T, 12), skewed.T
+    yield "thin slab", gas(40, [12.0, 12.0, 2.2], 13), [12.0, 12.0, 2.2]
+    yield "needle", gas(60, [60.0, 2.3, 2.3], 14), [60.0, 2.3, 2.3]
+    clump = gas(12, 1.5, 15)
+    yield "huge", np.vstack([clump, clump + 49.2, clump + 99.0]), 100.0
+    yield "tiny numbers", gas(24, 4e-9, 16), 4e-9, True, 1e-9
+    yield "large numbers", gas(24, 4e9, 17), 4e9, True, 1e9
+    ulp = float(np.nextafter(4.0, 5.0))
+    places = np.array([[0.0, 1, 1], [3.75, 1, 1], [2.0, 0, 0], [2.0, 3.5, 0], [0, 0, 2], [0, 0.5, 2]])
+    for edge, name in (
+        (4.0, "exactly 4"),
+        (ulp, "4 and an ulp"),
+        (float(np.nextafter(4.0, 0.0)), "an ulp below 4"),
+    ):
+        yield f"pairs through faces, edges {name}", places, edge
+
+
+def _axes() -> Named:
+    for pbc in ((True, True, False), (True, False, False), (False, True, True), (False, False, True)):
+        word = "".join(letter for letter, repeats in zip("xyz", pbc, strict=True) if repeats)
+        edges = np.array([4.0, 4.5, 5.0])
+        yield f"repeats along {word}", gas(24, edges, 20), np.diag(edges), pbc
+        beyond = gas(24, edges, 21, -0.6, 1.6)
+        beyond = np.where(pbc, np.mod(beyond, edges), beyond)
+        yield f"repeats along {word}, atoms past the free faces", beyond, np.diag(edges), pbc
+        zero = np.diag(np.where(pbc, edges, 0.0))
+        yield f"repeats along {word}, no vectors along the rest", gas(24, edges, 22), zero, pbc
+    edges = np.array([4.0, 4.5, 5.0])
+    pair = np.array([[0.2, 2.0, 2.0], [3.9, 2.0, 2.0]])
+    yield "not neighbors through a face that does not repeat", pair, 4.0, (False, True, True)
+    molecule = np.array([[0.0, 0, 0], [0.9, 0.2, 0.1], [1.7, -0.3, 0.4], [-0.8, 0.1, 0.5], [2.4, 0.2, 0.2]])
+    yield "free, in a dummy box of 1", molecule, 1.0, False
+    yield "free, in a dummy box of 100", molecule, 100.0, False
+    yield "free, in a box that would hold it", molecule + 3.0, 8.0, False
+    yield "free, negative coordinates, in a dummy box", molecule - 7.5, 1.0, False
+    tilted = np.array([[4.0, 0, 0], [1.5, 4.0, 0], [1.0, -1.2, 5.0]])
+    yield "skewed slab", gas(24, tilted, 23), tilted, (True, True, False)
+    yield "slab with a tilted free axis", gas(24, tilted, 24, -0.7, 1.7), tilted, (True, False, True)
+
+
+def _narrow() -> Named:
+    yield "own images along one axis", [[0.1, 0.2, 0.3]], [0.7, 5.0, 5.0]
+    yield "own images along all axes", [[0.1, 0.2, 0.3]], 0.8
+    yield "two atoms, edges of 1.5 cutoffs", [[0.1, 0.1, 0.1], [0.8, 0.9, 0.7]], 1.5
+    yield "two atoms, edges of 0.6 cutoffs", [[0.1, 0.1, 0.1], [0.3, 0.4, 0.5]], 0.6
+    yield "one axis below two cutoffs", gas(10, [1.7, 4.0, 4.0], 30), [1.7, 4.0, 4.0]
+    yield "one axis just below one cutoff", gas(6, [0.96, 4.0, 4.0], 31), [0.96, 4.0, 4.0]
+    pair = [[0.0, 0, 0], [0.9, 0, 0]]
+    yield "one cell, both neighbors the same atom", pair, [1.8, 5, 5]
+    for edge in (0.45, 0.7, 0.95, 1.9):
+        walls = np.array([[0.02, 0.03, 0.02], [0.98, 0.97, 0.96]]) * edge
+        yield f"two atoms at opposite walls, edges of {edge} cutoffs", walls, edge
+    skewed = np.array([[1.4, 0, 0], [1.1, 1.2, 0], [-0.9, 0.8, 1.3]])
+    yield "small and skewed", gas(4, skewed, 32), skewed
+    yield "small and skewed, slab", gas(4, skewed, 33), skewed, (True, True, False)
+    cubic = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0.0]])
+    yield "four shells of a primitive cell", [[0.0, 0, 0]], cubic, True, 3.05
+    yield "many images along a needle", gas(3, [0.3, 9.0, 9.0], 34), [0.3, 9.0, 9.0]
+    yield "many images, far outside", gas(4, 1.3, 35, -9.0, 9.0), 1.3
+
+
+def _outside() -> Named:
+    inside = gas(24, 4.0, 40)
+    shifts = np.random.default_rng(41).integers(-3, 4, inside.shape)
+    yield "lattice vectors added", inside + 4.0 * shifts, 4.0
+    yield "all of one box over", inside + np.array([4.0, 0, 0]), 4.0
+    yield "all of one box back", inside - [0, 4.0, 4.0], 4.0
+    yield "a thousand boxes over", inside + 4000.0 * np.sign(shifts), 4.0
+    yield "one atom a million boxes over", [[1.0, 1, 1], [1.5 + 4e6, 1, 1], [1, 1.6, 1 - 8e6]], 4.0
+    skewed = np.array([[4.0, 0, 0], [1.9, 4.0, 0], [-1.7, 1.5, 4.0]])
+    yield "skewed, lattice vectors added", gas(24, skewed, 42) + shifts @ skewed, skewed
+    tilted = gas(8, skewed, 43) + 1000.0 * np.where([True, True, False], shifts[:8], 0) @ skewed
+    yield "skewed slab, a thousand boxes over", tilted, skewed, (True, True, False)
+    beyond = np.where([True, False, True], 4.0 * shifts, 0.0)
+    yield "slab, lattice vectors added", inside + beyond, 4.0, (True, False, True)
+    for place, word in (
+        (0.0, "0"),
+        (4.0, "L"),
+        (-0.0, "-0"),
+        (-1e-52, "-1e-52"),
+        (-1e-17, "-1e-17"),
+        (-1e-9, "-1e-9"),
+        (float(np.nextafter(4.0, 0.0)), "an ulp below L"),
+        (float(np.nextafter(4.0, 9.0)), "an ulp above L"),
+        (-4.0, "-L"),
+        (8.0, "2 L"),
+        (float(-np.spacing(4.0)), "minus an ulp of L"),
+    ):
+        near = np.array([[0.5, 2, 2], [3.5, 2, 2], [2, 0.5, 2], [2, 3.5, 2], [2, 2, 0.5], [2, 2, 3.5]])
+        on = np.array([[place, 2, 2], [2, place, 2], [2, 2, place], [place, place, place]])
+        yield f"atoms at {word}", np.vstack([on, near, [[0.4, 0.4, 0.4]]]), 4.0
+    for edge in (4.0, 4.0 * (1 + 1e-9), 4.0 * (1 + 1e-6)):
+        name = f"pairs a hair inside the cutoff, across walls of cells, edges {edge!r}"
+        yield name, _across_walls(edge), [edge, 200.0, 200.0]
+    face = [[0.0, 1, 1], [3 * (1.0 / 3.0) * 2.1, 1, 1], [2.1 - 0.5, 1, 1]]
+    yield "a face that no double holds", face, 2.1
+    for edge in (2.1, 3.3, 4.7):
+        yield "a grid on the walls of the cells", grid(3) / 3 * edge, edge, True, edge / 3 * 1.1
+
+
+def _across_walls(edge: float) -> ndarray:
+    """Pairs along x whose atoms lie just below a multiple of the cutoff, and a cutoff less a hair below that.
+
+    A search that puts one of them into the next cell, as float32 does, has two cells between them.
+    """
+    hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
+    pairs = []
+    for wall in range(1, 5):
+        for n, below in enumerate(hairs):
+            for k, hair in enumerate(hairs):
+                first = np.array([wall - below, 6.0 * (5 * wall - 4 + n), 6.0 * (1 + k)])
+                pairs += [first, first - [1.0 - hair, 0.0, 0.0]]
+    return np.array(pairs)
+
+
+def _ties() -> Named:
+    whole = grid(4).astype(float)
+    yield "whole numbers, first shell at the cutoff", whole, 4.0, True, 1.0
+    yield "whole numbers, 3-4-5", [[0.0, 0, 0], [3, 4, 0], [3, 4, 12], [0, 4, 3], [-5, 0, 0]], None, True, 5.0
+    through = [[0.0, 0, 0], [13, 12, 0], [4, 3, 0], [0, 0, 11]]
+    yield "whole numbers, 3-4-5 through faces", through, 16.0, True, 5.0
+    yield "second shell at the cutoff, which is no double", whole, 4.0, True, float(np.sqrt(2.0))
+    for ulps in (-2, -1, 0, 1, 2):
+        r_cut = 2.5 + ulps * float(np.spacing(2.5))
+        corner = [[1.0, 1, 1], [3.5, 1, 1], [1, 3.5, 1]]
+        yield f"pairs {-ulps:+d} ulp from the cutoff", corner, 8.0, True, r_cut
+    rng = np.random.default_rng(50)
+    direction = rng.normal(size=(30, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    yield "30 atoms on a sphere of the cutoff", np.vstack([np.zeros((1, 3)), direction]) + 4.0, 9.0
+    yield "an image of itself at the cutoff", [[0.3, 0.3, 0.3]], [2.0, 7.0, 7.0], True, 2.0
+    yield "half of the box at the cutoff", [[0.0, 0, 0], [2.0, 0, 0]], 4.0, True, 2.0
+
+
+def _coincident() -> Named:
+    yield "two atoms in one place", [[1.0, 1, 1], [1.0, 1, 1]], 5.0
+    yield "two atoms in one place, free", [[1.0, 1, 1], [1.0, 1, 1]]
+    yield "two atoms at the origin", [[0.0, 0, 0], [0.0, 0, 0]], 5.0
+    yield "in one place through the box", [[0.0, 1, 1], [5.0, 1, 1], [0, 6, 1]], 5.0
+    yield "in one place, five boxes apart", [[0.5, 1, 1], [25.5, -24, 1]], 5.0
+    yield "five atoms in one place", np.tile([[2.0, 2.0, 2.0]], (5, 1)), 5.0
+    yield "apart by 1e-300", [[0.0, 0, 0], [1e-300, 0, 0], [0, 1e-200, 0]], 5.0
+    yield "apart by an ulp", [[1.0, 1, 1], [float(np.nextafter(1.0, 2.0)), 1, 1]], 5.0
+    yield "pairs of coincident atoms", np.repeat(gas(6, 4.0, 60), 2, axis=0), 4.0
+
+
+def _crowds() -> Named:
+    for count in (20, 33, 41, 66, 130, 260):
+        cluster = 5.0 + 0.45 * gas(count, 1.0, 70 + count, -1.0, 1.0)
+        yield f"{count} atoms in one clump", cluster, 12.0, True, 1.6
+    for count in (150, 520):
+        around = np.vstack([np.zeros((1, 3)), 0.97 * _sphere(count)])
+        yield f"{count} neighbors on one atom", around + 4.0, 9.0
+    thin = gas(300, 24.0, 71)
+    clump = 12.0 + 0.3 * gas(60, 1.0, 72, -1.0, 1.0)
+    yield "a clump in a thin gas", np.vstack([thin, clump]), 24.0
+    yield "a clump in a thin gas, first in the file", np.vstack([clump, thin]), 24.0
+    yield "a clump and emptiness, free", np.vstack([clump, thin[:5] * 40.0])
+    yield "a crystal with 86 neighbors", grid(6) + 0.3, 6.0, True, 2.85
+    small = gas(3, 0.9, 73)
+    yield "three atoms with hundreds of images", small, 0.9, True, 3.5
+
+
+def vast() -> Iterator[Case]:
+    """Few atoms in so much space that a grid of cells over it has no room in memory, or in 32 bits.
+
+    For lists in a process of their own: those that make such a grid end it.
+    """
+    apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
+    yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
+    yield once("two pairs thousands of cutoffs apart, along a wire", "axes", apart, 3.0, (False, False, True))
+    yield once("a box of thousands of cutoffs", "boxes", apart + 1.0, 4000.0)
+
+
+def lattice(edge: int, seed: int = 0) -> Case:
+    """A cubic lattice of whole numbers with gaps, its atoms in any order and in any image of the box.
+
+    Neighbors are the 26 around a place, known by counting modulo the edge: no search and no rounding.
+
+    Args:
+        edge: places along an edge.
+        seed: of gaps, order and images.
+    """
+    rng = np.random.default_rng(seed)
+    places = grid(edge)
+    kept = rng.permutation(len(places))[: len(places) - len(places) // 50]
+    places = places[kept]
+    images = rng.integers(-1, 2, places.shape)
+    positions = (places + images * edge).astype(np.float64)
+    at = np.full((edge,) * 3, -1)
+    at[tuple(places.T)] = np.arange(len(places))
+    parts = []
+    for x, y, z in np.ndindex(3, 3, 3):
+        step = np.array([x, y, z]) - 1
+        if tuple(step) <= (0, 0, 0):
+            continue
+        target = places + step
+        j = at[tuple(np.mod(target, edge).T)]
+        occupied = j >= 0
+        i, j = np.flatnonzero(occupied), j[occupied]
+        # x_j + shift L = place of i + step, in the images that the atoms are given in
+        shift = np.floor_divide(target[i], edge) + images[i] - images[j]
+        parts.append((i, j, shift, np.full(len(i), np.sqrt(float(step @ step)))))
+    i, j, shift, distance = (np.concatenate([part[n] for part in parts]) for n in range(4))
+    turn = i > j
+    i, j, shift = np.where(turn, j, i), np.where(turn, i, j), np.where(turn[:, None], -shift, shift)
+    yes = np.ones(len(i), bool)
+    known = PairSet(i, j, shift, distance, yes, ~yes)
+    name = f"{len(places):,} atoms on a lattice with gaps"
+    return once(name, "large", positions, float(edge), r_cut=1.875, known=known)
+
+
+def _sphere(count: int) -> ndarray:
+    """Directions spread evenly over a sphere (Fibonacci's)."""
+    k = np.arange(count) + 0.5
+    height, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    flat = np.sqrt(1 - height**2)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
+
+
+# --- cases drawn at random ---
 
 #: Kinds of boxes, and of places of atoms, that a case is named after.
 SHAPES = ("cube", "orthorhombic", "skewed", "strongly skewed", "turned", "left-handed")
 SIZES = ("ordinary", "wide", "thin", "two cutoffs", "narrow", "long", "huge")
 PLACES = (
-    "inside",
-    "outside",
-    "far outside",
-    "on walls",
-    "clustered",
-    "coincident",
-    "on a grid",
-    "at the cutoff",
-)
+    "inside", "outside", "far outside", "on walls", "clustered", "coincident", "on a grid", "at the cutoff"
+)  # fmt: skip
+#: Lengths of all edges, and of one that is drawn, in cutoffs.
+_EDGES = {"wide": (6.0, 15.0), "narrow": (0.6, 2.0), "huge": (20.0, 45.0)}
+_ONE_EDGE = {"thin": (0.5, 2.2), "long": (30.0, 120.0)}
 
 _FEW_IMAGES = 400  # lattice vectors that the oracle may have to try for a pair
 
@@ -75,20 +351,12 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
     """Lengths of the edges in units of the cutoff."""
     edges = rng.uniform(2.05, 6.0, 3)
     axis = rng.integers(3)
-    if size == "wide":
-        edges = rng.uniform(6.0, 15.0, 3)
-    elif size == "thin":
-        edges[axis] = rng.uniform(0.5, 2.2)
-    elif size == "two cutoffs":
+    if size == "two cutoffs":
         # where numbers of cells and of images change
-        edges = rng.integers(2, 6, 3) * (1.0 + rng.choice([-1e-9, -1e-15, 0.0, 1e-15, 1e-9], 3))
-    elif size == "narrow":
-        edges = rng.uniform(0.6, 2.0, 3)
-    elif size == "long":
-        edges[axis] = rng.uniform(30.0, 120.0)
-    elif size == "huge":
-        edges = rng.uniform(20.0, 45.0, 3)
-    return edges
+        return rng.integers(2, 6, 3) * (1.0 + rng.choice([-1e-9, -1e-15, 0.0, 1e-15, 1e-9], 3))
+    if size in _ONE_EDGE:
+        edges[axis] = rng.uniform(*_ONE_EDGE[size])
+    return rng.uniform(*_EDGES[size], 3) if size in _EDGES else edges
 
 
 @st.composite
@@ -212,3 +480,37 @@ def drawn(count: int, seed: int) -> list[Case]:
 
     draw()
     return collected[:count]
+
+
+def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
+    """Other ways to put a question: (words, whether it should make no difference, the question)."""
+    yield "when it is asked anew", True, case
+    if case.atoms > 1:
+        yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])
+    if case.steps > 1:
+        yield "of a list that is made anew at that step", False, replace(case, stills=case.stills[-1:])
+    power = float(np.ldexp(1.0, 1 - int(np.frexp(case.r_cut)[1])))
+    if power != 1.0:  # of two, which rounds nothing
+        scaled = case.changed(lambda x: power * x, lambda cell: power * cell, r_cut=power * case.r_cut)
+        stills = tuple(
+            replace(still, skin=None if still.skin is None else power * still.skin) for still in scaled.stills
+        )
+        scaled = replace(scaled, stills=stills, skin=power * case.skin)
+        yield f"with all lengths multiplied by {power:.2g}", False, scaled
+    wrapped = replace(
+        case, stills=tuple(_wrapped(still, np.array(case.pbc)) for still in case.stills), known=None
+    )
+    if not wrapped.equals(case):
+        yield "with its atoms wrapped into the box", False, wrapped
+
+
+def _wrapped(still: Still, pbc: ndarray) -> Still:
+    """The same atoms in the images that lie in the box."""
+    if not pbc.any() or not len(still.positions):
+        return still
+    matrix = completed(still.cell, pbc)
+    fractions = np.linalg.solve(matrix.T, still.positions.T).T
+    home = still.positions - np.where(pbc, np.floor(fractions), 0.0) @ matrix
+    # an atom a hair below a face is wrapped onto the one across, by rounding
+    over = np.where(pbc, np.linalg.solve(matrix.T, home.T).T >= 1.0, False)
+    return replace(still, positions=home - np.where(over, 1.0, 0.0) @ matrix)

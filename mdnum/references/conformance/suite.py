@@ -2,44 +2,38 @@
 
 from __future__ import annotations
 
-import itertools
-import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mdnum.deadline import Deadline
-from mdnum.references.conformance.case import AREAS, Case, once
-from mdnum.references.conformance.catalog import gas
+from mdnum.deadline import Deadline, fewest
+from mdnum.references.conformance.answer import Answer
+from mdnum.references.conformance.case import AREAS, Case, gas, once
 from mdnum.references.conformance.judge import (
     CODES,
     DOUBLE,
     SINGLE,
-    Code,
+    CaseAnswers,
+    CaseResult,
     Conventions,
+    Failed,
     Failure,
+    RefusalKind,
+    Report,
     Truth,
     judge,
     measures_well,
     truth,
-)
+    without_numbers,
+)  # fmt: skip
 from mdnum.references.conformance.lists import PairList
+from mdnum.references.conformance.questions import alike, questions
 from mdnum.references.conformance.questions import large as large_questions
-from mdnum.references.conformance.questions import questions
-from mdnum.references.conformance.results import (
-    CaseAnswers,
-    CaseResult,
-    Failed,
-    RefusalKind,
-    Report,
-    Shrunk,
-    alike,
-)
 from mdnum.references.conformance.session import CallOutcome, RemoteSession, Session
-from mdnum.references.conformance.shrink import kind, shrunk
+from mdnum.references.oracle import completed, widths
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Saved = Callable[[bool], None]
@@ -63,14 +57,13 @@ class Examiner:
     """Asks a list and judges its answers; finds out its conventions first.
 
     Args:
-        tested: the list.
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
 
     Attributes:
         report: what was found out, of the cases that it was given to `take`.
         opening: what became of the plainest questions.
-        refused: the smallest refused case by kind of exception, with the exception in words.
+        refused: the smallest refused case by kind of exception.
     """
 
     def __init__(self, tested: PairList, reuse: bool = False, apart: bool = False):
@@ -79,7 +72,7 @@ class Examiner:
             RemoteSession(tested, reuse) if apart and tested.word else Session(tested, reuse)
         )
         self.report = Report(tested)
-        self.refused: dict[str, tuple[str, Case]] = {}
+        self.refused: dict[str, RefusalKind] = {}
         self.opening: list[tuple[Case, CallOutcome]] = []
         self._find_conventions()
 
@@ -148,20 +141,17 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
-
-        A refusal, a crash and a time without an answer are for the suite to report.
-        """
+        """Why no plain question had an answer that is one, but for what the suite reports; None otherwise."""
         reasons = [
-            f"asked about {case.name}, {outcome.malformed or f'it raised {outcome.raised}'}"
+            f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
-            if outcome.malformed or (outcome.raised and not outcome.refused)
+            if (why := outcome.failure) is not None and why.code in ("RAISED", "MALFORMED")
         ]
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing."""
-        return self.ask(case).failures
+        """What is wrong with the answers to a case within the limits, at the first step where anything is."""
+        return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
         """What becomes of a case. An accidental exception is a failure; a refusal is none."""
@@ -171,15 +161,17 @@ class Examiner:
         how = self.report.how
         for step, outcome in enumerate(outcomes):
             result = replace(result, aliased=result.aliased or outcome.aliased)
-            failures, unit, ties = self._judge(case, step, outcome, how)
-            result = replace(
-                result, ties=ties if step == 0 else result.ties, single=result.single or unit != how.unit
-            )
-            how = replace(how, unit=unit)
-            if failures:
-                return replace(result, failures=tuple(replace(failure, step=step) for failure in failures))
-            if outcome.refused:
-                return replace(result, refused=(step, str(outcome.raised)))
+            if outcome.refused is not None:
+                return replace(result, refused=(step, outcome.refused))
+            found = [outcome.failure] if outcome.failure is not None else []
+            if outcome.answer is not None:
+                found, how, ties = self._judge(case, step, outcome.answer, how)
+                ties = ties if step == 0 else result.ties
+                result = replace(result, ties=ties, single=result.single or how.unit != self.report.how.unit)
+                if outcome.changed:
+                    found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
+            if found:
+                return replace(result, failures=tuple(replace(failure, step=step) for failure in found))
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
@@ -187,34 +179,21 @@ class Examiner:
         self.report.take(case, result)
         if result.refused is not None:
             step, words = result.refused
-            case, smallest = case.until(step + 1), re.sub(r"[-+\d.e]+", "#", words)
-            _, known = self.refused.get(smallest, ("", None))
-            if known is None or (case.steps, case.atoms) < (known.steps, known.atoms):
-                self.refused[smallest] = words, case
+            case, like = case.until(step + 1), without_numbers(words)
+            known = self.refused.get(like)
+            if known is None or (case.steps, case.atoms) < (known.case.steps, known.case.atoms):
+                self.refused[like] = RefusalKind(words, case)
 
     def _judge(
-        self, case: Case, step: int, outcome: CallOutcome, how: Conventions
-    ) -> tuple[list[Failure], float, tuple[int, int]]:
-        """(failures, roundoff that the answer was judged by, ties counted and not)."""
-        silent: tuple[tuple[Code, str | None], ...] = (
-            ("CRASHED", outcome.crashed),
-            ("NO_ANSWER", outcome.late),
-            ("RAISED", None if outcome.refused else outcome.raised),
-            ("MALFORMED", outcome.malformed),
-        )
-        for code, text in silent:
-            if text is not None:
-                return [Failure(code, text)], how.unit, (0, 0)
-        answer = outcome.answer
-        if answer is None:
-            return [], how.unit, (0, 0)
+        self, case: Case, step: int, answer: Answer, how: Conventions
+    ) -> tuple[list[Failure], Conventions, tuple[int, int]]:
+        """(failures, conventions that the answer was judged by, ties counted and not)."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
         if found and step and reach is not None and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
             found = judge(answer, _with_earlier(case, step, right, reach), how)
-        unit = how.unit
         # a list that is stale by a hair is not one in single precision, nor one that is wrong anyway; and
         # whoever measures in double and decides in single loses pairs that it knows to be inside
         if (
@@ -222,24 +201,19 @@ class Examiner:
             and self.report.wrong <= _MISTAKES * (self.report.asked + 1)
             and self.tested.unit is None and how.unit == DOUBLE and not measures_well(answer, right, how)
         ):  # fmt: skip
-            coarse = truth(case, step, reach=reach, unit=SINGLE)
-            if not judge(answer, coarse, replace(how, unit=SINGLE)):
-                unit, found = SINGLE, []
-        ties = (0, 0)
-        if not found and step == 0 and unit == DOUBLE and not self.report.superset:
-            ties = _ties(outcome, right)
-        if outcome.changed:
-            found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
-        return found, unit, ties
+            coarse, single = truth(case, step, reach=reach, unit=SINGLE), replace(how, unit=SINGLE)
+            if not judge(answer, coarse, single):
+                return [], single, (0, 0)
+        counts = not found and step == 0 and how.unit == DOUBLE and not self.report.superset
+        return found, how, _ties(answer, right) if counts else (0, 0)
 
 
-def _ties(outcome: CallOutcome, right: Truth) -> tuple[int, int]:
+def _ties(answer: Answer, right: Truth) -> tuple[int, int]:
     """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
-    assert outcome.answer is not None
-    rows = set(zip(outcome.answer.i.tolist(), outcome.answer.j.tolist(), strict=True))
+    rows = set(zip(answer.i.tolist(), answer.j.tolist(), strict=True))
     off = np.abs(right.distance - right.r_cut) > 1e-6
     listed = [
         (i, j) in rows or (j, i) in rows
@@ -306,7 +280,7 @@ def examine(
     """
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
-    report = examiner.report
+    report, session = examiner.report, examiner.session
     deadline, answers, saved = (
         deadline or Deadline(),
         answers or CaseAnswers(),
@@ -314,86 +288,54 @@ def examine(
     )
     far = apart and bool(tested.word)
     every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
-    crystals = list(large_questions()) if large and asked is None else []
-    report.questions = total = len(every) + len(crystals)
+    every += large_questions() if large and asked is None else ()
+    report.questions = len(every)
     stopped = False
-    for number, case in enumerate(itertools.chain(every, crystals)):
+    for number, case in enumerate(every):
         if progress is not None:
-            progress(number, total, {"phase": "asking", "unit": "cases"})
+            progress(number, len(every), {"phase": "asking", "unit": "cases"})
         result = answers.of(number, case)
-        if not stopped and (result is not None or not deadline.passed):
-            why = tested.limits.refusal(case)
-            if why is None and result is None and case.area == "large":
-                why = _too_long(report, case)
-            if why is not None:
-                report.skip(case, why)
-            else:
-                if result is None:
-                    result = answers.cases[str(number)] = examiner.ask(case)
-                    saved(bool(result.failures))
-                examiner.take(case, result)
-                stopped = stop and bool(result.failures)
-        if number + 1 == len(every) and not stopped and not deadline.passed:
-            report.keeps_order = _keeps_order(examiner)
+        if stopped or (result is None and deadline.passed):
+            continue
+        why = tested.limits.refusal(case)
+        if why is None and result is None and case.area == "large":
+            why = _too_long(report, case)
+        if why is not None:
+            report.skip(case, why)
+            continue
+        if result is None:
+            result = answers.cases[str(number)] = examiner.ask(case)
+            saved(bool(result.failures))
+        examiner.take(case, result)
+        stopped = stop and bool(result.failures)
+    if every and not stopped and not deadline.passed:
+        report.keeps_order = _keeps_order(examiner)
     if shrink:
-        examiner.session.reuse = False
+        session.reuse = False
         if not deadline.passed:
             report.refusals = _refusals(examiner)
         for number, failed in enumerate(report.failed):
             if progress is not None:
                 progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
-            report.failed[number] = _shrunk(examiner, failed, deadline, answers, saved)
+            name = f"{failed.code} {failed.case.area} {failed.case.name}"
+            smaller = answers.shrunk.get(name)
+            if smaller is None and not deadline.passed:
+                # a new process: what the list kept from other questions must not be part of it
+                session.close()
+                smaller = deepest(examiner.failures, shrunk(examiner.failures, failed, deadline))
+                if deadline.passed:
+                    report.whole = False
+                elif smaller.case.known is None:  # pairs that are known in closed form alone are not kept
+                    answers.shrunk[name] = smaller
+                    saved(True)
+            elif smaller is None:
+                report.whole = False
+            report.failed[number] = smaller or failed
         report.failed = distinct(report.failed)
     report.areas = {area: report.areas[area] for area in AREAS if area in report.areas}
-    examiner.session.close()
+    session.close()
     report.seconds = time.perf_counter() - began
     return report
-
-
-def _shrunk(
-    examiner: Examiner,
-    failed: Failed,
-    deadline: Deadline,
-    answers: CaseAnswers,
-    saved: Callable[[bool], None],
-) -> Failed:
-    """A failure on a few atoms: as it was shrunk before, or as far as the time allows."""
-    name = f"{failed.code} {failed.asked.area} {failed.asked.name}"
-    if (kept := answers.shrunk.get(name)) is not None:
-        return Failed(kept.case, kept.failures, kept.alone, asked=failed.asked)
-    if not deadline.passed:
-        # a new process: what the list kept from other questions must not be part of it
-        examiner.session.close()
-        failed = _deepest(examiner, shrunk(examiner, failed, deadline))
-    if deadline.passed:
-        examiner.report.whole = False
-    elif failed.case.known is None:  # pairs that are known in closed form alone are not kept
-        answers.shrunk[name] = Shrunk(failed.case, failed.failures, failed.alone)
-        saved(True)
-    return failed
-
-
-def _deepest(examiner: Examiner, failed: Failed) -> Failed:
-    """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
-
-    It moves on the way it went, so that what is reported is how near a lost pair can be.
-    """
-    case = failed.case
-    if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
-        return failed
-    first, last = case.stills
-    for part in np.arange(1.02, _FURTHEST, 0.04):
-        moved = first.positions + part * (last.positions - first.positions)
-        further = replace(case, stills=(first, replace(last, positions=moved)))
-        found = tuple(
-            failure
-            for failure in examiner.failures(further)
-            if failure.code == "MISSING" and failure.step == 1
-        )
-        if not found:
-            break
-        failed = replace(failed, case=further, failures=found)
-    return failed
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
@@ -401,13 +343,10 @@ def _keeps_order(examiner: Examiner) -> bool | None:
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
-            answers = [examiner.session.ask(case)[0].answer for _ in range(3)]
-            first = answers[0]
-            return (
-                None
-                if first is None
-                else all(other is not None and first.same(other) for other in answers[1:])
-            )
+            first, *others = (examiner.session.ask(case)[0].answer for _ in range(3))
+            if first is not None:
+                return all(other is not None and first.same(other) for other in others)
+            return None
     return None
 
 
@@ -427,15 +366,15 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
     A new process, or a new object, is asked each.
     """
     found = []
-    for words, case in list(examiner.refused.values())[:_REFUSALS]:
-        uneven, answers = [], []
-        for how, even, other in alike(case):
+    for refusal in list(examiner.refused.values())[:_REFUSALS]:
+        answered: dict[bool, list[str]] = {True: [], False: []}
+        for how, even, other in alike(refusal.case):
             if examiner.tested.limits.refusal(other) is None:
                 examiner.session.close()
                 outcomes = examiner.session.ask(other)
                 if len(outcomes) == other.steps and outcomes[-1].answer is not None:
-                    (uneven if even else answers).append(how)
-        found.append(RefusalKind(words, case, tuple(uneven), tuple(answers)))
+                    answered[even].append(how)
+        found.append(replace(refusal, uneven=tuple(answered[True]), answers=tuple(answered[False])))
     return found
 
 
@@ -452,7 +391,7 @@ def distinct(failed: Iterable[Failed]) -> list[Failed]:
     kept: dict[Any, Failed] = {}
     for failure in sorted(failed, key=size):
         case = failure.case
-        key: Any = kind(failure.worst)
+        key: Any = failure.worst.kind
         if failure.code not in ("RAISED", "CRASHED", "MALFORMED"):
             key = (key, min(case.atoms, 3), min(case.steps, 2), any(case.pbc))
             if not failure.alone:
@@ -461,3 +400,128 @@ def distinct(failed: Iterable[Failed]) -> list[Failed]:
         kept.setdefault(key, failure)
     areas = list(AREAS)
     return sorted(kept.values(), key=lambda one: (CODES.index(one.code), areas.index(one.case.area)))
+
+
+# --- a failing case brought down to a few atoms, few steps and round numbers that fail in the same way ---
+
+#: Questions and seconds that a shrink may take; a slow list has this many questions, and at most so long.
+TRIES, SECONDS = 600, 8.0
+LEAST_TRIES, PATIENCE = 80, 60.0
+_MOST_IMAGES = 3000
+
+Failures = Callable[[Case], Sequence[Failure]]
+
+
+def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
+    """The smallest case found, before the deadline, that fails with the same code.
+
+    `failures` asks the list; a new object of a kept list for each question.
+    """
+    deadline = deadline or Deadline()
+    sought, least = failed.worst.kind, min(1, failed.case.atoms)
+    tries, began = 0, time.perf_counter()
+
+    def fails(case: Case) -> bool:
+        nonlocal tries
+        tries += 1
+        asked = case.steps and case.atoms >= least and _sensible(case)
+        return bool(asked) and any(failure.kind == sought for failure in failures(case))
+
+    def spent() -> bool:
+        seconds = time.perf_counter() - began
+        return deadline.passed or tries >= TRIES or seconds > (SECONDS if tries >= LEAST_TRIES else PATIENCE)
+
+    if failed.code == "NO_ANSWER":
+        return failed  # every try would take as long
+    case, before = failed.case, None
+    if not fails(case):
+        # what it kept from earlier questions was part of it: reported as it is
+        return replace(failed, alone=False)
+    while case is not before and not spent():
+        before = case
+        stills = fewest(case.stills, lambda kept, case=case: fails(replace(case, stills=tuple(kept))), spent)
+        case = replace(case, stills=tuple(stills)) if len(stills) < case.steps else case
+        atoms = fewest(range(case.atoms), lambda kept, case=case: fails(_only(case, kept)), spent)
+        case = _only(case, atoms) if len(atoms) < case.atoms else case
+        for simpler in _simplifications(case):
+            if spent():
+                break
+            other = simpler(case)
+            case = other if not other.equals(case) and fails(other) else case
+    found = tuple(failure for failure in failures(case) if failure.code == failed.code)
+    found = found or failed.failures
+    return replace(failed, case=case.until(found[0].step + 1), failures=found)
+
+
+def _only(case: Case, atoms: list[int]) -> Case:
+    """Some of the atoms; few need no pairs in closed form."""
+    smaller = case.only(np.array(atoms, int))
+    return replace(smaller, known=None) if len(atoms) <= 400 else smaller
+
+
+def _sensible(case: Case) -> bool:
+    """Whether it is a question: finite numbers, a box with room in it, not too many images to count."""
+    pbc = np.array(case.pbc)
+    if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
+        return False
+    for cell in (still.cell for still in case.stills):
+        if not np.isfinite(cell).all() or np.linalg.matrix_rank(cell[pbc]) < pbc.sum():
+            return False
+        if pbc.any():
+            with np.errstate(all="ignore"):
+                full = completed(cell, pbc)
+                if not abs(np.linalg.det(full)) > 0:
+                    return False
+                images = np.prod(2 * np.floor((case.r_cut + 2 * case.skin) / widths(full)[pbc]) + 3)
+            if not images <= _MOST_IMAGES:
+                return False
+    return True
+
+
+def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
+    """Axes that need not repeat, cells that need not lean, fewer digits, coordinates that may be 0."""
+    for axis in range(3):
+        yield lambda case, axis=axis: replace(
+            case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
+        )
+    yield lambda case: case if any(case.pbc) else case.changed(cell=np.zeros_like)
+    yield lambda case: case.changed(cell=lambda cell: np.diag(np.diag(cell)))
+    for digits in (1, 2, 3, 5, 8):
+        yield lambda case, d=digits: case.changed(
+            lambda x: np.round(x, d),
+            lambda x: np.round(x, d),
+            r_cut=round(case.r_cut, d),
+            skin=round(case.skin, d),
+        )
+    for digits in (0, 1, 2) if case.atoms <= 12 else ():
+        yield lambda case, d=digits: case.changed(cell=lambda cell: np.round(cell, d))
+        for atom, axis in np.ndindex(case.atoms, 3):
+
+            def moved(
+                positions: np.ndarray, atom: int = atom, axis: int = axis, digits: int = digits
+            ) -> np.ndarray:
+                positions = positions.copy()
+                # a still may have fewer atoms
+                positions[atom : atom + 1, axis] = np.round(positions[atom : atom + 1, axis], digits)
+                return positions
+
+            yield lambda case, moved=moved: case.changed(moved)
+
+
+def deepest(failures: Failures, failed: Failed) -> Failed:
+    """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
+
+    It moves on the way it went, so that what is reported is how near a lost pair can be.
+    """
+    case = failed.case
+    if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
+        return failed
+    first, last = case.stills
+    for part in np.arange(1.02, _FURTHEST, 0.04):
+        moved = first.positions + part * (last.positions - first.positions)
+        further = replace(case, stills=(first, replace(last, positions=moved)))
+        found = tuple(one for one in failures(further) if one.code == "MISSING" and one.step == 1)
+        if not found:
+            break
+        failed = replace(failed, case=further, failures=found)
+    return failed

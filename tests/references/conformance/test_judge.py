@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mdnum.references.conformance.answer import Answer, Malformed, read
-from mdnum.references.conformance.case import once
-from mdnum.references.conformance.catalog import gas, lattice
+from mdnum.references.conformance.case import gas, once
 from mdnum.references.conformance.judge import DOUBLE, SINGLE, Conventions, judge, truth
+from mdnum.references.conformance.questions import lattice
 from mdnum.references.oracle import all_pairs
 
 _CASE = once("a gas", "few", gas(20, 3.0, 0), 3.0)

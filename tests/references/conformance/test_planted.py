@@ -12,12 +12,11 @@ import planted_lists
 import pytest
 
 from mdnum.references.conformance.case import Still
-from mdnum.references.conformance.catalog import LARGE_EDGE, SMALL_EDGE, catalog, lattice
-from mdnum.references.conformance.loading import from_object
+from mdnum.references.conformance.judge import Report
+from mdnum.references.conformance.lists import from_object
 from mdnum.references.conformance.motions import motions
-from mdnum.references.conformance.questions import drawn, questions
+from mdnum.references.conformance.questions import LARGE_EDGE, SMALL_EDGE, catalog, drawn, lattice, questions
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.results import Report
 from mdnum.references.conformance.suite import Examiner, examine
 
 ROOT = Path(__file__).parents[3]

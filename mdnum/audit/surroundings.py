@@ -1,0 +1,508 @@
+"""What only shows among many: routes through a structure, and an atom that is crowded until something drops.
+
+What jumps for two atoms may jump otherwise among many (an embedding, an angle), and what is smooth for two
+may not be: triples, and atoms of the structure, are walked through what two atoms have shown and beyond. A
+cap on neighbors shows where one more atom is brought past all neighbors of a crowded center: exactly as far
+as the k-th of them, a calculator that keeps k neighbors exchanges one for the other, and something jumps;
+where it keeps the first k in its own order, a permutation of the atoms does the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from ase import Atoms
+from ase.neighborlist import neighbor_list
+from jaxtyping import Float, Int
+
+from mdnum.audit.base import CalculatorError, Progress, Ways
+from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
+from mdnum.audit.structures import Pair, molecules, whole
+from mdnum.audit.subject import CalculatorSubject, differences
+from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
+
+#: Half the stretch around an expected crossing in which it is located, length.
+_SIDE = 1e-7
+#: Crossings of one threshold that are measured, each by another atom.
+_MOST_CROSSINGS = 2
+#: Crossings of known thresholds in the structure that are measured, by 170 calls or so each.
+_CROSSINGS = 4
+#: Through the structure, scanned for unknown thresholds by 430 calls or so each.
+_ROUTES = 2
+#: Of a structure of more atoms than the second, so many are kept to be walked through.
+_CUT_OUT, _MANY = 40, 500
+_MOST_TRIPLES = 4
+#: Of a route through the structure, length.
+_LENGTH = 0.6
+#: Two distances this near to one another are tied, length.
+_TIED = 1e-6
+#: Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere.
+_MOST = 160
+#: Of which a calculator that refuses more is given.
+_FEWEST = 4
+#: The crowd is between these fractions of the cutoff.
+_NEAR, _FAR = 0.5, 0.94
+#: How far to either side of a tie is asked, the second for calculators that compute in float32.
+_SIDES = (1e-9, 1e-6)
+_SURE = 30.0
+_WITHOUT_CUTOFF = 6.0
+#: With how many neighbors ties are tried, three calls each; the share of one of several species is less.
+_TIES = 160
+#: Ties that are tried in any case.
+_HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
+
+
+class RouteCrossing(NamedTuple):
+    """A place along a route, length, at which the lead's distance to an atom passes a threshold."""
+
+    at: float
+    threshold: PairThreshold
+
+
+@dataclass(frozen=True)
+class Route:
+    """A structure in which some atoms move along a line."""
+
+    name: str
+    atoms: Atoms  # the structure at 0
+    moving: Int[np.ndarray, "moving"]  # atoms that move together
+    lead: int  # the one of them whose distances are watched
+    direction: Float[np.ndarray, "3"]  # unit vector
+
+    def at(self, along: float) -> Atoms:
+        """The structure with those atoms moved."""
+        atoms = self.atoms.copy()
+        atoms.positions[self.moving] += along * self.direction
+        return atoms
+
+    def curve(self, subject: CalculatorSubject) -> Curve:
+        """Energy, and force along the line on what moves."""
+
+        def at(along: float) -> tuple[float, float]:
+            energy, forces = subject.both(self.at(along))
+            return energy, float((forces[self.moving] @ self.direction).sum())
+
+        return Curve(at)
+
+    def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
+        """Every place between low and high at which the lead's distance to an atom passes a threshold.
+
+        The distance along a line is a hyperbola, so the places are roots of a quadratic.
+        """
+        found: list[RouteCrossing] = []
+        symbols = np.array(self.atoms.get_chemical_symbols())
+        for threshold in thresholds:
+            reach = threshold.radius + max(abs(low), abs(high))
+            first, second, vectors = neighbor_list("ijD", self.atoms, reach)
+            near = (first == self.lead) & ~np.isin(second, self.moving)
+            one, other = threshold.species
+            wanted = {one: other, other: one}.get(symbols[self.lead])
+            for vector in vectors[near & (symbols[second] == wanted)]:
+                toward = float(vector @ self.direction)
+                rest = toward**2 - float(vector @ vector) + threshold.radius**2
+                roots = (toward - np.sqrt(rest), toward + np.sqrt(rest)) if rest > 0 else ()
+                found += [RouteCrossing(float(root), threshold) for root in roots if low < root < high]
+        return sorted(found, key=lambda one: one.at)
+
+    def ties(self, along: float) -> list[tuple[int, int]]:
+        """(atom, k) where, at a place, an atom's k-th and (k+1)-th neighbors are equally far."""
+        atoms = self.at(along)
+        found: list[tuple[int, int]] = []
+        for center, row in enumerate(atoms.get_all_distances(mic=bool(atoms.pbc.any()))):
+            others = np.sort(np.delete(row, center))
+            for k in np.flatnonzero(np.diff(others) < _TIED):
+                if center == self.lead or abs(others[k] - row[self.lead]) < _TIED:
+                    found.append((center, int(k) + 1))
+        return found
+
+
+@dataclass(frozen=True)
+class Event:
+    """A place on a route at which something jumps."""
+
+    route: str  # its name
+    at: float  # place along it, length
+    jump: Jump  # what jumps there; the force is the one along the route
+    force: float  # largest change of the force on any atom, eV/Å
+    threshold: PairThreshold | None  # the pair threshold that explains it, None if none does
+    ties: tuple[tuple[int, int], ...]  # (atom, k) whose k-th and next neighbors are equally far there
+
+
+@dataclass(frozen=True)
+class EnvironmentWalks:
+    """What walks through surroundings found."""
+
+    events: tuple[Event, ...]  # places at which something jumps
+    measured: int  # crossings of known thresholds that were measured
+    routes: tuple[str, ...]  # names of routes that were scanned for unknown ones
+
+    @property
+    def unexplained(self) -> list[Event]:
+        """Events that no pair threshold explains and that jump beyond doubt."""
+        return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
+
+
+def walk_surroundings(
+    subject: CalculatorSubject,
+    progress: Progress,
+    ways: Ways,
+    crossings: int = _CROSSINGS,
+    routes: int = _ROUTES,
+) -> EnvironmentWalks:
+    """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
+
+    Args:
+        ways: counts crossings and routes.
+        crossings: of known thresholds in the structure that are measured.
+        routes: through the structure on which others are searched.
+    """
+    walks = walk_pairs(subject).walks
+    thresholds = [one for walk in walks for one in walk.thresholds if one.order < SMOOTH or one.dies]
+    quantum = max((one.quantum for one in walks), default=(0.0, 0.0))
+    single = bool(walks) and walks[0].pair.moves == "atom"
+    atoms = subject.atoms
+    subject.forces(atoms)
+    if len(atoms) > _MANY and walks:
+        atoms = _cut_out(atoms, _groups(atoms, single), walks[0].pair)
+        try:
+            subject.forces(atoms)
+        except CalculatorError as error:
+            ways.skip(f"{_CUT_OUT} atoms cut out of the structure", error.message)
+            atoms = subject.atoms
+    groups = _groups(atoms, single)
+    targeted = _targeted(atoms, thresholds, groups)
+    if len(targeted) > crossings:
+        more = len(targeted) - crossings
+        ways.skip(f"{more} more crossings of known thresholds", f"{crossings} were measured")
+        targeted = targeted[:crossings]
+    triples = _triples(subject) if single else []
+    scans = [*triples, *_random(atoms, groups, routes)]
+    routed: list[tuple[Any, ...]] = [*targeted, *scans]
+
+    def walked(way: tuple[Any, ...]) -> list[Event]:
+        return [_at_crossing(subject, *way)] if len(way) == 2 else _scanned(subject, thresholds, *way)
+
+    before, phase = ways.asked, "walking through the structure"
+    found = ways.each(subject, routed, lambda way: way[0].name, walked, progress, phase, tolerant=True)
+    return EnvironmentWalks(
+        tuple(one for events in found.values() for one in events if not _rounded(one, quantum)),
+        min(ways.asked - before, len(targeted)),
+        tuple(routed[place][0].name for place in found if place >= len(targeted)),
+    )
+
+
+def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
+    """What moves together: single atoms, or molecules where the calculator takes nothing less."""
+    return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
+
+
+def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
+    """The groups nearest to the first, in one piece, in the surroundings of a pair; their order is kept."""
+    center = _lead(atoms, groups[0])
+    offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
+    nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
+    count = max(_CUT_OUT // max(len(groups[0]), 1), 4)
+    cut = Atoms(cell=[pair.box] * 3 if pair.box else None, pbc=pair.periodic)
+    for group in (groups[k] for k in sorted(nearest[:count])):
+        part = whole(atoms, group)
+        part.positions += offsets[_lead(atoms, group)] + pair.box / 2
+        cut += part
+    return cut
+
+
+def _lead(atoms: Atoms, group: np.ndarray) -> int:
+    return int(group[np.argmax(atoms.get_masses()[group])])
+
+
+def _targeted(
+    atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
+) -> list[tuple[Route, RouteCrossing]]:
+    """For each threshold, a few pairs of the structure near it, moved through it along their line."""
+    of_lead = {_lead(atoms, group): group for group in groups}
+    symbols = np.array(atoms.get_chemical_symbols())
+    ranked: list[tuple[int, Route, RouteCrossing]] = []
+    for threshold in thresholds:
+        first, second, distance, vector = neighbor_list("ijdD", atoms, threshold.radius + 1.0)
+        one, other = threshold.species
+        fits = (symbols[first] == one) & (symbols[second] == other) & (first != second)
+        fits &= np.isin(first, list(of_lead)) & np.isin(second, list(of_lead))
+        used: set[int] = set()
+        for k in np.argsort(np.abs(distance - threshold.radius)):
+            if not fits[k] or int(first[k]) in used or abs(distance[k] - threshold.radius) > 1.0:
+                continue
+            used.add(int(first[k]))
+            route = Route(
+                f"atom {first[k]} ({one}) toward {second[k]} ({other})",
+                atoms, of_lead[int(first[k])], int(first[k]), vector[k] / distance[k],
+            )  # fmt: skip
+            at = float(distance[k] - threshold.radius)
+            ranked.append((len(used), route, RouteCrossing(at, threshold)))
+            if len(used) == _MOST_CROSSINGS:
+                break
+    # the first of every threshold before the second of any
+    return [(route, crossing) for _, route, crossing in sorted(ranked, key=lambda one: one[0])]
+
+
+def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
+    """What jumps where a known threshold is crossed, to the last representable place if a value does."""
+    curve = route.curve(subject)
+    low, high = crossing.at - _SIDE, crossing.at + _SIDE
+    exact = crossing.threshold.order < 2
+    if exact:
+        low, high = locate(curve, crossing.threshold.order, low, high)
+    jump = measure(curve, low, high, STEP, exact, curved=not exact)
+    return _event(subject, route, jump, crossing)
+
+
+def _event(
+    subject: CalculatorSubject, route: Route, jump: Jump, crossing: RouteCrossing | None = None
+) -> Event:
+    change = subject.forces(route.at(jump.high)) - subject.forces(route.at(jump.low))
+    return Event(
+        route.name, jump.at, jump, float(np.linalg.norm(change, axis=1).max()),
+        crossing and crossing.threshold, () if crossing else tuple(route.ties(jump.at)),
+    )  # fmt: skip
+
+
+def _scanned(
+    subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
+) -> list[Event]:
+    """Unknown thresholds on a route."""
+    curve = route.curve(subject)
+    crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
+    inside = sum(low <= one.at <= high for one in crossings)
+    # crowded routes in finer steps, so that what lies between two crossings is seen
+    step = float(np.clip((high - low) / (10 * inside + 1), STEP / 10, STEP))
+    jumps, _ = find_jumps(curve, low, high, step, most=6, expected=[one.at for one in crossings])
+
+    def explains(crossing: RouteCrossing, jump: Jump) -> bool:
+        near = max(1e-6, 10 * crossing.threshold.located, jump.high - jump.low)
+        return abs(jump.at - crossing.at) < near
+
+    return [
+        _event(subject, route, jump)
+        for jump in jumps
+        if jump.order < SMOOTH and not any(explains(one, jump) for one in crossings)
+    ]
+
+
+def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
+    """A third atom brought toward one of a bonded pair, beside their line: (route, from, to)."""
+    found: list[tuple[Route, float, float]] = []
+    for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
+        bond = float(walk.distance[int(np.argmin(walk.energy))])
+        end = min((walk.cutoff or 8.0) + bond, 12.0)
+        one, other = walk.pair.species
+        side = np.radians(110.0)
+        beside = (bond * np.cos(side), bond * np.sin(side), 0)
+        atoms = Atoms([one, other, other], [(0, 0, 0), beside, (0, 0, 0)])
+        if walk.pair.box:
+            atoms.set_cell([walk.pair.box] * 3)
+            atoms.positions += walk.pair.box / 2  # what lies outside of a box may be lost
+        atoms.pbc = walk.pair.periodic
+        name = f"a third atom ({other}) toward {one}-{other}"
+        route = Route(name, atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0]))
+        found.append((route, max(float(walk.distance[0]), 0.8 * bond) + 6 * STEP, end))
+    return found
+
+
+def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
+    """Routes of some atoms in arbitrary directions."""
+    rng = np.random.default_rng(0)
+    found: list[tuple[Route, float, float]] = []
+    for k in rng.permutation(len(groups))[:count]:
+        direction = rng.normal(size=3)
+        lead = _lead(atoms, groups[k])
+        name = f"atom {lead} ({atoms.get_chemical_symbols()[lead]}) in some direction"
+        route = Route(name, atoms, groups[k], lead, direction / np.linalg.norm(direction))
+        found.append((route, -_LENGTH / 2, _LENGTH / 2))
+    return found
+
+
+def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
+    """Whether an event is no more than a step of answers that are rounded to decimals."""
+    if not any(quantum):
+        return False
+    small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
+    return event.jump.order > 1 or small
+
+
+# -- crowds ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A center with many neighbors, none as far as another, and what came of crowding it."""
+
+    species: str  # of all atoms
+    radius: float  # cutoff that the crowd is inside of, length
+    neighbors: int  # how many neighbors the center got
+    kept: int | None  # how many of them the calculator keeps, None where no exchange showed
+    energy: float  # jump at the exchange, eV; 0 without one
+    force: float  # largest jump of a force there, eV/Å
+    distance: float  # from the center at which the exchange takes place; nan without one
+    # number of neighbors at which the order of atoms starts to matter, None if it never does
+    order_from: int | None
+    order_energy: float  # how much it changes the energy then, eV
+    order_force: float  # how much it changes a force, eV/Å
+    # (k, largest force jump) for each tie with the k-th neighbor that was tried
+    jumps: tuple[tuple[int, float], ...]
+
+
+def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
+    """Crowd an atom of each species that the calculator takes alone.
+
+    Args:
+        ways: counts them.
+        most: neighbors given to the center.
+
+    Returns:
+        one for each species of the structure; none for a calculator that takes no single atoms.
+    """
+    alike = [
+        walk
+        for walk in walk_pairs(subject).walks
+        if walk.pair.species[0] == walk.pair.species[1] and walk.pair.moves == "atom"
+    ]
+    fewest = max(most // 8, _FEWEST)
+
+    def crowded(walk: PairWalk) -> Crowd | None:
+        for count in sorted({max(most // part, fewest) for part in (1, 2, 4, 8)}, reverse=True):
+            # some refuse what is too dense for them
+            with contextlib.suppress(CalculatorError), subject.trying():
+                return _crowded(subject, walk, count, _TIES // len(alike))
+        return None
+
+    name = lambda walk: f"crowding {walk.pair.species[0]}"  # noqa: E731
+    found = ways.each(subject, alike, name, crowded, progress, "crowding atoms", unit="elements")
+    return [one for one in found.values() if one]
+
+
+def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
+    """A center at the origin and count atoms around it at different distances: (atoms, distances).
+
+    The neighbors fill the shell evenly (a golden spiral in angle, equal volumes in distance), so that no two
+    are as near to one another as chance would put them. Sorted by distance, the center first.
+    """
+    k = np.arange(count)
+    share = (k + 0.5) / count
+    distance = radius * (_NEAR**3 + (_FAR**3 - _NEAR**3) * share) ** (1 / 3)
+    # neighbors in distance are put far apart in angle
+    spread = np.argsort(np.random.default_rng(0).random(count))
+    height = 1 - 2 * (spread + 0.5) / count
+    angle = np.pi * (3 - np.sqrt(5)) * spread
+    flat = np.sqrt(1 - height**2)
+    directions = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
+    positions = np.vstack([np.zeros(3), distance[:, None] * directions])
+    atoms = Atoms([pair.species[0]] * (count + 1), positions)
+    if pair.box:
+        atoms.set_cell([pair.box] * 3)
+        atoms.positions += pair.box / 2
+    atoms.pbc = pair.periodic
+    return atoms, distance
+
+
+def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
+    """The direction from the center that stays farthest from every neighbor."""
+    tried = np.random.default_rng(1).normal(size=(2000, 3))
+    tried /= np.linalg.norm(tried, axis=1)[:, None]
+    offsets = atoms.positions[1:] - atoms.positions[0]
+    units = offsets / np.linalg.norm(offsets, axis=1)[:, None]
+    return tried[np.argmin((tried @ units.T).max(axis=1))]
+
+
+def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) -> Crowd:
+    radius, quantum = walk.cutoff or _WITHOUT_CUTOFF, walk.quantum
+    atoms, distances = cluster(walk.pair, radius, count)
+    direction = gap(atoms)
+    between = 0.5 * (distances[1:] + distances[:-1])
+
+    def walker(place: float) -> Atoms:
+        return atoms + Atoms([walk.pair.species[0]], [atoms.positions[0] + place * direction])
+
+    def resolved(side: float) -> bool:
+        """Whether the calculator tells two places this near apart, wherever they are."""
+        return not any(
+            (subject.forces(walker(place - side)) == subject.forces(walker(place + side))).all()
+            for place in between[:: max(len(distances) // 6, 1)]
+        )
+
+    side = next((one for one in _SIDES if resolved(one)), _SIDES[-1])
+
+    def change(place: float) -> tuple[float, Float[np.ndarray, "atoms"]]:
+        """Changes from place - side to place + side that a smooth function has not.
+
+        (|change of the energy beyond the force's work|, for each atom |change of its force beyond the change
+        over the next stretch of that length|).
+        """
+        first, before = subject.both(walker(place - side))
+        second, after = subject.both(walker(place + side))
+        later = subject.forces(walker(place + 3 * side))
+        energy = abs(second - first + float((before[-1] + after[-1]) @ direction) * side)
+        return energy, np.linalg.norm((after - before) - (later - after), axis=1)
+
+    quiet = [change(place) for place in between[:: max(count // 10, 1)]]
+    # a force's change and that of its change are four roundings of each of three components
+    noise_energy = max(max(energy for energy, _ in quiet), 1e-14, 4 * quantum[0] / _SURE)
+    # an atom that its neighbors press hard has forces with more rounding in them than another
+    forces = np.linalg.norm(subject.forces(walker(float(between[0]))), axis=1)
+    rounding = 2.0**-50 if side == _SIDES[0] else 2.0**-21
+    floor = np.maximum(rounding * np.maximum(forces, np.median(forces)), 1e-14)
+    floor = np.maximum(floor, 4 * np.sqrt(3) * quantum[1] / _SURE)
+    noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
+    jumps: list[tuple[int, float]] = []
+    over: list[tuple[int, float, float]] = []
+    for k, place in enumerate(distances):
+        if k >= ties and k + 1 not in _HABITUAL:
+            continue
+        energy, force = change(place)
+        jumps.append((k + 1, float(force.max())))
+        sure = force > _SURE * noise_force
+        if energy > _SURE * noise_energy or sure.any():
+            over.append((k + 1, energy, float(force[sure].max()) if sure.any() else 0.0))
+    kept, energy, force = max(over, key=lambda one: (one[2], one[1])) if over else (None, 0.0, 0.0)
+    if energy <= _SURE * noise_energy:  # the force alone jumped
+        energy = 0.0
+    return Crowd(
+        walk.pair.species[0], radius, count, kept, energy, force,
+        float(distances[kept - 1]) if kept else float("nan"),
+        *_order(subject, walk, radius, count), tuple(jumps),
+    )  # fmt: skip
+
+
+def _order(
+    subject: CalculatorSubject, walk: PairWalk, radius: float, most: int
+) -> tuple[int | None, float, float]:
+    """(fewest neighbors at which permuting atoms changes anything, by how much energy, and force)."""
+    low, high, changed = 1, None, (0.0, 0.0)
+    larger = iter([*(count for count in (4, 16, 64) if count < most), most])
+    while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
+        found = _permuted(subject, walk, radius, count)
+        if found is None:
+            low = count
+        else:
+            high, changed = count, found
+    return high, *changed
+
+
+def _permuted(
+    subject: CalculatorSubject, walk: PairWalk, radius: float, count: int
+) -> tuple[float, float] | None:
+    """Changes of energy and force with the order of atoms; None if another order of sums explains them."""
+    atoms, _ = cluster(walk.pair, radius, count)
+    energy, forces = subject.both(atoms)
+    rng = np.random.default_rng(2)
+    worst = np.zeros(2)
+    for order in (np.arange(count + 1)[::-1], rng.permutation(count + 1), rng.permutation(count + 1)):
+        other = atoms.copy()[order]
+        assert isinstance(other, Atoms)
+        worst = np.maximum(worst, differences((energy, forces[order]), subject.both(other)))
+    # terms are at most as large as their sum is where the crowd repels; rounding of float32 is allowed
+    total = np.abs(forces).sum()
+    scale = np.array([total * np.ptp(atoms.positions, axis=0).max() + abs(energy), total])
+    changed = (worst > np.maximum(1e-6 * scale, STEPS * np.array(walk.quantum))).any()
+    return (float(worst[0]), float(worst[1])) if changed else None
