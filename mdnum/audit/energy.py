@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 from ase import Atoms
+from ase.neighborlist import neighbor_list
 from jaxtyping import Float
 
 from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
-from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import SpeciesCutoffs
-from mdnum.trajectories.tracker import Tracker
 
 #: Å before and after a crossing at which the energy is asked for.
 _BESIDE = 1e-7
@@ -41,6 +38,8 @@ _MOST_STEPS, _CALLS = 40, 800
 #: Of kT: what a step leaves unexplained below this is not searched.
 _SMALL = 1e-6
 _BLOCKS = 8
+#: Lattice vectors to either side by which images are numbered.
+_BOXES = (128, 128, 128)
 
 Steps = Float[np.ndarray, "steps"]
 
@@ -84,7 +83,7 @@ class RunCrossing:
     """A pair that crossed a threshold between two steps.
 
     Attributes:
-        i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
+        i, j, rank: the pair, and how many of its images inside are nearer.
     """
 
     step: int  # after it; the step before is one less
@@ -106,68 +105,46 @@ class RunCrossing:
 
 def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
     """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
-    like = run.start
-    box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
-    species = like.get_chemical_symbols()
-    found = []
-    for level in _levels(thresholds, set(species)):
-        radii = {one.species: one.radius for one in level.values()}
-        tracker = Tracker(SpeciesCutoffs(radii), species=species)
-        for step, positions in enumerate(run.positions):
-            flips = tracker.step(Frame(step, float(step), positions, box))
-            # the flips of one pair one way, by place on the way: which image a rank means does not matter
-            taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
-            for row in range(len(flips)):
-                i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
-                pair = i, j, entered
-                threshold = level[frozenset((species[i], species[j]))]
-                if pair not in taken:
-                    before, after = (run.positions[n][j] - run.positions[n][i] for n in (step - 1, step))
-                    taken[pair] = _ways(before, after, entered, threshold, box)
-                share, slack = taken[pair].pop(0) if taken[pair] else (0.5, 1e-3)
+    species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
+    for threshold in (one for one in thresholds if set(one.species) <= species):
+        radius = threshold.radius
+        before = _members(run.at(run.positions[0]), threshold)
+        for step in range(1, len(run.positions)):
+            now = _members(run.at(run.positions[step]), threshold)
+            for code in np.setxor1d(now[0], before[0]):
+                i, j, *image = np.unravel_index(code, (len(run.start), len(run.start), *_BOXES))
+                entered = bool(np.isin(code, now[0]))
+                start, end = (
+                    run.positions[n][j] - run.positions[n][i] + (np.array(image) - _BOXES[0] // 2) @ cell
+                    for n in (step - 1, step)
+                )
+                length, distance = (float(np.linalg.norm(one)) for one in (end - start, end))
+                slack = np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3)
+                share = _root(start, end - start, radius**2)
+                codes, distances = now if entered else before
+                same = codes // np.prod(_BOXES) == code // np.prod(_BOXES)
+                rank = int(np.sum(same & (distances < distances[codes == code])))
                 found.append(
                     RunCrossing(
-                        step, i, j, int(flips.rank[row]), entered, threshold,
-                        float(flips.distance[row]), float(flips.margin[row]), share, slack,
+                        step, int(i), int(j), rank, entered, threshold, distance, radius - distance, share,
+                        float(slack),
                     )
                 )  # fmt: skip
+            before = now
     return sorted(found, key=lambda one: (one.step, one.share))
 
 
-def _levels(
-    thresholds: Sequence[PairThreshold], species: set[str]
-) -> list[dict[frozenset[str], PairThreshold]]:
-    """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
-    levels: list[dict[frozenset[str], PairThreshold]] = []
-    for one in thresholds:
-        key = frozenset(one.species)
-        if key <= species:
-            level = next((level for level in levels if key not in level), None)
-            if level is None:
-                levels.append(level := {})
-            level[key] = one
-    return levels
+def _members(atoms: Atoms, threshold: PairThreshold) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs inside, each once, as a number of both atoms and the image of the second; their distances."""
+    i, j, image, distances = neighbor_list("ijSd", atoms, {threshold.species: threshold.radius})
 
+    def numbers(one: np.ndarray, two: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+        places = (one, two, *(boxes + _BOXES[0] // 2).T)
+        return np.asarray(np.ravel_multi_index(places, (len(atoms), len(atoms), *_BOXES)))
 
-def _ways(
-    before: Float[np.ndarray, "3"],
-    after: Float[np.ndarray, "3"],
-    entered: bool,
-    threshold: PairThreshold,
-    box: Box,
-) -> list[tuple[float, float]]:
-    """Where on the way of a step images of a pair cross a threshold one way, and what to stay clear of there.
-
-    Ranks name images by their distance: which image a flip belongs to is not known, those that cross are.
-    """
-    end, way = _images(after, threshold.radius, box), after - before
-    start = end - way
-    square = threshold.radius**2
-    was, is_now = np.sum(start**2, axis=1) < square, np.sum(end**2, axis=1) < square
-    crossing = (is_now & ~was) if entered else (was & ~is_now)
-    length = float(np.linalg.norm(way))
-    slack = float(np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3))
-    return sorted((_root(one, way, square), slack) for one in start[crossing])
+    codes = numbers(i, j, image)
+    once = codes < numbers(j, i, -image)
+    return codes[once], distances[once]
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
@@ -180,19 +157,6 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
     q = -0.5 * (b + np.copysign(np.sqrt(inside), b))
     roots = [q / a, c / q if q else 0.0]
     return float(np.clip(min(roots, key=lambda one: abs(one - 0.5)), 0.0, 1.0))
-
-
-def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np.ndarray, "images 3"]:
-    """The periodic images of a vector that may be as long as a radius, and some more."""
-    if not box.periodic:
-        return vector[None]
-    rows = box.matrix[box.pbc]
-    shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
-    base = vector - shares @ rows
-    # distance between the planes of the cell: one over the length of a reciprocal vector
-    widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
-    reach = [range(-int(radius / width) - 2, int(radius / width) + 3) for width in widths]
-    return base + np.array(list(product(*reach)), np.float64) @ rows
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
