@@ -38,8 +38,8 @@ _MOST_STEPS, _CALLS = 40, 800
 #: Of kT: what a step leaves unexplained below this is not searched.
 _SMALL = 1e-6
 _BLOCKS = 8
-#: Lattice vectors to either side by which images are numbered.
-_BOXES = (128, 128, 128)
+#: Å by which a list of pairs reaches further than the threshold, so that it lasts for some steps.
+_SKIN = 1.0
 
 Steps = Float[np.ndarray, "steps"]
 
@@ -107,44 +107,33 @@ def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCross
     """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
     species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
     for threshold in (one for one in thresholds if set(one.species) <= species):
-        radius = threshold.radius
-        before = _members(run.at(run.positions[0]), threshold)
+        radius, skin, reference = threshold.radius, 0.0, run.positions[0]
         for step in range(1, len(run.positions)):
-            now = _members(run.at(run.positions[step]), threshold)
-            for code in np.setxor1d(now[0], before[0]):
-                i, j, *image = np.unravel_index(code, (len(run.start), len(run.start), *_BOXES))
-                entered = bool(np.isin(code, now[0]))
-                start, end = (
-                    run.positions[n][j] - run.positions[n][i] + (np.array(image) - _BOXES[0] // 2) @ cell
-                    for n in (step - 1, step)
-                )
-                length, distance = (float(np.linalg.norm(one)) for one in (end - start, end))
-                slack = np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3)
-                share = _root(start, end - start, radius**2)
-                codes, distances = now if entered else before
-                same = codes // np.prod(_BOXES) == code // np.prod(_BOXES)
-                rank = int(np.sum(same & (distances < distances[codes == code])))
+            before, after = run.positions[step - 1 : step + 1]
+            if step == 1 or 2 * _furthest(after - reference) > skin:
+                skin, reference = max(_SKIN, 3 * _furthest(after - before)), before
+                i, j, image = neighbor_list("ijS", run.at(before), {threshold.species: radius + skin})
+                once = (i < j) | ((i == j) & (image @ [1_000_000, 1000, 1] > 0))
+                i, j, shift = i[once], j[once], image[once] @ cell
+            start, end = (positions[j] - positions[i] + shift for positions in (before, after))
+            was, now = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
+            for k in np.flatnonzero((was < radius) != (now < radius)):
+                entered, way = bool(now[k] < radius), end[k] - start[k]
+                distances = now if entered else was
+                nearer = (i == i[k]) & (j == j[k]) & (distances < distances[k])
+                clear = max(_BESIDE, 3 * threshold.located) / max(float(np.linalg.norm(way)), 1e-300)
                 found.append(
                     RunCrossing(
-                        step, int(i), int(j), rank, entered, threshold, distance, radius - distance, share,
-                        float(slack),
+                        step, int(i[k]), int(j[k]), int(nearer.sum()), entered, threshold, float(now[k]),
+                        radius - float(now[k]), _root(start[k], way, radius**2),
+                        float(np.clip(clear, 1e-9, 1e-3)),
                     )
                 )  # fmt: skip
-            before = now
     return sorted(found, key=lambda one: (one.step, one.share))
 
 
-def _members(atoms: Atoms, threshold: PairThreshold) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs inside, each once, as a number of both atoms and the image of the second; their distances."""
-    i, j, image, distances = neighbor_list("ijSd", atoms, {threshold.species: threshold.radius})
-
-    def numbers(one: np.ndarray, two: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        places = (one, two, *(boxes + _BOXES[0] // 2).T)
-        return np.asarray(np.ravel_multi_index(places, (len(atoms), len(atoms), *_BOXES)))
-
-    codes = numbers(i, j, image)
-    once = codes < numbers(j, i, -image)
-    return codes[once], distances[once]
+def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
+    return float(np.linalg.norm(moved, axis=1).max())
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
