@@ -28,7 +28,7 @@ PRECIOUS = b"somebody's only copy"
 @pytest.fixture
 def killed(tmp_path) -> Path:
     folder = RunFolder.create(tmp_path / "killed")
-    folder.write_system("units = 'lj'\n")
+    atomic.write_text(folder.path / "system.toml", "units = 'lj'\n")
     folder.write_provenance({"versions": {}})
     write_run(folder, 0, 40)
     folder.close()
@@ -242,7 +242,7 @@ def test_a_kill_while_a_file_is_replaced_leaves_no_damage(finished, monkeypatch,
 
 def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, killed):
     started = RunFolder.create(tmp_path / "started")
-    started.write_system("units = 'lj'\n")
+    atomic.write_text(started.path / "system.toml", "units = 'lj'\n")
     (started.path / "cu.eam.alloy").write_text("a table that belongs to the system")
     started.write_provenance({})
     started.log("compile")

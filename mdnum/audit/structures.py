@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import CalculatorError, Skipped
 from mdnum.audit.curve import Curve
-from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, only_trying
+from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
 from mdnum.errors import InputError
 from mdnum.references.load import described
 
@@ -138,7 +138,7 @@ def _first_crystal(
     """The crystal of the first element that is answered for, two atoms of it first where they are asked."""
     for symbol in symbols:
         subject = about(Atoms(symbol, [(0, 0, 0)]))
-        with only_trying(subject):
+        with subject.trying():
             for pair in pairs(subject)[0][:1] if paired else [None]:
                 if (made := _crystal(subject, pair, symbol)) is not None:
                     return made
@@ -468,7 +468,7 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
         try:
-            with only_trying(subject):
+            with subject.trying():
                 curve(float(places[k]))
         except CalculatorError:
             break

@@ -300,10 +300,19 @@ class CalculatorSubject:
     def try_both(self, atoms: Atoms) -> Answered:
         """Energy and forces, or why there are none, where either is of interest; no structure is saved."""
         try:
-            with only_trying(self):
+            with self.trying():
                 return self.both(atoms)
         except CalculatorError as error:
             return error
+
+    @contextmanager
+    def trying(self) -> Iterator[None]:
+        """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
+        before, self.saving = self.saving, False
+        try:
+            yield
+        finally:
+            self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Asks this object a question that it has answered, of which `repeats` takes note.
@@ -442,16 +451,6 @@ class CalculatorSubject:
             self._saved += 1
         write_text(path, exact_extxyz(atoms))
         return path
-
-
-@contextmanager
-def only_trying(subject: CalculatorSubject) -> Iterator[None]:
-    """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
-    before, subject.saving = subject.saving, False
-    try:
-        yield
-    finally:
-        subject.saving = before
 
 
 def exact_extxyz(atoms: Atoms) -> str:

@@ -17,6 +17,11 @@ from mdnum.errors import InputError
 from mdnum.program import Program, Twin
 from mdnum.systems import BallSystem, System
 
+#: What has a dtype of its own, by world.
+ROLES = {
+    "md": ("state", "force", "decision", "accumulate"),
+    "ball": ("state", "arithmetic", "decision", "accumulate"),
+}
 #: Of a system file, tables that do not enter a step.
 _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
@@ -31,7 +36,7 @@ def program_of(system: System | BallSystem, steps: int | None = None) -> Program
         from mdnum.ball.program import BallProgram
         from mdnum.systems.build_ball import problem
 
-        return BallProgram(problem(system.spec, steps, where=system.name), system.name)
+        return BallProgram(problem(system.spec, steps, where=system.name))
     from mdnum.rollout.program import MdProgram
     from mdnum.systems.build import build
 

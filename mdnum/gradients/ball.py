@@ -20,9 +20,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from mdnum.ball.contacts import Projection
 from mdnum.ball.problem import BallLoss, BallProblem, loss_at
 from mdnum.ball.rollout import BallRun
+from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.problem import Gradient, Kind
 from mdnum.registry import Registry
@@ -258,7 +258,7 @@ class ThroughIterations(BallMethod):
     """The derivative of the operations that ran, iteration by iteration.
 
     Attributes:
-        loss_scale: the reverse pass starts with it instead of 1 (`mdnum.numerics.scaling`); a power of two.
+        loss_scale: the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two.
     """
 
     loss_scale: float = 1.0

@@ -13,10 +13,18 @@ import numpy as np
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float
 
-from mdnum.ball.contacts import Motion, Moved, Penalty, Projection
-from mdnum.ball.integrators import BallVerlet, EventLocated, Push
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import (
+    BallDecisions,
+    BallRecord,
+    BallState,
+    BallVerlet,
+    EventLocated,
+    Motion,
+    Moved,
+    Penalty,
+    Projection,
+)
 from mdnum.ball.stopping import FixedCount
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
@@ -240,10 +248,8 @@ class SoftImpact(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
 
-        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
-        made = motion.integrator.push(push, motion.y, motion.v, motion.carried, motion.rounding)
-        left = jnp.maximum(-made.y, 0)
-        return Moved(made.y, made.v, made.a, BallRecord(made.height, made.contact, left, made.solve))
+        made = motion.integrator.push(pull, motion)
+        return made._replace(record=made.record._replace(left=jnp.maximum(-made.y, 0)))
 
 
 @dataclass(frozen=True)

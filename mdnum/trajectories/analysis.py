@@ -8,7 +8,7 @@ those of one process to the last bit. What two parts found at the frame that bot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,17 +21,14 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.boxes import Boxes, formats_of
-from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame, check_frame, smallest_radius
+from mdnum.trajectories.frame import FrameError, UnreadableFrame, check_frame
 from mdnum.trajectories.ledger import FlipTable, Members
-from mdnum.trajectories.mdanalysis_source import frame_of, labels_of
+from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.resolution import Resolution, infer
-from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs
-from mdnum.trajectories.tails import left_over, refuse_cut_text
-from mdnum.trajectories.topology import READING_FAILS, first_line, table_of
-from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
+from mdnum.trajectories.topology import READING_FAILS, AtomTable, first_line, formats_of
+from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.trajectories.trajectory import SAMPLE
-from mdnum.trajectories.xtc import XtcFile, opened
 
 
 @dataclass(frozen=True)
@@ -75,15 +72,12 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """What one process found with one rule.
+    """What one process found with one rule, frames counted from the first that it examined."""
 
-    Attributes:
-        flips: of its frames that have any, frames counted from the first that it examined.
-        rows: (pairs, near, smallest margin) of each frame of its own.
-    """
-
-    flips: list[FlipTable] = field(default_factory=list)
-    rows: list[tuple[int, int, float]] = field(default_factory=list)
+    flips: list[FlipTable] = field(default_factory=list)  # of its frames that have any
+    rows: list[tuple[int, int, float]] = field(
+        default_factory=list
+    )  # (pairs, near, smallest margin) of its own
     before: Members | None = None  # the pairs inside at the frame before its first; None for the first part
     initial: Members | None = None  # the pairs inside at its first frame, kept by the first part alone
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
@@ -110,7 +104,7 @@ class _Guarded:
 
     def __iter__(self) -> Iterator[Any]:
         for number in self.numbers:
-            yield self.analysis.timestep(int(number))
+            yield self.analysis.library.timestep(int(number))
 
 
 class NeighborFlips(AnalysisBase):
@@ -159,7 +153,7 @@ class NeighborFlips(AnalysisBase):
         everything = isinstance(universe_or_atomgroup, Universe)
         group = _group_of(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
         super().__init__(group.universe.trajectory, verbose=verbose)
-        self._first = None if everything and other is None else _indices_of(group)
+        self._first = None if everything and other is None else np.unique(np.asarray(group.indices, np.int64))
         self._second = None
         if other is not None:
             second = _group_of(other, "other")
@@ -167,18 +161,16 @@ class NeighborFlips(AnalysisBase):
                 raise InputError(
                     "the two groups belong to two universes", remedy="Select both from one universe"
                 )
-            self._second = _indices_of(second)
+            self._second = np.unique(np.asarray(second.indices, np.int64))
         self.rules = _rules_of(r_cut, rule)
         self._radius = smallest_radius(self.rules)
         self._species = None
         if any(one.needs_species for one in self.rules):
-            self._species = [str(one) for one in table_of(group.universe.atoms).species]
+            self._species = [str(one) for one in AtomTable.of(group.universe.atoms).species]
             for one in self.rules:
-                if isinstance(one, SpeciesCutoffs):
-                    # a species that no atom has
-                    one.table(self._species)
-        groups = [one for one in (self._first, self._second) if one is not None]
-        self._seen = np.unique(np.concatenate(groups)) if groups else None
+                # refuses a species that no atom has
+                one.table(self._species)
+        self._seen = atoms_of((self._first, self._second))
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             raise InputError(
                 f"bound = {bound!r}; expected a length of 0 or more, Å",
@@ -190,11 +182,8 @@ class NeighborFlips(AnalysisBase):
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
-        self._boxes: Boxes | None = None
-        self._labels: Callable[[int], np.ndarray | None] | None = None
         self._names: np.ndarray | None = None
-        self._guard: XtcFile | None = None
-        self._opened = False
+        self._library: LibraryFrames | None = None
         self._done, self._reading = 0, True
         self._to_the_end = False
 
@@ -251,14 +240,14 @@ class NeighborFlips(AnalysisBase):
         sample = []
         for number in self._numbers[:SAMPLE]:
             try:
-                sample.append(self._frame(self.timestep(int(number))))
+                sample.append(self.library.frame(self.library.timestep(int(number)), int(number)))
             except READING_FAILS:
                 # met again in its turn, and told there
                 break
         if sample:
             self._resolution = infer(sample, 32, formats_of(self._trajectory)[0])
             self._pbc = sample[0].box.pbc
-        self._let_go()
+        self._library = None
         return groups
 
     def _prepare_sliced_trajectory(self, slicer: Any) -> None:
@@ -266,22 +255,13 @@ class NeighborFlips(AnalysisBase):
         if isinstance(slicer, np.ndarray):
             self._sliced_trajectory = _Guarded(self, slicer)
 
-    def timestep(self, number: int) -> Any:
-        """MDAnalysis's timestep of a frame, once it is known that reading it does not end the process."""
-        if not self._opened:
-            self._guard, self._boxes = opened(self._trajectory), Boxes(self._trajectory)
-            self._labels = labels_of(self._trajectory)
-            self._names = self._labels(0)
-            self._opened = True
-        if self._guard is not None:
-            self._guard.check(number)
-        refuse_cut_text(self._trajectory, number)
-        return self._trajectory[number]
-
-    def _let_go(self) -> None:
-        """Leaves files that were opened: an open file does not go to another process."""
-        self._guard, self._boxes, self._opened = None, None, False
-        self._labels = None
+    @property
+    def library(self) -> LibraryFrames:
+        """The frames as the library reads them, opened when they are asked for in this process."""
+        if self._library is None:
+            self._library = LibraryFrames(self._trajectory)
+            self._names = self._library.labels(0)
+        return self._library
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
@@ -299,9 +279,9 @@ class NeighborFlips(AnalysisBase):
             self._stopped(_Failure(number, f"frame {number} cannot be read ({first_line(error)})", True))
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.last = tracker.members() if part.rows else None
-        # what a process sends back is what it found, not what it needed for that
+        # what a process sends back is what it found, not what it needed for that; an open file cannot be sent
         self._trackers = []
-        self._let_go()
+        self._library = None
         # where one process computes several parts, each has to be an object of its own
         return copy(self)
 
@@ -319,7 +299,7 @@ class NeighborFlips(AnalysisBase):
         if self._at:
             # the frame before the first of this part
             self._done = -1
-            ts = self.timestep(int(self._numbers[self._at - 1]))
+            ts = self.library.timestep(int(self._numbers[self._at - 1]))
             self._reading = False
             self._examined(ts)
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
@@ -341,7 +321,7 @@ class NeighborFlips(AnalysisBase):
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
-        frame = self._frame(ts)
+        frame = self.library.frame(ts, int(ts.frame))
         check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
         bound = self._bound or 0.0
         if self._bound is None and self._resolution is not None:
@@ -353,10 +333,6 @@ class NeighborFlips(AnalysisBase):
             raise FrameError(
                 f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
             ) from error
-
-    def _frame(self, ts: Any) -> Frame:
-        assert self._boxes is not None and self._labels is not None
-        return frame_of(ts, int(ts.frame), self._boxes, labels=self._labels(int(ts.frame)))
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence
@@ -385,10 +361,8 @@ class NeighborFlips(AnalysisBase):
     def _behind_the_last(self) -> _Failure | None:
         """A frame behind the last one that the library has, which it leaves out."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
-        if rest is None:
-            return None
         count = int(self._trajectory.n_frames)
-        return _Failure(count, f"frame {count} cannot be read ({rest})", True)
+        return None if rest is None else _Failure(count, f"frame {count} cannot be read ({rest})", True)
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
@@ -414,15 +388,10 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
         done += len(part.rows)
         last = last if part.last is None else part.last
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
-    return RuleResult(
-        rule,
-        FlipTable.concatenate(flips) if flips else FlipTable.none(),
-        rows[:, 0].astype(np.int64),
-        rows[:, 1].astype(np.int64),
-        rows[:, 2],
-        (parts[0].initial if parts else None) or Members.none(),
-        last or Members.none(),
-    )
+    table = FlipTable.concatenate(flips) if flips else FlipTable.none()
+    initial = (parts[0].initial if parts else None) or Members.none()
+    pairs, near = rows[:, :2].T.astype(np.int64)
+    return RuleResult(rule, table, pairs, near, rows[:, 2], initial, last or Members.none())
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:
@@ -439,11 +408,6 @@ def _group_of(atoms: Any, name: str) -> AtomGroup:
     if len(atoms) == 0:
         raise InputError(f"the group {name} is empty", remedy="Check the selection")
     return atoms
-
-
-def _indices_of(group: AtomGroup) -> np.ndarray:
-    """Its atoms, ascending, each once."""
-    return np.unique(np.asarray(group.indices, np.int64))
 
 
 def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
@@ -468,18 +432,17 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
 
 
 def _cutoff(value: Any) -> Rule:
+    def length(one: Any) -> float:
+        if isinstance(one, str | bytes):
+            raise ValueError("words")
+        return float(one)
+
     try:
         if isinstance(value, Mapping):
-            return SpeciesCutoffs({pair: _length(one) for pair, one in value.items()})
-        return CutoffRule(_length(value))
+            return SpeciesCutoffs({pair: length(one) for pair, one in value.items()})
+        return CutoffRule(length(value))
     except (TypeError, ValueError):
         raise InputError(
             f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species",
             remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them',
         ) from None
-
-
-def _length(value: Any) -> float:
-    if isinstance(value, str | bytes):
-        raise ValueError("words")
-    return float(value)

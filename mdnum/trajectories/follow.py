@@ -1,39 +1,83 @@
-"""A trajectory read once: every frame checked, every flip handed on as it is found."""
+"""A trajectory read once, or two of the same atoms in step: frames checked, flips handed on as they come.
+
+Neighbor sets of two are compared once, at the first frame; from there the flips of either say what becomes of
+the difference, so that a frame costs what changed in it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.compare import displacements
-from mdnum.trajectories.frame import Frame, checked, leap, smallest_radius
+from mdnum.trajectories.frame import Box, Frame, checked, leap
 from mdnum.trajectories.history import crossings
+from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.resolution import Resolution
-from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
-from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
+from mdnum.trajectories.search import image_distances
+from mdnum.trajectories.tracker import Groups, Tracker, atoms_of
 from mdnum.trajectories.trajectory import Trajectory
 
-#: Indices of the atoms on either side of a pair; None for all.
-Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]
+Pair = tuple[int, int, int]
 #: Takes rows of a table: its name and equally long columns.
 Sink = Callable[[str, dict[str, Any]], None]
 
+#: Rows of the table of pairs that come to differ.
+ROWS = 1_000
+_FIRST = 8
 # frames at which the flux through the threshold is measured from velocities
 _FLUX_FRAMES = 12
 # displacement for that, as a share of the usual distance of neighbors: small beside the way to a turn
 _FLUX_MOVE = 2e-3
+# times that differ by less than this, relative, are the same
+_SAME_TIME = 1e-6
 
 
-def atoms_of(groups: Groups) -> Int[np.ndarray, "atoms"] | None:
-    """The atoms that are on any side; None for all."""
-    some = [one for one in groups if one is not None]
-    return np.unique(np.concatenate(some)) if some else None
+def _usable(
+    files: Sequence[Trajectory],
+    atoms: Int[np.ndarray, "atoms"] | None,
+    rules: Sequence[Rule],
+    step: Callable[..., Any],
+    found: Pass | Compared,
+) -> Iterator[tuple[list[Frame], Any]]:
+    """(the next frame of each file, what `step` makes of them) up to where one ends or cannot be used.
+
+    Every rule steps before anything is handed on: a frame that one of them refuses is not in the ledger of
+    another.
+
+    Raises:
+        InputError: the first frame cannot be read or used: there is nothing to keep.
+    """
+    radius = smallest_radius(rules)
+    streams = [checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits) for one in files]
+    while True:
+        try:
+            frames = [frame for one in streams if (frame := next(one, None)) is not None]
+            if len(frames) < len(files):
+                break
+            stepped = step(*frames)
+        except InputError as error:
+            if not found.frames:
+                raise
+            found.stopped = error
+            if not hasattr(error, "frame"):
+                # a rule that refuses a frame does not know its number
+                message = f"frame {found.frames} of those examined: {error.message}"
+                found.stopped = InputError(message, remedy=error.remedy, where=error.where)
+            return
+        yield frames, stepped
+    if not found.frames:
+        where = str(files[0].path) if len(files) == 1 else None
+        raise InputError("no frame is left of what was asked for", remedy="Ask for others", where=where)
+
+
+# ---- one trajectory
 
 
 class NeighborCounts:
@@ -122,36 +166,22 @@ def follow(
     """
     species = [str(one) for one in trajectory.species]
     found = Pass([Followed(rule, Tracker(rule, *groups, species)) for rule in rules])
-    atoms, last, start = atoms_of(groups), None, None
-    frames = checked(
-        trajectory.frames(), atoms, str(trajectory.path), radius=smallest_radius(rules), bits=trajectory.bits
-    )
+    atoms, start, last = atoms_of(groups), None, None
     # frames whose velocities are used: spread over the file, or ever fewer if its end is not known
     count, measured = trajectory.count, {0, *(2**n for n in range(_FLUX_FRAMES - 1))}
     if count is not None:
         measured = set(np.linspace(0, count - 1, min(_FLUX_FRAMES, count)).astype(int).tolist())
-    while True:
-        try:
-            frame = next(frames, None)
-            if frame is None:
-                break
-            bound = resolution.bound(frame)
-            # every rule first: a frame that one of them refuses is not in the ledger of another; a margin
-            # among the nearest is the difference of two distances
-            stepped = [one.tracker.step(frame, bound * (1 + one.rule.directed)) for one in found.rules]
-        except InputError as error:
-            if not found.frames:
-                raise
-            found.stopped = error
-            if not hasattr(error, "frame"):
-                # a rule that refuses a frame does not know its number
-                message = f"frame {found.frames} of those examined: {error.message}"
-                found.stopped = InputError(message, remedy=error.remedy, where=error.where)
-            yield found
-            return
-        if start is None:
+
+    def step(frame: Frame) -> list[FlipTable]:
+        bound = resolution.bound(frame)
+        # a margin among the nearest is the difference of two distances
+        return [one.tracker.step(frame, bound * (1 + one.rule.directed)) for one in found.rules]
+
+    for (frame,), stepped in _usable([trajectory], atoms, rules, step, found):
+        if found.frames == 0:
             start = frame
         elif found.frames == 1:
+            assert start is not None
             found.moved = _moved(start, frame)
         if last is not None and (far := leap(last, frame, atoms)) is not None:
             found.leaps.append((frame.index, *far))
@@ -162,10 +192,6 @@ def follow(
                 _measure_flux(one, frame, groups, species)
         found.frames += 1
         yield found
-    if not found.frames:
-        raise InputError(
-            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
-        )
 
 
 def _hand_on(
@@ -193,16 +219,11 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """(where pairs come and go, whether their order decides there).
-
-    The radius of a rule, the largest of several; of one that counts neighbors, how far the last of them is.
-    """
-    if isinstance(rule, CutoffRule):
-        return rule.radius, False
-    if isinstance(rule, SpeciesCutoffs):
-        return max(rule.radii.values()), False
+    """(where pairs come and go: a radius, or how far the last is; whether their order decides there)."""
+    if isinstance(rule, CutoffRule | SpeciesCutoffs):
+        return rule.reach, False
     if not len(members):
-        return (rule.radius if isinstance(rule, Capped) else float("nan")), False
+        return rule.shortest if np.isfinite(rule.shortest) else float("nan"), False
     _, begin, counts = np.unique(members.i, return_index=True, return_counts=True)
     full = counts == rule.most
     if 2 * np.count_nonzero(full) < len(counts):
@@ -235,3 +256,329 @@ def _moved(start: Frame, end: Frame) -> float:
     expected = float(np.sqrt(np.mean(start.velocities**2))) * (end.time - start.time)
     moved = float(np.sqrt(np.mean(displacements(start, end) ** 2)))
     return moved / expected if expected > 0 else float("nan")
+
+
+# ---- two trajectories
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far atoms are from where they are in another frame."""
+
+    furthest: float  # largest displacement, length
+    typical: float  # root mean square displacement, length
+    atom: int  # the one that is displaced furthest
+    # most lattice vectors of one kind between an atom and its nearest image: 0 where none was wrapped in one
+    # of the frames only
+    periods: int = 0
+
+
+def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
+    """From one frame to another, up to lattice vectors of the second's box.
+
+    The nearest image is found along reduced lattice vectors: for an atom that moved by less than half the
+    width of the box it is the nearest of all. Where the frames repeat along different axes, only those along
+    which both do have images.
+    """
+    return _displaced(start, end)[0]
+
+
+def _displaced(start: Frame, end: Frame) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+    """(displacements, whole lattice vectors taken off)."""
+    moved = end.positions - start.positions
+    shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
+    if not shared.periodic:
+        return moved, np.zeros_like(moved)
+    lattice = lattice_of(shared)
+    whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
+    return moved - whole @ lattice.vectors, whole
+
+
+def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
+    """Whether two boxes tile space in the same way, whichever lattice vectors they name.
+
+    A component of a lattice vector may be off by the tolerance, length.
+    """
+    if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
+        return False
+    rows = np.asarray(one.pbc, bool)
+    a, b = np.asarray(one.matrix, np.float64)[rows], np.asarray(other.matrix, np.float64)[rows]
+    if np.array_equal(a, b):
+        return True
+    # the vectors of one are whole combinations of the other's, and as many to a cell
+    whole = np.rint(np.linalg.lstsq(a.T, b.T, rcond=None)[0].T)
+    return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
+
+
+def separation(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Separation:
+    """The separation of two frames; only of these atoms, where they are given."""
+    moved, whole = _displaced(one, other)
+    if atoms is not None:
+        moved, whole = moved[atoms], whole[atoms]
+    square = np.sum(moved**2, axis=1)
+    at = int(np.argmax(square))
+    return Separation(
+        float(np.sqrt(square[at])),
+        float(np.sqrt(square.mean())),
+        at if atoms is None else int(atoms[at]),
+        int(np.abs(whole).max()),
+    )
+
+
+@dataclass
+class SetDifference:
+    """Pairs (i, j, rank) that are inside in one trajectory only, carried along by the flips of both."""
+
+    only_a: set[Pair] = field(default_factory=set)
+    only_b: set[Pair] = field(default_factory=set)
+    new: list[Pair] = field(default_factory=list)  # those that came to differ at the last frame
+
+    @classmethod
+    def of(cls, a: Members, b: Members) -> SetDifference:
+        """At the first frame."""
+        columns = [(one.i.tolist(), one.j.tolist(), one.rank.tolist()) for one in (a, b)]
+        first, second = (set(zip(*one, strict=True)) for one in columns)
+        both = first & second
+        found = cls(first - both, second - both)
+        found.new = sorted(found.only_a | found.only_b)
+        return found
+
+    def __len__(self) -> int:
+        return len(self.only_a) + len(self.only_b)
+
+    def step(self, a: FlipTable, b: FlipTable) -> None:
+        """After the flips of the next frame in either."""
+        differed: dict[Pair, bool] = {}
+        for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
+            columns = (flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.entered.tolist())
+            for *ids, entered in zip(*columns, strict=True):
+                pair: Pair = (ids[0], ids[1], ids[2])
+                differed.setdefault(pair, pair in mine or pair in others)
+                # entering ends a difference where the other has the pair inside, and begins one if not
+                here, there = (mine, others) if entered else (others, mine)
+                if pair in there:
+                    there.remove(pair)
+                else:
+                    here.add(pair)
+        now = (pair for pair, was in differed.items() if not was)
+        self.new = sorted(pair for pair in now if pair in self.only_a or pair in self.only_b)
+
+
+def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
+    """Distances of pairs in a frame, through the image that each names; inf where there is none, length."""
+    i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
+    at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
+    return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
+
+
+def growth(
+    time: Float[np.ndarray, "frames"], length: Float[np.ndarray, "frames"], limit: float
+) -> tuple[float, float, int] | None:
+    """Rate at which a separation grows, from a straight line through its logarithm.
+
+    Lengths of 0, and those above the limit, which are no small differences any more, are left out.
+
+    Returns:
+        (rate per time, r² of the line, frames used); None with fewer than five.
+    """
+    use = (length > 0) & (length < limit) & np.isfinite(length)
+    if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
+        return None
+    x, y = time[use], np.log(length[use])
+    slope, offset = np.polyfit(x, y, 1)
+    spread = float(np.sum((y - y.mean()) ** 2))
+    left = float(np.sum((y - slope * x - offset) ** 2))
+    return float(slope), 1.0 - left / spread if spread > 0 else 1.0, int(np.count_nonzero(use))
+
+
+@dataclass
+class ComparedSide:
+    """One of the two trajectories."""
+
+    trajectory: Trajectory
+    tracker: Tracker
+    resolution: Resolution
+    distance_bound: float = 0.0  # how far a distance can be off at the last frame, length
+    box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
+    bound: float = 0.0  # how far a margin can be off
+
+    def step(self, frame: Frame) -> FlipTable:
+        """The flips of the next frame."""
+        self.distance_bound = self.resolution.bound(frame)
+        self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
+        # a margin among the nearest is the difference of two distances
+        self.bound = self.distance_bound * (1 + self.tracker.rule.directed)
+        return self.tracker.step(frame, bound=self.bound)
+
+    def position_bound(self, periods: int) -> float:
+        """How far one atom, seen through so many periods of the box, can be off at the last frame, length."""
+        # a distance has two atoms that are off
+        return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
+
+
+def differing_rows(
+    pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
+) -> dict[str, np.ndarray]:
+    """Columns on pairs that differ: where each is inside, and by how much.
+
+    A pair is ambiguous where its distance in either file is so close to the threshold that the positions may
+    have been on its other side before they were written.
+    """
+    rule = sides[0].tracker.rule
+    i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
+    in_a = np.array([pair in difference.only_a for pair in pairs], bool)
+    lengths = [distances(frame, pairs, rule.directed) for frame in frames]
+    margins = [
+        _thresholds(i, j, inside, rule, side) - distance
+        for inside, side, distance in zip((in_a, ~in_a), sides, lengths, strict=True)
+    ]
+    # what has no threshold is not known to be away from it
+    clear = [np.abs(margin) > side.bound for margin, side in zip(margins, sides, strict=True)]
+    return {
+        "i": i, "j": j, "rank": rank,
+        "inside": np.where(in_a, "A", "B").astype(object),
+        "distance_a": lengths[0], "distance_b": lengths[1], "margin_a": margins[0], "margin_b": margins[1],
+        "bound": np.full(len(pairs), max(side.bound for side in sides)), "ambiguous": ~(clear[0] & clear[1]),
+    }  # fmt: skip
+
+
+def _thresholds(
+    i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
+) -> Float[np.ndarray, "pairs"]:
+    """Distance under which each pair is inside, length; that of a neighbor where it is one."""
+    if isinstance(rule, CutoffRule):
+        return np.full(len(i), rule.radius)
+    if isinstance(rule, SpeciesCutoffs):
+        species = side.trajectory.species.astype(str)
+        names = list(zip(species[i].tolist(), species[j].tolist(), strict=True))
+        return np.array([rule.radii.get((a, b), rule.radii.get((b, a), np.nan)) for a, b in names], float)
+    stays, enters = side.tracker.thresholds()
+    return np.where(inside, stays[i], enters[i])
+
+
+@dataclass
+class NeighborSets:
+    """The neighbor sets of one rule in the two trajectories."""
+
+    rule: Rule
+    sides: list[ComparedSide]
+    difference: SetDifference = field(default_factory=SetDifference)
+    first: dict[str, Any] | None = None  # what was seen at the first frame whose sets differ
+    certain: int | None = None  # first frame at which a pair differs that no resolution could have moved
+    first_pairs: list[dict[str, Any]] = field(default_factory=list)  # some of the pairs that differ there
+    rows: int = 0  # pairs written to the table of those that come to differ
+
+
+@dataclass
+class Compared:
+    """What the frames showed.
+
+    Attributes:
+        beyond: first frame at which an atom is further apart than the resolution of the two files explains.
+        last: the separation at the last frame.
+    """
+
+    frames: int = 0
+    seed: int | None = None  # first frame whose positions differ at all
+    beyond: int | None = None
+    other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
+    times_differ: int = 0
+    last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))
+    stopped: InputError | None = None
+
+
+def follow_both(sets: list[NeighborSets], atoms: np.ndarray | None, sink: Sink) -> Iterator[Compared]:
+    """Reads both once, in step, yielding the same `Compared` after each frame.
+
+    Args:
+        sets: of every rule.
+        atoms: those that matter; None for all.
+        sink: takes rows of "apart" and "differing": name of the table, and columns.
+    """
+    found, sides = Compared(), sets[0].sides
+
+    def step(*frames: Frame) -> list[list[FlipTable]]:
+        return [[side.step(frame) for side, frame in zip(one.sides, frames, strict=True)] for one in sets]
+
+    files, rules = [side.trajectory for side in sides], [one.rule for one in sets]
+    for (a, b), flips in _usable(files, atoms, rules, step, found):
+        at, before, now = found.frames, found.last, separation(a, b, atoms)
+        if found.seed is None and now.furthest > 0:
+            found.seed = at
+        allowed = sum(side.position_bound(now.periods) for side in sides)
+        if found.beyond is None and now.furthest > allowed:
+            found.beyond = at
+        # formats that round positions may round the box as much
+        tolerance = sum(side.distance_bound for side in sides)
+        if found.other_box is None and not same_lattice(a.box, b.box, tolerance):
+            axes = bool((a.box.pbc != b.box.pbc).any())
+            found.other_box = {"frame": at, "axes": axes, "a": a.box.plain(), "b": b.box.plain()}
+        found.times_differ += int(abs(a.time - b.time) > _SAME_TIME * max(abs(a.time), abs(b.time)))
+        for place, (one, new) in enumerate(zip(sets, flips, strict=True)):
+            if at:
+                one.difference.step(*new)
+            else:
+                one.difference = SetDifference.of(*(side.tracker.members() for side in one.sides))
+            _sets_at(sink, place, one, at, (a, b), now, before)
+        # pairs are those of the first rule
+        only, tracked = sets[0].difference, [side.tracker.pairs for side in sides]
+        row = {
+            "frame": at, "number_a": a.index, "number_b": b.index, "time": a.time, "time_b": b.time,
+            "furthest": now.furthest, "bound": allowed, "typical": now.typical, "atom": now.atom,
+            "pairs_a": tracked[0], "pairs_b": tracked[1],
+            "only_a": len(only.only_a), "only_b": len(only.only_b),
+        }  # fmt: skip
+        sink("apart", {name: [value] for name, value in row.items()})
+        found.last = now
+        found.frames += 1
+        yield found
+
+
+def _sets_at(
+    sink: Sink,
+    number: int,
+    one: NeighborSets,
+    at: int,
+    frames: tuple[Frame, Frame],
+    now: Separation,
+    before: Separation,
+) -> None:
+    """What one rule's sets show at a frame, and the pairs that are new among those that differ."""
+    difference, first = one.difference, False
+    if one.certain is None and len(difference):
+        # all that differ: one that came to differ within the resolution may be beyond it by now
+        differing = sorted(difference.only_a | difference.only_b)
+        standing = differing_rows(differing, difference, one.sides, frames)
+        undecided, first = int(np.count_nonzero(standing["ambiguous"])), one.first is None
+        if first:
+            one.first = {
+                "frame": at, "number": frames[0].index, "time": frames[0].time, "pairs": len(difference),
+                "furthest": now.furthest, "typical": now.typical,
+                "furthest_before": before.furthest if at else None,
+                "typical_before": before.typical if at else None, "ambiguous": undecided,
+            }  # fmt: skip
+        if undecided < len(difference):
+            one.certain = at
+    if new := difference.new[: ROWS - one.rows]:
+        rows = differing_rows(new, difference, one.sides, frames)
+        told = {"rule": np.full(len(new), number), "frame": np.full(len(new), at), **rows}
+        sink("differing", told)
+        one.rows += len(new)
+        if first:
+            kept = range(min(len(new), _FIRST))
+            one.first_pairs = [{name: values[k] for name, values in told.items()} for k in kept]
+
+
+def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Rates at which the separation grows before the sets differ, and from then on."""
+    limit = 0.1 * (
+        one.rule.radius if isinstance(one.rule, CutoffRule) else float(table["furthest"].max(initial=0.0))
+    )
+    cut = frames if one.first is None else one.first["frame"]
+    # up to its bound a separation may be made of rounding
+    length = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
+    parts = {}
+    for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
+        line = growth(table["time"][part], length[part], limit)
+        parts[name] = None if line is None else dict(zip(("rate", "r2", "frames"), line, strict=True))
+    return parts

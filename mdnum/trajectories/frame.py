@@ -7,14 +7,14 @@ every other pair of that frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
 
 # Sizes of the system from its middle at which nothing is any more: unwrapped coordinates of a liquid get
 # some thousand boxes far in a second; what flies off into empty space gets further.
@@ -41,6 +41,10 @@ class Box:
         """Whether any direction repeats."""
         return bool(self.pbc.any())
 
+    def plain(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"matrix": np.asarray(self.matrix, float).tolist(), "pbc": np.asarray(self.pbc, bool).tolist()}
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -64,32 +68,20 @@ class Frame:
 
 
 class FrameError(InputError):
-    """A frame was read and holds what cannot be right.
-
-    Args:
-        frame: its number in the file, from 0.
-    """
+    """A frame holds what cannot be right; it has this number in its file, from 0."""
 
     def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
         self.frame = frame
 
 
-class UnreadableFrame(InputError):
-    """A frame in the middle of a file cannot be read; those before it were given out.
-
-    Args:
-        frame: its number in the file, from 0.
-    """
+class UnreadableFrame(FrameError):
+    """A frame in the middle of a file cannot be read; those before it were given out."""
 
     def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
-        otherwise = (
-            f"The frames before it were read; to stop there add @:{frame} to the path"
-            if frame
-            else "Check that the file is whole and of the kind its name says"
-        )
-        super().__init__(message, remedy=remedy or otherwise, where=where)
-        self.frame = frame
+        before = f"The frames before it were read; to stop there add @:{frame} to the path"
+        remedy = remedy or (before if frame else "Check that the file is whole and of the kind its name says")
+        super().__init__(message, frame=frame, remedy=remedy, where=where)
 
 
 def checked(
@@ -100,21 +92,7 @@ def checked(
     radius: float = np.inf,
     bits: int = 64,
 ) -> Iterator[Frame]:
-    """The frames, each checked before it is given on.
-
-    Args:
-        frames: of a trajectory.
-        atoms: the atoms that matter, ascending; None for all.
-        where: the file, for messages.
-        radius: the shortest length that distances are compared with.
-        bits: width of a coordinate as it was read.
-
-    Raises:
-        FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
-            distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
-            axes than in the first frame (most often: there is none), or along one without a vector, or an
-            atom is labeled as another one than in the first frame.
-    """
+    """The frames, each checked before it is given on; arguments and errors as of `check_frame`."""
     pbc = labels = None
     for frame in frames:
         pbc = frame.box.pbc if pbc is None else pbc
@@ -133,13 +111,27 @@ def check_frame(
     radius: float = np.inf,
     bits: int = 64,
 ) -> None:
-    """As `checked`, for one frame; pbc and labels are those of the first, None for any."""
+    """Refuses a frame that no simulation writes.
+
+    Args:
+        atoms: those that matter, ascending; None for all.
+        pbc, labels: of the first frame; None for any.
+        where: the file, for messages.
+        radius: the shortest length that distances are compared with.
+        bits: width of a coordinate as it was read.
+
+    Raises:
+        FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
+            distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
+            axes than in the first frame (most often: there is none), or along one without a vector, or an
+            atom is labeled as another one than in the first frame.
+    """
 
     def refused(message: str, remedy: str) -> FrameError:
         return FrameError(f"frame {frame.index}{message}", frame=frame.index, remedy=remedy, where=where)
 
     def place(atom: int) -> str:
-        return f"({', '.join(f'{value:g}' for value in frame.positions[atom])})"
+        return f"atom {atom} is at ({', '.join(f'{value:g}' for value in frame.positions[atom])})"
 
     failed = (
         f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
@@ -173,21 +165,20 @@ def check_frame(
     with np.errstate(over="ignore", invalid="ignore"):
         total = x.sum()
     if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
-        first = _named(int(bad[0]), atoms)
-        raise refused(f": atom {first} is at {place(first)}{_and_others(bad.size)}", failed)
+        raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
     if (found := far_out(frame, atoms, radius, bits)) is not None:
         atom, many, why = found
         raise refused(
-            f": atom {atom} is at {place(atom)}, {why}{_and_others(many)}",
+            f": {place(atom)}, {why}{_and_others(many)}",
             f"{failed}; an atom that did fly off is left out with --between",
         )
     # one atom may well be at the origin; two cannot be at one place
     zero = np.flatnonzero(~x.any(axis=1))
     if zero.size > 1:
-        some = f"atom {_named(int(zero[0]), atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
+        some = f"atom {_named(zero[0], atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
+        some = "all coordinates are 0" if zero.size == len(x) else some
         raise refused(
-            f": {'all coordinates are 0' if zero.size == len(x) else some}, as where coordinates were never "
-            "written",
+            f": {some}, as where coordinates were never written",
             "Leave the frame out with @START:STOP, or the atoms with --between",
         )
 
@@ -206,21 +197,10 @@ def _and_others(count: int) -> str:
 # ---- further out, or further from one frame to the next, than any simulation takes an atom
 
 
-def smallest_radius(rules: Sequence[Rule]) -> float:
-    """The shortest length that any of the rules compares distances with; infinite where none does."""
-    radii = [np.inf]
-    for rule in rules:
-        if isinstance(rule, SpeciesCutoffs):
-            radii.extend(rule.radii.values())
-        elif isinstance(rule, CutoffRule | Capped):
-            radii.append(rule.radius)
-    return float(min(radii))
-
-
 def far_out(
     frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, radius: float = np.inf, bits: int = 64
 ) -> tuple[int, int, str] | None:
-    """The atom that is furthest out, where that is further than can be; arguments as of `checked`.
+    """The atom that is furthest out, where that is further than can be; arguments as of `check_frame`.
 
     Returns:
         (the atom, how many are too far out, why in words); None where none is.
@@ -238,12 +218,12 @@ def far_out(
     size = max(box, float(np.median(away)))
     limit = (_FAR_BOXES if box else _FAR_SIZES) * size
     if size and away.max() > limit:
-        at, what = int(np.argmax(away)), "the box" if box >= size else "all the rest"
+        at, what = np.argmax(away), "the box" if box >= size else "all the rest"
         why = f"{float(away[at]) / size:.2g} times the size of {what} away from the others"
         return _named(at, atoms), int(np.count_nonzero(away > limit)), why
     if unit * top > radius:
         why = f"so far out that float{bits} tells distances no better than to {unit * top:.2g}"
-        return _named(int(np.argmax(largest)), atoms), int(np.count_nonzero(unit * largest > radius)), why
+        return _named(np.argmax(largest), atoms), int(np.count_nonzero(unit * largest > radius)), why
     return None
 
 
@@ -265,7 +245,7 @@ def leap(
     # all of them may be shifted together
     distance = np.abs(moved - np.median(moved, axis=0)).max(axis=1)
     size = max(box, float(np.median(np.abs(x - np.median(x, axis=0)).max(axis=1))))
-    at = int(np.argmax(distance))
+    at = np.argmax(distance)
     if not size or distance[at] <= (_LEAP_BOXES if box else _LEAP_SIZES) * size:
         return None
     return _named(at, atoms), float(distance[at])
@@ -278,5 +258,6 @@ def _box(frame: Frame) -> float:
     return float(np.linalg.norm(frame.box.matrix, axis=1).max())
 
 
-def _named(at: int, atoms: Int[np.ndarray, "chosen"] | None) -> int:
-    return at if atoms is None else int(atoms[at])
+def _named(at: Any, atoms: Int[np.ndarray, "chosen"] | None) -> int:
+    """Number in the file of the atom at this place among those that matter."""
+    return int(at if atoms is None else atoms[at])

@@ -100,20 +100,6 @@ class Thresholds(NamedTuple):
     old_first_out: Float[np.ndarray, "old_limits"]
 
 
-class _Columns(NamedTuple):
-    """Those of `FlipTable` that differ from row to row."""
-
-    i: np.ndarray
-    j: np.ndarray
-    rank: np.ndarray
-    entered: np.ndarray
-    distance: np.ndarray
-    before: np.ndarray
-    margin: np.ndarray
-    margin_before: np.ndarray
-    ambiguous: np.ndarray
-
-
 class LedgerRows:
     """Makes the rows of frame after frame; labels are the numbers in the file of the atoms that take part."""
 
@@ -138,10 +124,8 @@ class LedgerRows:
         shift = max(int(self.atoms).bit_length() - max(count // _PART, 1).bit_length(), 0)
         start = np.zeros((max(self.atoms, 1) - 1 >> shift) + 2, np.int64)
         _parted(changed, *distances, self.labels, ranks, shift, start, self._rows, thresholds)
-        kinds = (np.int64,) * 3 + (np.bool_,) + (np.float64,) * 4 + (np.bool_,)
-        made = _Columns(*(np.empty(count, kind) for kind in kinds))
-        _sorted(start, shift, self._rows, ranks, bound, made)
-        return FlipTable(frame=np.full(count, frame), bound=np.full(count, bound), **made._asdict())
+        *columns, ambiguous = _sorted(start, shift, self._rows, ranks, bound, count)
+        return FlipTable(np.full(count, frame), *columns, np.full(count, bound), ambiguous)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -177,8 +161,12 @@ def _parted(changed, distance, before, labels, ranks, shift, start, rows, of):
 
 
 @numba.njit(cache=True, nogil=True)
-def _sorted(start, shift, rows, ranks, bound, made):
+def _sorted(start, shift, rows, ranks, bound, count):
     """The columns, in order: in each part a counting sort by the first atom, and then each atom's few."""
+    i, j, rank = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
+    distance, before = np.empty(count), np.empty(count)
+    margin, margin_before = np.empty(count), np.empty(count)
+    entered, ambiguous = np.empty(count, np.bool_), np.empty(count, np.bool_)
     cursor = np.empty((1 << shift) + 1, np.int64)
     most = 0
     for part in range(start.shape[0] - 1):
@@ -216,10 +204,15 @@ def _sorted(start, shift, rows, ranks, bound, made):
         for m in range(high - low):
             k, at = order[m], low + m
             key = np.int64(rows[k, 1])
-            made.i[at], made.j[at], made.rank[at] = np.int64(rows[k, 0]), key, 0
+            i[at], j[at], rank[at] = np.int64(rows[k, 0]), key, 0
             if ranks > 1:
-                made.j[at], made.rank[at] = key // ranks, key % ranks
-            made.distance[at], made.before[at] = rows[k, 2], rows[k, 3]
-            made.margin[at], made.margin_before[at] = rows[k, 4], rows[k, 5]
-            made.entered[at] = rows[k, 6] != 0.0
-            made.ambiguous[at] = abs(rows[k, 4]) <= bound or abs(rows[k, 5]) <= bound
+                j[at], rank[at] = key // ranks, key % ranks
+            distance[at], before[at], margin[at], margin_before[at] = (
+                rows[k, 2],
+                rows[k, 3],
+                rows[k, 4],
+                rows[k, 5],
+            )
+            entered[at] = rows[k, 6] != 0.0
+            ambiguous[at] = abs(rows[k, 4]) <= bound or abs(rows[k, 5]) <= bound
+    return i, j, rank, entered, distance, before, margin, margin_before, ambiguous

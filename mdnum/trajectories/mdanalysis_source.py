@@ -1,7 +1,15 @@
-"""Trajectories that MDAnalysis reads."""
+"""Trajectories that MDAnalysis reads, and what stands behind the last frame that it reads.
+
+A run that was killed, a copy that was cut and a frame whose head is damaged all look like the end of the file
+to MDAnalysis's readers of dcd, trr and some text formats, which leave the rest out without a word. A number
+cut in the middle is read as another one.
+"""
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import struct
 import warnings
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -11,24 +19,86 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.trajectories.boxes import Boxes, box_of, formats_of
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.binary import head_of, opened
+from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.rules import CutoffRule
-from mdnum.trajectories.tails import left_over, refuse_cut_text
+from mdnum.trajectories.text import refuse_cut_line
 from mdnum.trajectories.topology import (
     NARROWED,
     READING_FAILS,
-    notes_on,
+    AtomTable,
+    Boxes,
+    box_of,
+    file_of,
+    formats_of,
     opened_by_mdanalysis,
-    table_of,
     topology_universe,
-    with_elements,
 )
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
 
 # a distance that bonded atoms have, and others do not come to, Å
 _CLOSE = 1.4
+# of trr: magic, length of the word with its end, length of the word, the word; then thirteen numbers
+_TRR = struct.Struct(">3i12s13i")
+_TRR_MAGIC = 1993
+# readers of text by lines, and where each has its open file
+_LINES = {"XYZ": "xyzfile", "TXYZ": "xyzfile", "ARC": "xyzfile", "TRJ": "trjfile", "MDCRD": "trjfile"}
+# where readers keep the places at which frames begin
+_BEGINS = {"XYZ": "_offsets", "PDB": "_start_offsets", "ENT": "_start_offsets"}
+# enough of a file's end for some lines
+_LAST_BYTES = 20_000
+_COMPRESSED: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
+_PART = 1 << 22
+
+
+class LibraryFrames:
+    """Frames of one of MDAnalysis's readers, each looked at before the library reads it."""
+
+    def __init__(self, trajectory: Any):
+        self.trajectory = trajectory
+        self.boxes, self.labels = Boxes(trajectory), labels_of(trajectory)
+        self._guard = opened(trajectory)
+
+    def timestep(self, number: int, forward: bool = False) -> Any:
+        """MDAnalysis's timestep of a frame, which may be the one after that at which the reader stands.
+
+        Raises:
+            ValueError: reading it would end the process, or its last number was cut.
+        """
+        if self._guard is not None:
+            self._guard.check(number)
+        self._refuse_cut_text(number)
+        return self.trajectory.next() if forward else self.trajectory[number]
+
+    def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
+        """A frame from a timestep, copied."""
+        return Frame(
+            index=number,
+            time=float(number) if untimed else float(ts.time),
+            positions=np.array(ts.positions, np.float64),
+            box=self.boxes.box(ts, number),
+            velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
+            labels=self.labels(number),
+        )
+
+    def _refuse_cut_text(self, number: int) -> None:
+        """Refuses the last frame of text whose last number was cut; no other can be."""
+        trajectory = self.trajectory
+        if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
+            return
+        path, word = found
+        end, size = _last_bytes(path)
+        offsets = getattr(trajectory, "_offsets", ())
+        if len(offsets) > number + 1 and offsets[number + 1] < size:
+            # what was cut are lines behind this frame, too few for another: left_over tells of them
+            return
+        last = end.decode("latin-1").splitlines(keepends=True)
+        if word == "XYZ":
+            refuse_cut_line(last[-int(trajectory.n_atoms) :])
+        elif word in ("TRJ", "MDCRD") and last:
+            # a line of it holds several numbers
+            refuse_cut_line(last[-1:], last[-1].split()[:-1])
 
 
 class MDAnalysisTrajectory(Trajectory):
@@ -39,33 +109,52 @@ class MDAnalysisTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
-        self._universe, said = open_universe(path, topology, format)
-        self.table = table_of(self._universe.atoms)
-        with_elements(self._universe, self.table)
+        self._universe, said = self._opened(format)
+        self.table = AtomTable.of(self._universe.atoms)
+        self.table.give_elements(self._universe)
         trajectory = self._universe.trajectory
         self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
         self.length = _length_of(trajectory)
         self.time = "frame" if _has_no_times(trajectory, said) else "ps"
         boxes = Boxes(trajectory)
-        self.notes = (NARROWED, *notes_on(self.table), *boxes.notes, *differing_box(trajectory, boxes))
+        self.notes = (NARROWED, *self.table.notes, *boxes.notes, *differing_box(trajectory, boxes))
 
     @property
     def universe(self) -> Any:
         return self._universe
 
+    def _opened(self, format: str | None) -> tuple[Any, list[str]]:
+        """A Universe of the trajectory, and the warnings that opening it gave."""
+        import MDAnalysis
+
+        path = self.path
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            if self.topology is None:
+                universe = opened_by_mdanalysis(
+                    path, lambda: MDAnalysis.Universe(str(path), format=format), path
+                )
+            else:
+                universe = topology_universe(self.topology)
+                atoms = len(universe.atoms)
+                other = atoms_in(path, atoms, format)
+                self._belongs(atoms, atoms if other is None else other)
+                opened_by_mdanalysis(path, lambda: _loaded(universe, path, format), path)
+            # a topology without coordinates has no trajectory at all
+            if not opened_by_mdanalysis(path, lambda: len(getattr(universe, "trajectory", ())), path):
+                raise self._empty()
+        return universe, [str(one.message) for one in caught]
+
     def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Frame]]:
         trajectory = self._universe.trajectory
-        boxes, labels = Boxes(trajectory), labels_of(trajectory)
-        at = None
+        frames, at = LibraryFrames(trajectory), None
         for number in numbers:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
-                    refuse_cut_text(trajectory, number)
                     # some formats go forward only, so that the next frame is asked for as the next
-                    step = at is not None and number == at + 1 and trajectory.ts.frame == at
-                    ts = trajectory.next() if step else trajectory[number]
-                    frame = frame_of(ts, number, boxes, self.time == "frame", labels(number))
+                    forward = at is not None and number == at + 1 and trajectory.ts.frame == at
+                    frame = frames.frame(frames.timestep(number, forward), number, self.time == "frame")
                 except READING_FAILS as error:
                     raise self._unreadable(number, error) from error
             at = number
@@ -83,15 +172,13 @@ class MDAnalysisTrajectory(Trajectory):
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
     """What the file says its atoms are in each frame: MDAnalysis reads that of the first alone.
 
-    Args:
-        trajectory: MDAnalysis's reader. Others than those of XYZ files and of PDB models give None.
+    Others of MDAnalysis's readers than those of XYZ files and of PDB models give None.
     """
     from MDAnalysis.lib.util import anyopen
 
-    begins = {"XYZ": "_offsets", "PDB": "_start_offsets", "ENT": "_start_offsets"}
-    word = next((word for word in formats_of(trajectory) if word in begins), None)
-    # where each frame begins; another release of MDAnalysis may keep it elsewhere
-    offsets = None if word is None or trajectory.n_frames < 2 else getattr(trajectory, begins[word], None)
+    word = next((word for word in formats_of(trajectory) if word in _BEGINS), None)
+    # another release of MDAnalysis may keep it elsewhere
+    offsets = None if word is None or trajectory.n_frames < 2 else getattr(trajectory, _BEGINS[word], None)
     if offsets is None:
         return lambda number: None
     file: Any = anyopen(str(trajectory.filename))
@@ -112,50 +199,6 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
     return of
 
 
-def frame_of(
-    ts: Any, number: int, boxes: Boxes, untimed: bool = False, labels: np.ndarray | None = None
-) -> Frame:
-    """A frame from an MDAnalysis timestep, copied."""
-    return Frame(
-        index=number,
-        time=float(number) if untimed else float(ts.time),
-        positions=np.array(ts.positions, np.float64),
-        box=boxes.box(ts, number),
-        velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
-        labels=labels,
-    )
-
-
-def open_universe(
-    path: Path, topology: str | Path | None, format: str | None = None
-) -> tuple[Any, list[str]]:
-    """A Universe of a trajectory, and the warnings that opening it gave.
-
-    Raises:
-        InputError: nobody reads it, or it has another number of atoms than its topology.
-    """
-    import MDAnalysis
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        if topology is None:
-            universe = opened_by_mdanalysis(path, lambda: MDAnalysis.Universe(str(path), format=format), path)
-        else:
-            universe = topology_universe(topology)
-            atoms = len(universe.atoms)
-            if (other := atoms_in(path, atoms, format)) not in (None, atoms):
-                raise InputError(
-                    f"the topology {Path(topology).name} has {atoms:,} atoms and the trajectory {other:,}",
-                    remedy="Give the topology that the trajectory was written with, or a selection of it",
-                    where=str(path),
-                )
-            opened_by_mdanalysis(path, lambda: _loaded(universe, path, format), path)
-        # a topology without coordinates has no trajectory at all
-        if not opened_by_mdanalysis(path, lambda: len(getattr(universe, "trajectory", ())), path):
-            raise InputError("the file holds no frame", remedy="Check how it was written", where=str(path))
-    return universe, [str(one.message) for one in caught]
-
-
 def _loaded(universe: Any, path: Path, format: str | None) -> None:
     try:
         universe.load_new(str(path), format=format)
@@ -167,11 +210,7 @@ def _loaded(universe: Any, path: Path, format: str | None) -> None:
 
 
 def atoms_in(path: Path, topology: int, format: str | None = None) -> int | None:
-    """Atoms in a trajectory; None where its format does not tell.
-
-    Args:
-        topology: atoms of its topology, which some readers want to know first.
-    """
+    """Atoms in a trajectory; None where its format does not tell. Some readers want those of its topology."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({"n_atoms": topology}, {}):
@@ -218,7 +257,11 @@ def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
             # float32, and angles from cosines
             if not apart > 1e-4 * float(np.abs(ours.matrix).max()):
                 continue
-            counts = [_close_pairs(ts, box) for box in (theirs, ours)]
+            counts = []
+            for box in (theirs, ours):
+                tracker = Tracker(CutoffRule(_CLOSE))
+                tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
+                counts.append(len(tracker.members()))
         except (*READING_FAILS, InputError):
             # a frame that cannot be used is told in its turn
             continue
@@ -238,7 +281,103 @@ def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
         yield said
 
 
-def _close_pairs(ts: Any, box: Box) -> int:
-    tracker = Tracker(CutoffRule(_CLOSE))
-    tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
-    return len(tracker.members())
+# ---- behind the last frame
+
+
+def left_over(trajectory: Any) -> str | None:
+    """What is left behind the last frame of one of MDAnalysis's readers, in words; None where nothing is.
+
+    One that reads text by lines is moved to its last frame.
+    """
+    path = file_of(trajectory)
+    if path is None or not path.is_file():
+        return None
+    words = formats_of(trajectory)
+    if "DCD" in words:
+        rest, frame = _behind_dcd(path, int(trajectory.n_frames))
+    elif "TRR" in words:
+        rest, frame = _behind_trr(path, trajectory)
+    elif "NCDF" in words:
+        # a run that was killed has not always come to saying in the head what it wrote
+        head = head_of(path)
+        rest, frame = (head.rest, head.record) if head is not None else (0, 0)
+    elif found := _text(trajectory):
+        if trajectory.ts.frame != trajectory.n_frames - 1:
+            trajectory[trajectory.n_frames - 1]
+        return _behind_text(getattr(trajectory, _LINES[found[1]], None))
+    else:
+        return None
+    if rest <= 0:
+        return None
+    if rest < frame:
+        return f"the file ends after {rest:,} bytes of it"
+    if "NCDF" in words:
+        return f"the file goes on for {rest // frame:,} frames more than its head tells of"
+    return f"the {rest:,} bytes behind the frame before are no frame"
+
+
+def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
+    """Bytes behind the last frame, and those of a frame."""
+    from MDAnalysis.lib.formats.libdcd import DCDFile
+
+    with DCDFile(str(path)) as file:
+        sizes = [getattr(file, name, None) for name in ("_header_size", "_firstframesize", "_framesize")]
+    if None in sizes:
+        # another release of MDAnalysis keeps them elsewhere
+        return 0, 0
+    head, first, other = (int(one) for one in sizes if one is not None)
+    return path.stat().st_size - head - first - (frames - 1) * other, other
+
+
+def _behind_trr(path: Path, trajectory: Any) -> tuple[int, int]:
+    """As `_behind_dcd`: the last frame's head says how long it is."""
+    offsets = getattr(getattr(trajectory, "_xdr", None), "offsets", None)
+    if offsets is None or not len(offsets):
+        return 0, 0
+    begin = int(offsets[-1])
+    with path.open("rb") as file:
+        file.seek(begin)
+        head = file.read(_TRR.size)
+    if len(head) < _TRR.size:
+        return 0, 0
+    magic, _, _, _, *numbers = _TRR.unpack(head)
+    sizes, atoms = numbers[:10], numbers[10]
+    # nine numbers of a box, or three an atom, are of one width, and so are the time and lambda
+    width = sizes[2] // 9 if sizes[2] else max(sizes[7:]) // max(3 * atoms, 1)
+    if magic != _TRR_MAGIC or width not in (4, 8):
+        return 0, 0
+    size = _TRR.size + 2 * width + sum(sizes)
+    return path.stat().st_size - begin - size, size
+
+
+def _behind_text(file: Any) -> str | None:
+    """Lines behind the last frame, without blank ones at the end."""
+    if file is None or file.closed:
+        return None
+    lines = 0
+    try:
+        for number, line in enumerate(file):
+            lines = number + 1 if line.strip() else lines
+    except (OSError, EOFError, ValueError):
+        return None
+    return f"the file ends after {lines:,} lines of it" if lines else None
+
+
+def _last_bytes(path: Path) -> tuple[bytes, int]:
+    """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
+    if path.suffix not in _COMPRESSED:
+        size = path.stat().st_size
+        with path.open("rb") as raw:
+            raw.seek(max(size - _LAST_BYTES, 0))
+            return raw.read(), size
+    last, size = b"", 0
+    with _COMPRESSED[path.suffix](path, "rb") as packed:
+        while part := packed.read(_PART):
+            last, size = (last + part)[-_LAST_BYTES:], size + len(part)
+    return last, size
+
+
+def _text(trajectory: Any) -> tuple[Path, str] | None:
+    """(file, format) behind MDAnalysis's reader where it reads text by lines."""
+    path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
+    return None if word is None or path is None else (path, word)

@@ -42,21 +42,8 @@ def _count(value: int, where: str) -> None:
         )
 
 
-@dataclass(frozen=True)
-class CutoffRule:
-    """Inside where r < radius.
-
-    The decision compares r² with radius² in float64, as most codes do; a pair within rounding of the radius
-    is ambiguous whichever way it fell.
-
-    Attributes:
-        radius: length.
-    """
-
-    radius: float
-
-    def __post_init__(self):
-        _radius(self.radius, "CutoffRule.radius")
+class _Rule:
+    """What most rules have in common."""
 
     directed = False
     needs_species = False
@@ -64,20 +51,53 @@ class CutoffRule:
     @property
     def name(self) -> str:
         """In words."""
-        return f"r < {self.radius:g}"
+        raise NotImplementedError
+
+    @property
+    def reach(self) -> float:
+        """Distance beyond which nothing is a neighbor, length."""
+        raise NotImplementedError
+
+    @property
+    def shortest(self) -> float:
+        """The shortest length that distances are compared with; infinite where their order decides."""
+        return self.reach
+
+    def table(
+        self, species: Sequence[str] | np.ndarray
+    ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
+        """Species of each atom as a number, and the radius of each pair of numbers (`NEVER` without one)."""
+        return np.zeros(len(species), np.int64), np.array([[float(self.reach)]])
 
 
 @dataclass(frozen=True)
-class SpeciesCutoffs:
-    """A radius for each pair of species; pairs without one are never inside.
+class CutoffRule(_Rule):
+    """Inside where r < radius, a length.
 
-    Attributes:
-        radii: length by (species, species), in either order.
+    The decision compares r² with radius² in float64, as most codes do; a pair within rounding of the radius
+    is ambiguous whichever way it fell.
     """
+
+    radius: float
+
+    def __post_init__(self):
+        _radius(self.radius, "CutoffRule.radius")
+
+    @property
+    def name(self) -> str:
+        return f"r < {self.radius:g}"
+
+    @property
+    def reach(self) -> float:
+        return self.radius
+
+
+@dataclass(frozen=True)
+class SpeciesCutoffs(_Rule):
+    """A radius, length, for each pair of species, in either order; pairs without one are never inside."""
 
     radii: Mapping[tuple[str, str], float]
 
-    directed = False
     needs_species = True
 
     def __post_init__(self):
@@ -99,13 +119,20 @@ class SpeciesCutoffs:
 
     @property
     def name(self) -> str:
-        """In words."""
         return ", ".join(f"{a}-{b} < {value:g}" for (a, b), value in self.radii.items())
 
+    @property
+    def reach(self) -> float:
+        return max(self.radii.values())
+
+    @property
+    def shortest(self) -> float:
+        return min(self.radii.values())
+
     def table(
-        self, species: Sequence[str]
+        self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Species of each atom as a number, and the radius of each pair of numbers (`NEVER` without one).
+        """As of every rule.
 
         Raises:
             InputError: a species of the rule that no atom has.
@@ -114,31 +141,24 @@ class SpeciesCutoffs:
         place = {str(name): k for k, name in enumerate(names)}
         radii = np.full((len(names), len(names)), NEVER)
         for (a, b), value in self.radii.items():
-            for one in (a, b):
-                if one not in place:
-                    raise InputError(
-                        f"no atom is of species {one!r}; there are {', '.join(list(place)[:20])}",
-                        remedy="Write species as the trajectory names them",
-                        where=f"SpeciesCutoffs.radii[{(a, b)}]",
-                    )
+            if missing := [one for one in (a, b) if one not in place]:
+                raise InputError(
+                    f"no atom is of species {missing[0]!r}; there are {', '.join(list(place)[:20])}",
+                    remedy="Write species as the trajectory names them",
+                    where=f"SpeciesCutoffs.radii[{(a, b)}]",
+                )
             radii[place[a], place[b]] = radii[place[b], place[a]] = value
         return index.reshape(-1).astype(np.int64), radii
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """The k nearest of each atom, directed from the atom to its neighbors.
-
-    Attributes:
-        k: how many.
-        within: none further than this, length.
-    """
+class Nearest(_Rule):
+    """The k nearest of each atom within a length, directed from the atom to its neighbors."""
 
     k: int
     within: float | None = None
 
     directed = True
-    needs_species = False
 
     def __post_init__(self):
         _count(self.k, "Nearest.k")
@@ -147,7 +167,6 @@ class Nearest:
 
     @property
     def name(self) -> str:
-        """In words."""
         return f"{self.k} nearest" + (f" within {self.within:g}" if self.within is not None else "")
 
     @property
@@ -157,26 +176,25 @@ class Nearest:
 
     @property
     def reach(self) -> float:
-        """Distance beyond which nothing is a neighbor, length."""
         return math.inf if self.within is None else self.within
+
+    @property
+    def shortest(self) -> float:
+        # it is the order of distances that decides, hardly ever the radius
+        return math.inf
 
 
 @dataclass(frozen=True)
-class Capped:
-    """A cutoff with a largest number of neighbors: the `most` nearest of those inside, directed.
+class Capped(_Rule):
+    """A cutoff, length, with a largest number of neighbors: the `most` nearest of those inside, directed.
 
     What graph builders do that have a maximum number of neighbors and keep the nearest.
-
-    Attributes:
-        radius: length.
-        most: how many neighbors an atom can have.
     """
 
     radius: float
     most: int
 
     directed = True
-    needs_species = False
 
     def __post_init__(self):
         _radius(self.radius, "Capped.radius")
@@ -184,13 +202,16 @@ class Capped:
 
     @property
     def name(self) -> str:
-        """In words."""
         return f"r < {self.radius:g}, at most {self.most} neighbors"
 
     @property
     def reach(self) -> float:
-        """Distance beyond which nothing is a neighbor, length."""
         return self.radius
 
 
 Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
+
+
+def smallest_radius(rules: Sequence[Rule]) -> float:
+    """The shortest length that any of the rules compares distances with; infinite where none does."""
+    return float(min((one.shortest for one in rules), default=math.inf))

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.topology import AtomTable, first_line, topology_universe, with_elements
+from mdnum.trajectories.topology import AtomTable, first_line, topology_universe
 from mdnum.trajectories.trajectory import Trajectory, parse_slice, split_path
 
 # MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
@@ -58,31 +57,27 @@ def open_trajectory(
 
         RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
-    if file.is_dir():
-        if (file / "summary.json").exists():
-            raise _no_trajectory(file)
-        if file.suffix != ".bundle":
-            raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
+    if file.is_dir() and (file / "summary.json").exists():
+        raise _no_trajectory(file)
+    if file.is_dir() and file.suffix != ".bundle":
+        raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
     for one in (file, None if topology is None else Path(topology).expanduser()):
         if one is not None and not one.exists():
             raise InputError("no such file", remedy="Check the path", where=str(one))
         if one is not None and one.is_file() and not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
-    from mdnum.trajectories import ase_source, mdanalysis_source, netcdf, text, xtc
+    from mdnum.trajectories import binary, mdanalysis_source, text
 
     readers = {
-        "lammps": text.LammpsDump, "gro": text.GroTrajectory, "xtc": xtc.XtcTrajectory,
-        "netcdf": netcdf.NetcdfTrajectory,
+        "lammps": text.LammpsDump, "gro": text.GroTrajectory, "extxyz": text.ExtxyzTrajectory,
+        "xtc": binary.XtcTrajectory, "netcdf": binary.NetcdfTrajectory,
     }  # fmt: skip
     kind = _reader_of(file, format)
-    if kind in readers:
-        opened = readers[kind](file, topology, frames)
+    word = format or (text.format_of(file) if kind == "ase" else "")
+    if reader := readers.get("extxyz" if kind == "ase" and word == "extxyz" else kind):
+        opened = reader(file, topology, frames)
     elif kind == "ase":
-        word = format or ase_source.format_of(file)
-        if word == "extxyz":
-            opened = text.ExtxyzTrajectory(file, topology, frames)
-        else:
-            opened = ase_source.AseTrajectory(file, topology, frames, word)
+        opened = text.AseTrajectory(file, topology, frames, word)
     else:
         opened = mdanalysis_source.MDAnalysisTrajectory(file, topology, frames, format)
     if not opened.atoms:
@@ -96,24 +91,19 @@ def _no_trajectory(folder: Path) -> InputError:
         world = json.loads((folder / "summary.json").read_text()).get("world", "md")
     except (ValueError, AttributeError, OSError):
         world = "md"
+    message = "this run folder has no trajectory"
+    remedy = "Run again with --save-every 1 (or another number of steps)"
     if world != "md":
-        return InputError(
-            "this folder holds results, and no trajectory",
-            remedy=f"Give the trajectory itself; `mdnum report {folder}` shows what the folder holds",
-            where=str(folder),
-        )
-    return InputError(
-        "this run folder has no trajectory",
-        remedy="Run again with --save-every 1 (or another number of steps)",
-        where=str(folder),
-    )
+        message = "this folder holds results, and no trajectory"
+        remedy = f"Give the trajectory itself; `mdnum report {folder}` shows what the folder holds"
+    return InputError(message, remedy=remedy, where=str(folder))
 
 
 def _reader_of(file: Path, format: str | None) -> str:
     """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's: "lammps", "gro", "xtc", "netcdf"."""
     import MDAnalysis
 
-    from mdnum.trajectories.netcdf import head_of
+    from mdnum.trajectories.binary import head_of
 
     known: set[str] = set(MDAnalysis._READERS)
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
@@ -159,35 +149,34 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
     """
     from MDAnalysis.exceptions import NoDataError, SelectionError
 
+    table, where = trajectory.table, str(trajectory.path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         universe = _universe(trajectory)
         try:
             found = universe.select_atoms(words)
         except (NoDataError, AttributeError) as error:
-            raise InputError(
-                f"the selection {words!r} asks for what the file does not tell ({first_line(error)})",
-                remedy="Give a topology that has it with -s TOPOLOGY, or select by index",
-                where=str(trajectory.path),
-            ) from error
+            message = f"the selection {words!r} asks for what the file does not tell ({first_line(error)})"
+            remedy = "Give a topology that has it with -s TOPOLOGY, or select by index"
+            raise InputError(message, remedy=remedy, where=where) from error
         except (SelectionError, ValueError, TypeError) as error:
-            raise InputError(
-                f"{words!r} is no selection ({first_line(error)})",
-                remedy=_LANGUAGE,
-                where=str(trajectory.path),
-            ) from error
+            message = f"{words!r} is no selection ({first_line(error)})"
+            raise InputError(message, remedy=_LANGUAGE, where=where) from error
     if len(found) == 0:
         raise InputError(
-            f"the selection {words!r} names no atom of {trajectory.atoms:,}; {_there_are(trajectory.table)}",
-            remedy=_LANGUAGE if trajectory.table.named else "Give a topology with -s TOPOLOGY",
-            where=str(trajectory.path),
+            f"the selection {words!r} names no atom of {trajectory.atoms:,}; {_there_are(table)}",
+            remedy=_LANGUAGE if table.named else "Give a topology with -s TOPOLOGY",
+            where=where,
         )
     return np.asarray(found.indices, np.int64)
 
 
 def _universe(trajectory: Trajectory) -> Any:
-    """A Universe that stands at the first frame asked for."""
-    first = next(iter(trajectory.frames()), None)
+    """A Universe that stands at the first frame asked for. Distances in a selection are float32."""
+    import MDAnalysis
+    from MDAnalysis.lib.mdamath import triclinic_box
+
+    first, table, universe = next(iter(trajectory.frames()), None), trajectory.table, None
     if first is None:
         raise InputError(
             "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
@@ -198,34 +187,21 @@ def _universe(trajectory: Trajectory) -> Any:
     if trajectory.topology is not None:
         try:
             universe = topology_universe(trajectory.topology)
+            table.give_elements(universe)
         except InputError:
-            # a topology of ASE's: it says no more than the table
-            return universe_of(trajectory.table, first)
-        with_elements(universe, trajectory.table)
-        return _standing(universe, first)
-    return universe_of(trajectory.table, first)
-
-
-def _standing(universe: Any, frame: Frame) -> Any:
-    """The Universe at this frame. Distances in a selection are float32."""
-    from MDAnalysis.lib.mdamath import triclinic_box
-
-    box = triclinic_box(*frame.box.matrix) if frame.box.pbc.all() else np.zeros(6, np.float32)
-    universe.load_new(frame.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
+            # a topology of ASE's says no more than the table
+            universe = None
+    if universe is None:
+        at = np.unique(table.residues, return_index=True)[1]
+        universe = MDAnalysis.Universe.empty(len(table), n_residues=len(at), atom_resindex=table.residues)
+        for name, values in (
+            ("names", table.names), ("types", table.species), ("elements", table.species),
+            ("resnames", table.residue_names[at]), ("resids", table.residue_ids[at]),
+        ):  # fmt: skip
+            universe.add_TopologyAttr(name, values)
+    box = triclinic_box(*first.box.matrix) if first.box.pbc.all() else np.zeros(6, np.float32)
+    universe.load_new(first.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
     return universe
-
-
-def universe_of(table: AtomTable, frame: Frame) -> Any:
-    """An MDAnalysis Universe with one frame, for its selection language."""
-    import MDAnalysis
-
-    first = np.unique(table.residues, return_index=True)[1]
-    universe: Any = MDAnalysis.Universe.empty(len(table), n_residues=len(first), atom_resindex=table.residues)
-    for name, values in (("names", table.names), ("types", table.species), ("elements", table.species)):
-        universe.add_TopologyAttr(name, values)
-    universe.add_TopologyAttr("resnames", table.residue_names[first])
-    universe.add_TopologyAttr("resids", table.residue_ids[first])
-    return _standing(universe, frame)
 
 
 def _there_are(table: AtomTable) -> str:

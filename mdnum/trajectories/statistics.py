@@ -34,19 +34,12 @@ _CLASSES = 60
 
 @dataclass(frozen=True)
 class Durations(Sums):
-    """Stays counted by the number of frames they were inside for; memory does not grow with stays.
+    """Stays counted by the number of frames they were inside for: entry n is for n frames."""
 
-    Attributes:
-        seen: by length, stays seen to begin and to end; entry n is for n frames.
-        goes_on: those seen to begin, but not to end (censored on the right).
-        older: those seen to end, but not to begin (censored on the left).
-        throughout: those inside from the first frame to the last.
-    """
-
-    seen: Int[np.ndarray, "lengths"]
-    goes_on: Int[np.ndarray, "lengths"]
-    older: Int[np.ndarray, "lengths"]
-    throughout: Int[np.ndarray, "lengths"]
+    seen: Int[np.ndarray, "lengths"]  # seen to begin and to end
+    goes_on: Int[np.ndarray, "lengths"]  # seen to begin, but not to end (censored on the right)
+    older: Int[np.ndarray, "lengths"]  # seen to end, but not to begin (censored on the left)
+    throughout: Int[np.ndarray, "lengths"]  # inside from the first frame to the last
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Durations:
@@ -132,11 +125,8 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
     """Of the pairs inside at a frame, the share inside without a break until so many frames later.
 
-    Args:
-        pairs: inside at each frame.
-
-    Returns:
-        by lag from 0, averaged over all frames that leave room for it; nan where no pair was inside.
+    By lag from 0, averaged over all frames that leave room for it; nan where no pair was inside. `pairs` are
+    the numbers inside at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -151,10 +141,7 @@ def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[
     """Of the pairs inside at a frame, those inside so many frames later, whatever happened between.
 
     The intermittent counterpart of `residence`; divide the first by the second (sums over parts of the pairs
-    add up).
-
-    Args:
-        lags: frames, each from 0 to frames - 1.
+    add up). Each lag is from 0 to frames - 1.
 
     Returns:
         by lag, pairs of frames at which a pair was inside both times, and at which it was the first time.
@@ -225,11 +212,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class ClassTally(Sums):
-    """Flips and time inside by pair of classes.
-
-    Attributes:
-        exposure: times that a pair inside at one frame was examined again at the next one.
-    """
+    """Flips and time inside by pair of classes."""
 
     _common = ("names",)
 
@@ -237,16 +220,14 @@ class ClassTally(Sums):
     entered: Int[np.ndarray, "classes classes"]  # flips by class of the first and of the second atom
     left: Int[np.ndarray, "classes classes"]
     inside: Int[np.ndarray, "classes classes"]  # pairs inside, summed over frames
-    exposure: Int[np.ndarray, "classes classes"]
+    exposure: Int[np.ndarray, "classes classes"]  # as of `Durations`
 
     @classmethod
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
-        """Counts by the classes of the two atoms.
+        """Counts by the classes of the two atoms over so many frames.
 
-        Args:
-            frames: frames examined.
-            directed: whether i -> j and j -> i are two things (nearest neighbors); else both count as one,
-                under the class that comes first.
+        Where directed, i -> j and j -> i are two things; else both count as one, under the class that comes
+        first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:
@@ -282,13 +263,9 @@ class ClassTally(Sums):
 
 @dataclass(frozen=True)
 class Chatter(Sums):
-    """Flips by how soon the same pair flips back.
+    """Flips by how soon the same pair flips back."""
 
-    Attributes:
-        inside: visits inside by their length in frames, 0 to the window: a pair that left so soon again.
-    """
-
-    inside: Int[np.ndarray, "lengths"]
+    inside: Int[np.ndarray, "lengths"]  # visits inside by their length in frames, 0 to the window
     outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
     flips: int  # all flips
 
@@ -399,9 +376,8 @@ class Statistics(Sums):
     def of(cls, history: History, labels: Labels, directed: bool, window: int) -> tuple[Statistics, Contacts]:
         """Those of some of the pairs, and their contacts.
 
-        Args:
-            window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
-                overlooked in an intermittent contact.
+        Within a window of frames a flip that is reversed is chatter, and a stay outside is overlooked in an
+        intermittent contact.
         """
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
@@ -426,11 +402,9 @@ class Statistics(Sums):
         return counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Columns of a table of lifetimes by lag.
+        """Columns of a table of lifetimes by lag, from the numbers of pairs inside at each frame.
 
-        Args:
-            pairs: inside at each frame.
-            interval: time between frames; nan where it is not known.
+        The time between frames is nan where it is not known.
         """
         lags = lags_of(len(pairs))
         left, loose = survival(self.durations), survival(self.intermittent)
@@ -455,18 +429,13 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Lifetimes in numbers, frames; None where the file does not tell.
-
-    Attributes:
-        mean: the area below the curve, which is the mean where `mean_is_whole`, and less where some are left
-            at its end.
-    """
+    """Lifetimes in numbers, frames; None where the file does not tell."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over
     quarter_gone: int | None
     three_quarters_gone: int | None
-    mean: float | None
+    mean: float | None  # the area below the curve: less than the mean where some are left at its end
     mean_is_whole: bool
     longest: int  # frames for which any was followed
     mean_by_rate: float  # see `mean_by_rate`

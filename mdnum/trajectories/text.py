@@ -1,4 +1,7 @@
-"""Trajectories that are text, one block of lines a frame: read block by block, every digit kept.
+"""Trajectories that ASE reads, and text, one block of lines a frame: read block by block, every digit kept.
+
+Text that is read here, and what the libraries lose of it (tests/trajectories/test_source.py measures that
+they still do):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
   Howto_triclinic): MDAnalysis narrows them to float32 and takes a tilted box without its tilt;
@@ -11,21 +14,209 @@ from __future__ import annotations
 
 import io
 import re
+import tomllib
+import zlib
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
+from ase.io.formats import UnknownFileTypeError, filetype, iread
+from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Bool, Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.ase_source import AseFrames
-from mdnum.trajectories.frame import Box, Frame, FrameError
-from mdnum.trajectories.tails import refuse_cut_line
-from mdnum.trajectories.topology import AtomTable, table_of_topology
+from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
+from mdnum.trajectories.topology import CHECK, AtomTable
 from mdnum.trajectories.trajectory import Trajectory
+from mdnum.units import METAL, Units
+from mdnum.units import get as units_named
+
+# what the end of the file looks like to ASE's reader of traj
+_ENDS = "buffer is smaller than requested size"
+_NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
+
+
+class AseFrames(Trajectory):
+    """Frames that are ASE's Atoms once they are read."""
+
+    reader = "ASE"
+    # ASE's reader of each format raises what it likes on files that end early or hold something else
+    _fails = (Exception,)
+    _timed, _per_time = False, 1.0
+
+    def _atoms_of(self, raw: Any) -> Any:
+        return raw
+
+    def _of_atoms(self, first: Any) -> AtomTable:
+        """What the first frame says of its atoms, and of the units."""
+        self._timed = "time" in first.info
+        units = _units(self.path)
+        self.length, self.time = units.length, units.time if self._timed else "frame"
+        self._per_time = units.time_factor
+        return AtomTable.plain(first.get_chemical_symbols())
+
+    def _frame(self, number: int, raw: Any) -> Frame:
+        atoms = self._atoms_of(raw)
+        momenta, velocities = atoms.arrays.get("momenta"), None
+        if momenta is not None and np.any(momenta):
+            velocities = np.asarray(momenta, np.float64) / atoms.get_masses()[:, None] * self._per_time
+        timed = self._timed and "time" in atoms.info
+        return Frame(
+            index=number,
+            time=float(atoms.info["time"]) if timed else float(number),
+            positions=np.array(atoms.positions, np.float64),
+            box=Box(np.array(atoms.cell.array, np.float64), np.array(atoms.pbc, bool)),
+            velocities=velocities,
+            labels=np.array(atoms.get_chemical_symbols()),
+        )
+
+
+class AseTrajectory(AseFrames):
+    """A file that `ase.io` reads, frame by frame where its format allows that."""
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str):
+        super().__init__(path, topology, frames)
+        self.format = format
+        if format == "traj":
+            try:
+                with TrajectoryReader(str(path)) as reader:
+                    self._count = len(reader)
+            except Exception as error:
+                raise self._refused(
+                    f"ASE cannot open it ({error})", "Check that it was written to its end"
+                ) from error
+        _, first = self._first()
+        self._has(len(first), self._of_atoms(first))
+
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        return self._of_traj(numbers) if self.format == "traj" else self._of_any(numbers)
+
+    def _of_traj(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        with TrajectoryReader(str(self.path)) as reader:
+            for number in numbers:
+                if number >= len(reader):
+                    return
+                try:
+                    atoms = reader[number]
+                except Exception as error:
+                    raise self._unreadable(number, error) from error
+                yield number, atoms
+
+    def _of_any(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        images = iread(str(self.path), index=slice(None), format=self.format, do_not_split_by_at_sign=True)
+        number = 0
+        for wanted in numbers:
+            try:
+                atoms = next(islice(images, wanted - number, None), None)
+            except Exception as error:
+                raise self._unreadable(wanted, error) from error
+            if atoms is None:
+                return
+            number = wanted + 1
+            yield wanted, atoms
+
+    def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
+        if isinstance(error, UnknownFileTypeError) and self.format == str(error):
+            raise self._refused(
+                f"--format {self.format!r} is known to neither MDAnalysis nor ASE",
+                "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ...",
+            ) from error
+        return super()._unreadable(number, "the file ends in it" if _ENDS in str(error) else error)
+
+
+def format_of(path: Path) -> str:
+    """The format of a file in ASE's word.
+
+    Raises:
+        InputError: it knows none for it, or the file cannot be read.
+    """
+    # by its name, where ASE would look into it first and give up where it is cut
+    plain = path.with_suffix("") if path.suffix in (".gz", ".bz2") else path
+    if plain.suffix == ".extxyz":
+        return "extxyz"
+    try:
+        return filetype(str(path))
+    except UnknownFileTypeError as error:
+        raise InputError(
+            "neither MDAnalysis nor ASE knows this format",
+            remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
+            where=str(path),
+        ) from error
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        said = str(error).rstrip(".")
+        raise InputError(f"it cannot be read ({said})", remedy=CHECK, where=str(path)) from error
+
+
+def _units(path: Path) -> Units:
+    """Units of the mdnum run that a file belongs to; else ASE's Å, and ps for times and velocities."""
+    system = path.parent / "system.toml"
+    if path.name != "trajectory.traj" or not system.exists():
+        return METAL
+    return units_named(str(tomllib.loads(system.read_text()).get("units", "metal")))
+
+
+# ---- text
+
+
+def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
+    """Refuses a last line that was cut in its last number: what is left of it is another number.
+
+    That the line has no end proves nothing by itself, since some programs leave it out. The number was cut
+    where it has fewer digits than those that stand in its place in the lines before.
+
+    Args:
+        lines: of a frame, all with one number in the last place.
+        like: words to compare with instead.
+
+    Raises:
+        ValueError: it was cut.
+    """
+    if not lines or lines[-1].endswith(("\n", "\r")):
+        return
+    words = lines[-1].split()
+    if not words or lines[-1][-1].isspace():
+        # more was written behind the number
+        return
+    others = list(like) or [line.split()[-1] for line in lines[:-1] if line.strip()]
+    if not others:
+        # one atom: its other coordinates are written alike
+        others = [word for word in words[:-1] if "." in word]
+    if _is_cut(words[-1], others):
+        raise ValueError(
+            f"the file ends in the middle of a number, {words[-1]!r}: it has fewer digits than those before, "
+            "and its line no end; if it is whole, end the line"
+        )
+
+
+def _is_cut(word: str, others: Sequence[str]) -> bool:
+    mine, rest = _digits(word), [one for one in map(_digits, others) if one is not None]
+    # a mass or a charge stands in other rows too
+    if mine is None or not rest or word in others:
+        return False
+    decimals, significant, exponent = mine
+    if 0 <= exponent < 2:
+        # C, Fortran and Python write two digits at least
+        return True
+    if exponent < 0 and all(one[2] >= 0 for one in rest):
+        return True
+    if len({one[0] for one in rest}) == 1:
+        return decimals < rest[0][0]
+    # so many digits in all, and zeros at the end left out
+    return significant < median(one[1] for one in rest)
+
+
+def _digits(word: str) -> tuple[int, int, int] | None:
+    """(decimals, significant digits, digits of the exponent or -1); None for what is no number."""
+    match = _NUMBER.fullmatch(word)
+    if match is None:
+        return None
+    before, after, exponent = match.groups()
+    digits = ((before or "") + (after or "")).lstrip("0")
+    return len(after or ""), len(digits), -1 if exponent is None else len(exponent.lstrip("+-"))
 
 
 class TextTrajectory(Trajectory):
@@ -156,11 +347,10 @@ class LammpsDump(TextTrajectory):
 
         names = next((names for names in _COLUMNS if set(names) <= set(columns)), None)
         if names is None:
-            raise FrameError(
-                f"frame {number} has no positions among its columns ({' '.join(columns)})",
-                remedy="Dump x y z, xu yu zu or xs ys zs",
-                where=str(self.path),
-                frame=number,
+            raise self._odd(
+                number,
+                f"has no positions among its columns ({' '.join(columns)})",
+                "Dump x y z, xu yu zu or xs ys zs",
             )
         positions = numbers(names)
         if names[0].startswith("xs"):
@@ -175,10 +365,9 @@ class LammpsDump(TextTrajectory):
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
         if "id" not in columns:
-            raise InputError(
+            raise self._refused(
                 "the dump has no ids, and LAMMPS changes the order of atoms as they move",
-                remedy="Dump the column id",
-                where=str(self.path),
+                "Dump the column id",
             )
         ids = rows[:, columns.index("id")].astype(np.int64)
         order = np.argsort(ids, kind="stable")
@@ -186,11 +375,10 @@ class LammpsDump(TextTrajectory):
         if not np.array_equal(known, ids[order]):
             lost = np.setdiff1d(known, ids)
             seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise FrameError(
-                f"frame {number} {seen} of the first frame: {len(rows):,} atoms, and {len(known):,} there",
-                remedy="Dump one group of atoms that stays the same",
-                where=str(self.path),
-                frame=number,
+            raise self._odd(
+                number,
+                f"{seen} of the first frame: {len(rows):,} atoms, and {len(known):,} there",
+                "Dump one group of atoms that stays the same",
             )
         return order
 
@@ -283,7 +471,7 @@ class GroTrajectory(TextTrajectory):
 
     def _described(self, block: list[str]) -> AtomTable:
         self.time = "ps" if _TIME.search(block[0]) else "frame"
-        return table_of_topology(self.path)
+        return AtomTable.read(self.path)
 
     def _frame(self, number: int, raw: list[str]) -> Frame:
         rows = [line.rstrip("\n") for line in raw[2:-1]]

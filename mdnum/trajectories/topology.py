@@ -1,22 +1,53 @@
-"""What a topology says of the atoms: names, elements, residues, through MDAnalysis or ASE."""
+"""What MDAnalysis and ASE make of atoms and boxes: names, elements, residues; boxes as the files have them.
+
+MDAnalysis keeps three lengths and three angles, from which a box has its first vector along x and its second
+in the xy plane. Most programs turn their boxes like that; where one does not, its coordinates are turned
+otherwise too, and images would be put into wrong places without a word:
+
+- CHARMM's are symmetric matrices (since version 22, in dcd files);
+- HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
+- those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
+
+Of PDB files with many models it loses boxes unless there are as many as models. Programs write CRYST1 once at
+the head (OpenMM), before each model (GROMACS), or inside of each. MDAnalysis reads a model from its MODEL
+record on: what stands before the first is never read, and what stands behind a model is taken for that
+one's, though it is the next one's.
+"""
 
 from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box
 
 #: what readers raise on files that end early or hold something else
 READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
 #: what a reader of results from MDAnalysis's coordinates should know
 NARROWED = "MDAnalysis hands every coordinate over in float32, whatever the file stores."
+#: what to do about a file that nobody can read
+CHECK = "Check that the file is whole and of the kind its name says"
+
+_UNNAMED = "The file says how many atoms there are and nothing else; names and elements need a topology."
+_GUESSED = "Elements are guessed from the names of the atoms."
+_ONCE = "The file gives a box once, before its first model: it is taken for all frames."
+_PDB = frozenset({"PDB", "ENT", "XPDB"})
+# a box of this is a word for none: CRYST1 is demanded by the format
+_PLACEHOLDER = (1.0, 1.0, 1.0, 90.0, 90.0, 90.0)
+_COLUMNS = ((6, 15), (15, 24), (24, 33), (33, 40), (40, 47), (47, 54))
+
+Dimensions = tuple[float, ...] | None
+# the matrix of a frame's box, of its number and MDAnalysis's timestep; None for MDAnalysis's own
+Matrices = Callable[[int, Any], Float[np.ndarray, "3 3"] | None]
 
 
 @dataclass(frozen=True)
@@ -44,11 +75,78 @@ class AtomTable:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of results should know of how the atoms are named."""
+        return (_UNNAMED,) if not self.named else (_GUESSED,) if self.guessed else ()
+
     @classmethod
     def plain(cls, species: list[str], named: bool = True) -> AtomTable:
         """Atoms that have a species and belong to no residue."""
         words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
         return cls(words, words, np.full(len(species), "", dtype=object), none, none, named)
+
+    @classmethod
+    def of(cls, atoms: Any) -> AtomTable:
+        """What a topology says of its atoms, an MDAnalysis AtomGroup."""
+
+        def column(name: str, otherwise: Any) -> np.ndarray:
+            values = getattr(atoms, name, None)
+            return np.array([otherwise] * len(atoms) if values is None else list(map(str, values)), object)
+
+        known = [hasattr(atoms, name) for name in ("names", "types", "elements")]
+        elements, types = column("elements", ""), column("types", "X")
+        names, guessed = column("names", ""), False
+        if known[0] and not all(elements):
+            from MDAnalysis.guesser.default_guesser import DefaultGuesser
+            from MDAnalysis.guesser.tables import SYMB2Z
+
+            # "OW1" -> "O", "CL" -> "Cl", "CA" -> "C"
+            guess = {
+                one: str(DefaultGuesser(None).guess_atom_element(one)).capitalize() for one in set(names)
+            }
+            found = {one: element if element in SYMB2Z else "" for one, element in guess.items()}
+            rows = zip(elements, names, types if known[1] else names, strict=True)
+            elements, guessed = (
+                np.array([e or found[n] or t for e, n, t in rows], object),
+                any(found.values()),
+            )
+        elif not all(elements):
+            elements = types
+        return cls(
+            names=names if known[0] else elements,
+            species=elements,
+            residue_names=column("resnames", ""),
+            residue_ids=np.array(getattr(atoms, "resids", np.zeros(len(atoms))), np.int64),
+            residues=np.array(atoms.resindices, np.int64),
+            named=any(known),
+            guessed=guessed,
+        )
+
+    @classmethod
+    def read(cls, topology: str | Path) -> AtomTable:
+        """The atoms of a topology file: any that MDAnalysis takes for one, or any structure that ASE reads.
+
+        Raises:
+            InputError: neither reads it.
+        """
+        try:
+            return cls.of(topology_universe(topology).atoms)
+        except InputError:
+            from ase.io import read
+
+            try:
+                atoms: Any = read(str(topology))
+            except Exception as error:
+                raise InputError(
+                    "neither MDAnalysis nor ASE reads this topology", where=str(topology)
+                ) from error
+            return cls.plain(atoms.get_chemical_symbols())
+
+    def give_elements(self, universe: Any) -> None:
+        """Adds the elements that were guessed, for selections by element."""
+        if self.guessed and not hasattr(universe.atoms, "elements"):
+            universe.add_TopologyAttr("elements", self.species)
 
 
 def first_line(error: BaseException) -> str:
@@ -65,15 +163,6 @@ def first_line(error: BaseException) -> str:
     return text[0].rstrip(".") if text else type(error).__name__
 
 
-def notes_on(table: AtomTable) -> tuple[str, ...]:
-    """What a reader of results should know of how the atoms are named."""
-    if not table.named:
-        return (
-            "The file says how many atoms there are and nothing else; names and elements need a topology.",
-        )
-    return ("Elements are guessed from the names of the atoms.",) if table.guessed else ()
-
-
 def topology_universe(topology: str | Path) -> Any:
     """A Universe of a topology, with or without coordinates.
 
@@ -87,92 +176,190 @@ def topology_universe(topology: str | Path) -> Any:
         return opened_by_mdanalysis(Path(topology), lambda: MDAnalysis.Universe(str(topology)), None)
 
 
-def opened_by_mdanalysis(file: Path, act: Any, trajectory: Path | None) -> Any:
+def opened_by_mdanalysis(file: Path, act: Callable[[], Any], trajectory: Path | None) -> Any:
     """What opening a file gives; all that goes wrong in it is an InputError."""
     hook = sys.unraisablehook
     # readers that could not open complain once more when they are thrown away
     sys.unraisablehook = lambda _: None
     try:
-        try:
-            return act()
-        except READING_FAILS as error:
-            said, package = first_line(error), "install" in str(error)
-        except ImportError as error:
-            said, package = first_line(error), True
+        return act()
+    except (*READING_FAILS, ImportError) as error:
+        said = first_line(error)
+        if isinstance(error, ImportError) or "install" in str(error):
+            raise InputError(
+                f"reading it needs a package that is not installed ({said})",
+                remedy="Install the package, or convert the file to xtc or extxyz",
+                where=str(file),
+            ) from None
+        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
+        remedy = CHECK + hint if file == trajectory else CHECK
+        raise InputError(f"MDAnalysis cannot open it ({said})", remedy=remedy, where=str(file)) from None
     finally:
         sys.unraisablehook = hook
-    if package:
-        raise InputError(
-            f"reading it needs a package that is not installed ({said})",
-            remedy="Install the package, or convert the file to xtc or extxyz",
-            where=str(file),
-        )
-    hint = "Check that the file is whole and of the kind its name says"
-    if file == trajectory:
-        hint += "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-    raise InputError(f"MDAnalysis cannot open it ({said})", remedy=hint, where=str(file))
 
 
-def table_of(atoms: Any) -> AtomTable:
-    """What a topology says of its atoms.
+# ---- boxes
 
-    Args:
-        atoms: an MDAnalysis AtomGroup.
+
+def formats_of(trajectory: Any) -> list[str]:
+    """MDAnalysis's words for the format of one of its readers."""
+    return [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
+
+
+def file_of(trajectory: Any) -> Path | None:
+    """The one file behind one of MDAnalysis's readers; None where there is none."""
+    path = getattr(trajectory, "filename", None)
+    return Path(path) if isinstance(path, str | Path) else None
+
+
+class Boxes:
+    """The boxes of an MDAnalysis trajectory (its reader), turned as its coordinates are.
+
+    Attributes:
+        notes: what somebody who relies on the boxes should know, in sentences.
+        own: whether boxes are read from the file itself, and may be others than MDAnalysis's.
     """
 
-    def column(name: str, otherwise: Any) -> np.ndarray:
-        values = getattr(atoms, name, None)
-        return np.array([otherwise] * len(atoms) if values is None else [str(one) for one in values], object)
+    def __init__(self, trajectory: Any):
+        self._matrix: Matrices | None = None
+        self._models: tuple[Dimensions, ...] = ()
+        self.notes: tuple[str, ...] = ()
+        if (path := file_of(trajectory)) is not None:
+            words = formats_of(trajectory)
+            if make := next((_MATRICES[word] for word in words if word in _MATRICES), None):
+                self._matrix = make(str(path), trajectory)
+            if _PDB & set(words) and trajectory.n_frames > 1 and path.is_file():
+                stat = path.stat()
+                self._models, records = _models(str(path), stat.st_size, stat.st_mtime_ns)
+                self.notes = (_ONCE,) if self._models and records == 1 else ()
+        self._changed = bool(getattr(trajectory, "transformations", ()))
+        self.own = self._matrix is not None or bool(self._models)
 
-    known = [hasattr(atoms, name) for name in ("names", "types", "elements")]
-    elements, types = column("elements", ""), column("types", "X")
-    names, guessed = column("names", ""), False
-    if known[0] and not all(elements):
-        from MDAnalysis.guesser.default_guesser import DefaultGuesser
-        from MDAnalysis.guesser.tables import SYMB2Z
-
-        # "OW1" -> "O", "CL" -> "Cl", "CA" -> "C"
-        guess = {one: str(DefaultGuesser(None).guess_atom_element(one)).capitalize() for one in set(names)}
-        found = {one: element if element in SYMB2Z else "" for one, element in guess.items()}
-        rest = types if known[1] else names
-        elements = np.array(
-            [e or found[n] or t for e, n, t in zip(elements, names, rest, strict=True)], object
-        )
-        guessed = any(found.values())
-    elif not all(elements):
-        elements = types
-    return AtomTable(
-        names=names if known[0] else elements,
-        species=elements,
-        residue_names=column("resnames", ""),
-        residue_ids=np.array(getattr(atoms, "resids", np.zeros(len(atoms))), np.int64),
-        residues=np.array(atoms.resindices, np.int64),
-        named=any(known),
-        guessed=guessed,
-    )
+    def box(self, ts: Any, number: int) -> Box:
+        """The box of a timestep that is this frame of the file."""
+        dimensions = ts.dimensions
+        # transformations may have set another
+        if self._models and (dimensions is None or not self._changed):
+            found = self._models[number] if number < len(self._models) else None
+            dimensions = None if found is None else np.array(found, np.float64)
+        box = box_of(dimensions)
+        matrix = self._matrix(number, ts) if self._matrix is not None and box.periodic else None
+        return box if matrix is None else Box(matrix, box.pbc)
 
 
-def with_elements(universe: Any, table: AtomTable) -> None:
-    """Adds the elements that were guessed, for selections by element."""
-    if table.guessed and not hasattr(universe.atoms, "elements"):
-        universe.add_TopologyAttr("elements", table.species)
+def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
+    """The box with these lengths, Å, and angles, degrees: a along x, b in the xy plane, as MDAnalysis has it.
 
+    None is for no box; an axis of length 0 with right angles does not repeat.
 
-def table_of_topology(topology: str | Path) -> AtomTable:
-    """The atoms of a topology file: any that MDAnalysis takes for one, or any structure that ASE reads.
-
-    Raises:
-        InputError: neither reads it.
+    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors are off by 1e-7 of themselves.
     """
+    from MDAnalysis.lib.mdamath import triclinic_vectors
+
+    if dimensions is None or not np.any(dimensions):
+        return Box()
+    lengths, angles = np.asarray(dimensions[:3], np.float64), np.asarray(dimensions[3:], np.float64)
+    if (lengths == 0).any() and (angles == 90).all():
+        return Box(np.diag(lengths), lengths > 0)
+    with np.errstate(invalid="ignore"):
+        matrix = np.asarray(triclinic_vectors(dimensions, dtype=np.float64), np.float64)
+    # lengths and angles that no box has are left for whoever needs the box to refuse
+    return Box(matrix if matrix.any() else np.full((3, 3), np.nan), np.ones(3, bool))
+
+
+def _charmm(path: str, trajectory: Any) -> Matrices:
+    from MDAnalysis.lib.formats.libdcd import DCDFile
+
+    file = DCDFile(path)
+
+    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
+        if (np.asarray(ts.dimensions[3:]) == 90).all():
+            return None
+        file.seek(number)
+        xx, xy, yy, xz, yz, zz = np.array(file.read().unitcell, np.float64)
+        symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        # in these places stand cosines otherwise, or angles, which give other lengths
+        lengths = np.sqrt((symmetric**2).sum(axis=1))
+        cosines = max(abs(xy), abs(xz), abs(yz)) <= 1
+        return symmetric if not cosines and np.allclose(lengths, ts.dimensions[:3], rtol=1e-5) else None
+
+    return matrix
+
+
+def _hoomd(path: str, trajectory: Any) -> Matrices:
+    import gsd.fl  # pyright: ignore[reportMissingImports] -- MDAnalysis needs it for the format
+
+    file, chunk = gsd.fl.open(path, "r"), "configuration/box"
+
+    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
+        # what does not change is written with the first frame alone
+        at = number if file.chunk_exists(number, chunk) else 0
+        if not file.chunk_exists(at, chunk):
+            return None
+        x, y, z, xy, xz, yz = np.asarray(file.read_chunk(at, chunk), np.float64)
+        return np.array([[x, 0, 0], [xy * y, y, 0], [xz * z, yz * z, z]])
+
+    return matrix
+
+
+def _h5md(path: str, trajectory: Any) -> Matrices:
+    import h5py  # pyright: ignore[reportMissingImports] -- MDAnalysis needs it for the format
+
+    file = h5py.File(path, "r")
+
+    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
+        group: Any = file["particles"]
+        box = next(iter(group.values()))["box"]
+        if "edges" not in box or "value" not in box["edges"]:
+            return None
+        edges = np.asarray(box["edges/value"][number], np.float64)
+        # MDAnalysis has converted its lengths to Å
+        return None if edges.shape != (3, 3) else edges * float(ts.dimensions[0] / np.linalg.norm(edges[0]))
+
+    return matrix
+
+
+def _dlpoly(path: str, trajectory: Any) -> Matrices:
+    # where each frame begins is known once they have been counted; another release keeps it elsewhere
+    offsets = getattr(trajectory, "_offsets", None) if trajectory.n_frames else None
+    file = open(path)  # noqa: SIM115 -- as long as frames are read
+
+    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
+        if offsets is None:
+            return None
+        file.seek(offsets[number])
+        file.readline()
+        return np.array([file.readline().split() for _ in range(3)], np.float64)
+
+    return matrix
+
+
+_MATRICES = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
+
+
+@lru_cache(maxsize=4)
+def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
+    """(lengths and angles of each model's box, records); read again if the file has changed."""
+    from MDAnalysis.lib.util import anyopen
+
+    found: list[Dimensions] = []
+    now, records, open_model = None, 0, False
+    with anyopen(path, "rb") as file:
+        for line in cast("Iterable[bytes]", file):
+            if line.startswith((b"ATOM", b"HETATM")):
+                if open_model:
+                    found.append(now)
+                    open_model = False
+            elif line.startswith(b"MODEL"):
+                open_model = True
+            elif line.startswith(b"CRYST1"):
+                now, records = _dimensions(line), records + 1
+    return tuple(found) if any(found) else (), records
+
+
+def _dimensions(line: bytes) -> Dimensions:
     try:
-        return table_of(topology_universe(topology).atoms)
-    except InputError:
-        from ase import Atoms
-        from ase.io import read
-
-        try:
-            atoms = read(str(topology))
-        except Exception as error:
-            raise InputError("neither MDAnalysis nor ASE reads this topology", where=str(topology)) from error
-        assert isinstance(atoms, Atoms)
-        return AtomTable.plain(atoms.get_chemical_symbols())
+        found = tuple(float(line[begin:end]) for begin, end in _COLUMNS)
+    except ValueError:
+        return None
+    return None if np.allclose(found, _PLACEHOLDER) or not any(found[:3]) else found

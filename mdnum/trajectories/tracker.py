@@ -21,7 +21,7 @@ from mdnum.trajectories.lattice import (
     own_images,
 )
 from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
-from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.search import (
     Changed,
     Found,
@@ -36,8 +36,16 @@ from mdnum.trajectories.search import (
 )
 from mdnum.trajectories.superset import Superset, displaced, examine, listed, skin_for
 
+#: Indices of the atoms on either side of a pair; None for all.
+Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]
 #: `Tracker.min_margin` looks this share of the radius away from it
 HORIZON = 0.02
+
+
+def atoms_of(groups: Groups) -> Int[np.ndarray, "atoms"] | None:
+    """The atoms that are on any side; None for all."""
+    some = [one for one in groups if one is not None]
+    return np.unique(np.concatenate(some)) if some else None
 
 
 @dataclass(frozen=True)
@@ -340,15 +348,9 @@ def _participants(
     if (centers == others).all():
         # the same array: pairs within one set are searched for from one side only
         others = centers
-    if isinstance(rule, SpeciesCutoffs):
-        assert species is not None
-        # species of atoms that do not take part count too: a selection may hold none of one
-        kinds, radii = rule.table(list(species))
-        kinds = kinds[labels]
-    else:
-        kinds = np.zeros(len(labels), np.int64)
-        radii = np.array([[float(rule.radius if isinstance(rule, CutoffRule) else rule.reach)]])
-    return Participants(labels, centers, others, kinds, radii)
+    # species of atoms that do not take part count too: a selection may hold none of one
+    kinds, radii = rule.table(np.zeros(atoms, str) if species is None else species)
+    return Participants(labels, centers, others, kinds[labels], radii)
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:

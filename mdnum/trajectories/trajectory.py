@@ -18,7 +18,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame
-from mdnum.trajectories.topology import AtomTable, first_line, table_of_topology
+from mdnum.trajectories.topology import CHECK, AtomTable, first_line
 
 #: Frames from which the resolution of a file is read.
 SAMPLE = 8
@@ -54,14 +54,7 @@ class Trajectory(ABC):
     table: AtomTable
     notes: tuple[str, ...] = ()
     # what a frame that is none raises while it is decoded
-    _fails: tuple[type[BaseException], ...] = (
-        ValueError,
-        IndexError,
-        KeyError,
-        OSError,
-        EOFError,
-        RuntimeError,
-    )
+    _fails: tuple[type[BaseException], ...] = (OSError, EOFError, ValueError, RuntimeError, LookupError)
     # frames in the file, where they are known
     _count: int | None = None
 
@@ -72,15 +65,20 @@ class Trajectory(ABC):
     def _has(self, atoms: int, table: AtomTable | None = None) -> None:
         """Sets the table of atoms: the topology's, where there is one."""
         if self.topology is not None:
-            table = table_of_topology(self.topology)
-            if len(table) != atoms:
-                raise InputError(
-                    f"the topology {self.topology.name} has {len(table):,} atoms "
-                    f"and the trajectory {atoms:,}",
-                    remedy="Give the topology that the trajectory was written with, or a selection of it",
-                    where=str(self.path),
-                )
+            table = AtomTable.read(self.topology)
+            self._belongs(len(table), atoms)
         self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
+
+    def _belongs(self, topology: int, atoms: int) -> None:
+        """Refuses a topology with another number of atoms."""
+        if self.topology is not None and topology != atoms:
+            raise self._refused(
+                f"the topology {self.topology.name} has {topology:,} atoms and the trajectory {atoms:,}",
+                "Give the topology that the trajectory was written with, or a selection of it",
+            )
+
+    def _refused(self, message: str, remedy: str = CHECK) -> InputError:
+        return InputError(message, remedy=remedy, where=str(self.path))
 
     @property
     def atoms(self) -> int:
@@ -100,9 +98,7 @@ class Trajectory(ABC):
     @property
     def in_file(self) -> int | None:
         """Frames in the file; None where they are not known without reading it."""
-        if self._count is None and any(
-            end is not None and end < 0 for end in (self.slice.start, self.slice.stop)
-        ):
+        if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
             self._count = sum(1 for _ in self._raw(chosen(slice(None), None)))
         return self._count
 
@@ -129,11 +125,10 @@ class Trajectory(ABC):
             except self._fails as error:
                 raise self._unreadable(number, error) from error
             if len(frame.positions) != self.atoms:
-                raise FrameError(
-                    f"frame {number} has {len(frame.positions):,} atoms and the first {self.atoms:,}",
-                    remedy="Leave out the frames with another number of atoms: a flip needs the pair before",
-                    where=str(self.path),
-                    frame=number,
+                raise self._odd(
+                    number,
+                    f"has {len(frame.positions):,} atoms and the first {self.atoms:,}",
+                    "Leave out the frames with another number of atoms: a flip needs the pair before",
                 )
             yield frame
 
@@ -152,11 +147,7 @@ class Trajectory(ABC):
                 raise
         if not sample:
             words, of = self.slice_words, "" if self.in_file is None else f" of {self.in_file:,}"
-            raise InputError(
-                f"@{words} leaves no frame{of}" if words else "the file holds no frame",
-                remedy="Ask for others" if words else "Check how it was written",
-                where=str(self.path),
-            )
+            raise self._refused(f"@{words} leaves no frame{of}", "Ask for others") if words else self._empty()
         return sample
 
     @property
@@ -164,11 +155,8 @@ class Trajectory(ABC):
         """The frames asked for, as behind an @; empty for all."""
         if self.slice == slice(None):
             return ""
-        ends = [
-            self.slice.start,
-            self.slice.stop,
-            *([] if self.slice.step in (None, 1) else [self.slice.step]),
-        ]
+        start, stop, step = self.slice.start, self.slice.stop, self.slice.step
+        ends = [start, stop] if step in (None, 1) else [start, stop, step]
         return ":".join("" if end is None else str(end) for end in ends)
 
     @abstractmethod
@@ -180,17 +168,17 @@ class Trajectory(ABC):
         """A frame from what `_raw` gave."""
 
     def _first(self) -> tuple[int, Any]:
-        """The first of the file.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The first of the file."""
         first = next(self._raw(iter([0])), None)
         if first is None:
-            raise InputError(
-                "the file holds no frame", remedy="Check how it was written", where=str(self.path)
-            )
+            raise self._empty()
         return first
+
+    def _empty(self) -> InputError:
+        return self._refused("the file holds no frame", "Check how it was written")
+
+    def _odd(self, number: int, seen: str, remedy: str) -> FrameError:
+        return FrameError(f"frame {number} {seen}", frame=number, remedy=remedy, where=str(self.path))
 
     def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
         said = error if isinstance(error, str) else first_line(error)

@@ -298,7 +298,8 @@ def judge(view: View) -> Verdict:
     silent = {code.lower(): _cases(summary, code) for code in SILENT}
     ways = [code for code, cases in silent.items() if cases]
     answered = asked - _total(summary, "refused") - _cases(summary, "RAISED")
-    values = {"name": view.name, "asked": asked, "wrong": wrong, "right": _total(summary, "passed"), **silent}
+    values = {"name": view.name, "asked": asked, "answered": answered, "wrong": wrong, **silent}
+    values["right"] = _total(summary, "passed")
     said = (
         "nothing_asked" if not asked
         else "nothing_answered" if not answered

@@ -14,17 +14,18 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.store.tables import TableStream
+from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import FlipsView, about, ending, plain_box, selected, stem
+from mdnum.verbs.flips_shared import FlipsView, about, ending, selected, stem
 from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.follow import Followed, Groups, Pass
+    from mdnum.trajectories.follow import Followed, Pass
     from mdnum.trajectories.history import History
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.statistics import Classes, Statistics
     from mdnum.trajectories.topology import AtomTable
+    from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
 #: Frames within which a flip that is reversed is chatter, unless another number is asked for.
@@ -126,7 +127,7 @@ def flips(
         leaps = found.leaps
         summary = {
             **about(opened, "flips", between),
-            "box": plain_box(sample[0].box),
+            "box": sample[0].box.plain(),
             "frames": found.frames,
             **steps,
             "window": window,
@@ -300,7 +301,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     def columns(name: str, part: int, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         found: dict[str, list[np.ndarray]] = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
         for batch in streams[name].batches(["rule", *kinds]):
-            rows = {name: batch[name].to_numpy() for name in ("rule", *kinds)}
+            rows = {name: as_numpy(batch[name]) for name in ("rule", *kinds)}
             mine = rows["rule"] == rule
             if parts > 1:
                 mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part
@@ -430,7 +431,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups) -> Any:
     """What writing positions with so few digits did to the flips, estimated; None where it cannot be."""
-    from mdnum.trajectories.grid_effect import grid_effect
+    from mdnum.trajectories.resolution import grid_effect
 
     return grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked) if one.reach > 0 else None
 

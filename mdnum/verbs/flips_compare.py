@@ -15,10 +15,9 @@ from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number
-from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, growth_of
-from mdnum.trajectories.follow import atoms_of
+from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
-from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.verbs.flips_shared import FlipsView, about, ending, name_of, resolution, selected, stem
 from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 

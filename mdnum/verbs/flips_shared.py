@@ -14,8 +14,7 @@ from mdnum.report.words import listed, number, plain
 from mdnum.verbs.frame import View
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.follow import Groups
-    from mdnum.trajectories.frame import Box
+    from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
@@ -68,11 +67,6 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
         "interrupted": interrupted,
         "status": "stopped" if stopped is not None or interrupted else "complete",
     }
-
-
-def plain_box(box: Box) -> dict[str, Any]:
-    """A box as plain values."""
-    return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}
 
 
 class FlipsView(View):

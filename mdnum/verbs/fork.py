@@ -78,7 +78,7 @@ def fork(
 
     Returns:
         its result is a `mdnum.forks.Fork`, and where all choices were screened a list of
-        `mdnum.forks.screen.Screened`.
+        `mdnum.forks.pair.Screened`.
 
     Raises:
         InputError: the system cannot be run, the choice is unknown or does not apply to it, or something was
@@ -142,9 +142,9 @@ def fork_screen(
         progress: called with choices done, how many there are, and the name of the next as the phase.
 
     Returns:
-        its result is a list of `mdnum.forks.screen.Screened`.
+        its result is a list of `mdnum.forks.pair.Screened`.
     """
-    from mdnum.forks.screen import screen
+    from mdnum.forks.pair import screen
 
     began = time.perf_counter()
     system = of_any(system, overrides)
@@ -163,7 +163,7 @@ def fork_screen(
         summary = basics(system, steps) | {
             "ranking": [
                 {
-                    "choice": row.choice, "difference": row.difference, "first_bit": row.seed,
+                    "choice": row.choice, "difference": row.difference, "first_bit": row.first_bit,
                     "fork": row.fork, "split": row.split, "must_hold": row.must_hold, "held": row.held,
                     "steps": row.steps, "failed": row.failed,
                 }
@@ -218,7 +218,7 @@ def fork_folders(
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         with frame.new_folder("compare", f"fork-{system.name}", out, system=system) as folder:
             row = plain(found)
-            row |= {"first_bit": row.pop("seed"), "seconds": time.perf_counter() - began}
+            row["seconds"] = time.perf_counter() - began
             frame.store(folder, basics(system, found.steps) | row, {})
         return frame.finish(folder, report=report, result=found, progress=progress)
     if found.world != "md":
@@ -236,7 +236,7 @@ def fork_folders(
         return {
             "runs": [found.a, found.b],
             "differences": found.differences,
-            "stored": {"steps": found.steps, "first_bit": found.seed, "fork": known},
+            "stored": {"steps": found.steps, "first_bit": found.first_bit, "fork": known},
             "reproduced": known == made.dates.fork,
         }
 

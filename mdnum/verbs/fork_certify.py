@@ -14,7 +14,7 @@ from mdnum.plain import plain
 from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
-from mdnum.report.words import count, many, number, typeset
+from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import basics, of_any, of_md
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
     from mdnum.forks.exact.certify import Certificate
-    from mdnum.forks.variants import Variant, Variants
+    from mdnum.forks.processes import Variant, Variants
     from mdnum.systems import BallSystem, System
 
 TEXTS = Texts(__file__)
@@ -138,7 +138,7 @@ def _exact_md(found: Certificate) -> dict[str, Any]:
 
 def _ambiguous(simulation: Any, found: Certificate, note: Progress, tables: dict[str, Any]) -> dict[str, Any]:
     """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
-    from mdnum.forks.exact.bounds import certified_horizon
+    from mdnum.forks.certified import certified_horizon
     from mdnum.forks.exact.program import with_policy
     from mdnum.numerics import PrecisionPolicy
 
@@ -313,14 +313,14 @@ def fork_processes(
     Args:
         system: a loaded system, a shipped name or the path of a system file; pair potentials only.
         steps: of each program; default 200, or the system's own where they are fewer.
-        which: the variants; default `mdnum.forks.variants.VARIANTS`.
+        which: the variants; default `mdnum.forks.processes.VARIANTS`.
         out: the new fork folder; default runs/fork-<name>-<n>.
         overrides: dotted keys to values, such as {"precision.force": "float32"}.
         report: write report.html.
         progress: called now and then with variants done, how many there are, and a dictionary of figures.
 
     Returns:
-        its result is a `mdnum.forks.variants.Variants`.
+        its result is a `mdnum.forks.processes.Variants`.
 
     Raises:
         InputError: the system cannot be run, or its potential is a many-body one.
@@ -328,7 +328,7 @@ def fork_processes(
         MdnumError: not one of the variants ran.
     """
     from mdnum.forks.choices.base import is_pairwise
-    from mdnum.forks.variants import VARIANTS, variants
+    from mdnum.forks.processes import VARIANTS, variants
 
     began = time.perf_counter()
     loaded = of_md(system, overrides, "processes")
@@ -365,7 +365,7 @@ def _programs(found: Variants, tables: dict[str, Any]) -> dict[str, Any]:
         rows.append({
             "variant": one.name, "program": one.program, "flags": " ".join(one.flags),
             "reduction": one.reduction or "", "cluster": None if row.failed else row.cluster,
-            "first_bit": row.seed, "steps": len(row.hashes), "separation": row.separation,
+            "first_bit": row.first_bit, "steps": len(row.hashes), "separation": row.separation,
             "seconds": row.seconds, "hash": row.hashes[-1] if row.hashes else "", "failed": row.failed,
         })  # fmt: skip
     table = [
@@ -451,7 +451,7 @@ def page_processes(view: View, verdict: Verdict) -> Page:
         f"largest distance from the reference ({length})", tuple(series), y_scale="log",
         caption=TEXTS("programs_caption"),
     )] if series else []  # fmt: skip
-    causes = [typeset(sentence.replace("'", "’")) for sentence in s["causes"]]
+    causes = [_cause(**cause) for cause in s["causes"]]
     what = [*size(view), ("Programs", TEXTS("programs")), ("Took", f"{number(s['seconds'], 2)} s")]
     sections = [
         Section("Programs", [*causes, Table(columns, rows)], terminal=True),
@@ -460,6 +460,11 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     ]
     return Page(f"{view.name}: programs", TEXTS("programs_about"), keys,
                 [one for one in sections if one.parts], view.system_toml, view.folder.provenance)  # fmt: skip
+
+
+def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: Any) -> str:
+    what = TEXTS(f"cause_of_{program}") if program else ""
+    return TEXTS(f"cause_{code}", names=", ".join(names), what=what, **values)
 
 
 VERBS = {

@@ -286,7 +286,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
         return
     reason = minimal["reason"]
     values = {**minimal, "reason": reason[:1].upper() + reason[1:]}
-    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **values)
+    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_missing", **values)
     if minimal["pairs"]:
         rows = []
         for pair in minimal["pairs"]:

@@ -396,7 +396,7 @@ def _ball_flips(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 def _exponent(made: Fork) -> dict[str, Any]:
     """The largest Lyapunov exponent of run A beside the growth that was seen, or why there is none."""
-    from mdnum.forks.tangent import lyapunov
+    from mdnum.forks.linearized import lyapunov
 
     def none(name: str, **values: Any) -> dict[str, Any]:
         return {"lyapunov": None, "lyapunov_reason": TEXTS(f"lyapunov_{name}", **values)}
@@ -459,4 +459,9 @@ def _minimal(made: Fork, progress: Progress | None) -> dict[str, Any]:
     except InputError as error:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
     pairs = [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs or ()]
-    return {**vars(found), "pairs": None if found.pairs is None else pairs}
+    values = {**vars(found), "n": len(pairs), "decisions": found.horizon + 1}
+    reason = TEXTS(f"minimal_{found.code}", **values)
+    return {
+        **vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "reason": reason,
+        "pairs": pairs or None,
+    }  # fmt: skip

@@ -69,7 +69,7 @@ def folders(tmp_path_factory):
 
 def test_equal_runs_never_part(folders):
     found = compare_folders(folders["plain"], folders["again"])
-    assert (found.seed, found.fork, found.steps) == (None, None, STEPS)
+    assert (found.first_bit, found.fork, found.steps) == (None, None, STEPS)
     assert found.differences == () and found.same_structure
     assert found.causes == () and (found.world, found.channel) == ("md", "")
     assert compare_folders(folders["plain"], folders["short"]).steps == 100
@@ -80,7 +80,7 @@ def test_dates_are_those_of_the_runs_followed_again(folders):
     keys = [key for key, _, _ in found.differences]
     assert "precision.force" in keys
     again = fork(twin_of(found), STEPS, split=10.0, repeats=0)
-    assert found.seed == again.dates.seed == 0
+    assert found.first_bit == again.dates.seed == 0
     assert found.fork == again.dates.fork
     if found.fork is not None:
         assert again.decision is not None
@@ -106,7 +106,7 @@ def test_choices_and_numbers_are_differences_and_no_other_systems(folders):
 
 def test_other_starts_are_said_and_are_a_difference(folders):
     found = compare_folders(folders["plain"], folders["warm"])
-    assert not found.same_structure and found.seed == 0
+    assert not found.same_structure and found.first_bit == 0
     assert {"dynamics.temperature", "start"} < set(found.causes)
     assert [key for key, _, _ in found.differences if key.startswith("start")] == ["start: velocities"]
 

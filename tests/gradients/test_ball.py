@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from mdnum.ball.contacts import Impact, Penalty, Projection
-from mdnum.ball.integrators import BallVerlet, EventLocated, SemiImplicitEuler
 from mdnum.ball.problem import BallProblem, MeanHeight, ResidualPenetration
+from mdnum.ball.step import BallVerlet, EventLocated, Impact, Penalty, Projection, SemiImplicitEuler
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError

@@ -79,25 +79,19 @@ timestep = 0.01
 """
 
 
-@pytest.fixture
-def penalty(tmp_path: Path) -> Path:
-    path = tmp_path / "penalty.toml"
-    path.write_text(PENALTY)
-    return path
+def _written(name: str, text: str) -> Any:
+    @pytest.fixture(name=name)
+    def fixture(tmp_path: Path) -> Path:
+        path = tmp_path / f"{name}.toml"
+        path.write_text(text)
+        return path
+
+    return fixture
 
 
-@pytest.fixture
-def projection(tmp_path: Path) -> Path:
-    path = tmp_path / "projection.toml"
-    path.write_text(PROJECTION)
-    return path
-
-
-@pytest.fixture
-def impact(tmp_path: Path) -> Path:
-    path = tmp_path / "impact.toml"
-    path.write_text(IMPACT)
-    return path
+penalty = _written("penalty", PENALTY)
+projection = _written("projection", PROJECTION)
+impact = _written("impact", IMPACT)
 
 
 def refusal(path: Path, overrides: dict[str, Any] | None = None) -> str:

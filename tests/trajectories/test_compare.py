@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.compare import (
+from mdnum.trajectories.follow import (
     SetDifference,
     displacements,
     distances,

@@ -1,99 +1,408 @@
-"""Damage that leaves numbers: atoms far out, leaps, NetCDF files that end early, text cut and compressed."""
+"""Files that are not what they should be: refused in a line, or read up to where they go wrong."""
 
 from __future__ import annotations
 
 import bz2
 import gzip
+import json
+import re
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
-import ase.io
 import MDAnalysis
 import numpy as np
 import pytest
 from ase import Atoms
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from MDAnalysisTests import datafiles
+from trajectories.files import images, read, text_of, written
 
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.frame import (
-    Box,
-    Frame,
-    FrameError,
-    UnreadableFrame,
-    checked,
-    far_out,
-    leap,
-    smallest_radius,
+from mdnum.trajectories.binary import XtcFile, head_of
+from mdnum.trajectories.frame import FrameError, UnreadableFrame, checked
+from mdnum.trajectories.source import open_trajectory, select
+
+warnings.filterwarnings("ignore", module="MDAnalysis")
+
+
+def ends(path, frame: int, said: str = "") -> list:
+    """The frames of a file that cannot be read from this one on, which whoever stops there never notices."""
+    frames, error = read(open_trajectory(path))
+    assert isinstance(error, UnreadableFrame), error
+    assert error.frame == len(frames) == frame and f"frame {frame}" in str(error)
+    assert re.search(said, str(error)), error
+    return frames
+
+
+def refuse(said: str, *asked, **options) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        list(open_trajectory(*asked, **options).frames())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A water box of 50 atoms as an xtc of 12 frames that MDAnalysis wrote."""
+    folder = tmp_path_factory.mktemp("xtc")
+    universe = MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
+    group = universe.select_atoms("resname SOL")[:200]
+    group.write(folder / "small.gro")
+    with MDAnalysis.Writer(str(folder / "small.xtc"), len(group)) as writer:
+        for _ in range(2):
+            for _ts in universe.trajectory[:6]:
+                writer.write(group)
+    return folder
+
+
+@pytest.fixture
+def cut_dcd(tmp_path):
+    with open(datafiles.DCD, "rb") as file:
+        (tmp_path / "cut.dcd").write_bytes(file.read(1_000_000))
+    return tmp_path / "cut.dcd"
+
+
+# ---- what is no trajectory
+
+
+@pytest.mark.parametrize(
+    ("path", "topology", "counts"),
+    [
+        (datafiles.XTC, datafiles.PSF, "3,341 .*47,681"),
+        (datafiles.DCD, datafiles.GRO, "47,681 .*3,341"),
+        (datafiles.NCDF, datafiles.GRO, "47,681 .*2,661"),
+        ("run.traj", datafiles.two_water_gro, "two_water_gro.gro has 6 atoms and the trajectory 9"),
+    ],
 )
-from mdnum.trajectories.netcdf import head_of
-from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs
-from mdnum.trajectories.source import open_trajectory
-
-DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
+def test_a_topology_of_another_system_names_both_counts(tmp_path, path, topology, counts):
+    path = written(tmp_path, "traj", images()) if path == "run.traj" else path
+    refuse(counts, path, topology)
 
 
-def gas(side: float | None = 20.0, atoms: int = 60) -> Frame:
-    x = np.random.default_rng(3).uniform(0, 20.0, (atoms, 3))
-    return Frame(4, 4.0, x, Box() if side is None else Box(np.eye(3) * side, np.ones(3, bool)))
+@pytest.mark.parametrize(
+    "suffix", ["xtc", "trr", "dcd", "ncdf", "nc", "traj", "extxyz", "lammpstrj", "gro", "pdb", "zzz"]
+)
+@pytest.mark.parametrize("content", [b"", b"\x93 no trajectory \xff\x00" * 40, b"words and words\n" * 9])
+def test_a_file_that_is_no_trajectory_is_refused_in_a_line(tmp_path, suffix, content):
+    path = tmp_path / f"run.{suffix}"
+    path.write_bytes(content)
+    refuse(f"{path}.*" if content else f"{path}: the file is empty", path)
+    if not content:
+        refuse(f"{path}: the file is empty", datafiles.XTC, path)
 
 
-def moved(frame: Frame, atom: int, to: tuple[float, float, float]) -> Frame:
-    x = frame.positions.copy()
-    x[atom] = to
-    return Frame(frame.index, frame.time, x, frame.box)
+def test_what_is_not_there_is_told_as_what_it_is(tmp_path):
+    for path in ("nowhere.xtc", "nowhere.xtc@3:"):
+        refuse("no such file", path)
+    refuse(r"nowhere.gro: no such file", datafiles.XTC, "nowhere.gro")
+    refuse("it is a folder", tmp_path)
+    for world, said in (("flips", "holds results, and no trajectory"), ("md", "--save-every 1")):
+        (tmp_path / "summary.json").write_text(json.dumps({"world": world}))
+        refuse(said, tmp_path)
+    path = written(tmp_path, "traj", images())
+    with pytest.raises(InputError, match=r"names no atom of 9; there are names Ar"):
+        select(open_trajectory(path), "name OW")
+    with pytest.raises(InputError, match="no frame is left"):
+        select(open_trajectory(f"{path}@9:"), "name Ar")
+    assert list(open_trajectory(f"{path}@9:").frames()) == []
+    refuse("named twice", f"{path}@9:", slice=":2")
 
 
-@pytest.mark.parametrize("side", [20.0, None])
-@pytest.mark.parametrize("place", [(1e30, 2.0, 3.0), (2.0, -3e38, 3.0), (2.0, 3.0, 1e9)])
-def test_an_atom_that_no_simulation_puts_there_is_named(side, place):
-    frame = moved(gas(side), 17, place)
-    with pytest.raises(FrameError, match="frame 4: atom 17 is at") as caught:
-        list(checked([frame]))
-    assert caught.value.frame == 4 and "away from the others" in str(caught.value)
-    # two of them, and one that nobody asked about
-    with pytest.raises(FrameError, match=r"atom 17 .*, and 1 other likewise"):
-        list(checked([moved(frame, 2, (0.9 * place[0], 0.9 * place[1], 0.9 * place[2]))]))
-    assert len(list(checked([frame], np.arange(10)))) == 1
+@pytest.mark.parametrize("kind", ["traj", "extxyz", "lammpstrj"])
+def test_frames_without_atoms_are_refused(tmp_path, kind):
+    refuse(rf"run.{kind}: .*no atoms", written(tmp_path, kind, [Atoms(cell=[5, 5, 5], pbc=True)] * 3))
 
 
-def test_what_does_fly_off_drifts_or_was_never_wrapped_is_left_alone():
-    for side, far in ((20.0, 1e5), (None, 1e6)):
-        assert far_out(moved(gas(side), 5, (far, 0.0, 0.0))) is None
-    # all of them together, in a box and out of it
-    for side in (20.0, None):
-        here = gas(side)
-        assert far_out(Frame(0, 0.0, here.positions + 3e7, here.box)) is None
-        assert leap(here, Frame(0, 0.0, here.positions + 3e7, here.box)) is None
-    assert far_out(Frame(0, 0.0, np.zeros((1, 3)), Box())) is None
-    assert far_out(Frame(0, 0.0, np.array([[0.0, 0, 0], [1e9, 0, 0]]), Box())) is None
+# ---- bytes
 
 
-def test_floats_that_tell_no_distance_there_are_said_to():
-    drifted = gas()
-    drifted = Frame(0, 0.0, drifted.positions + 3e7, drifted.box)
-    assert far_out(drifted, radius=2.5, bits=64) is None
-    found = far_out(drifted, radius=2.5, bits=32)
-    assert found is not None and "float32 tells distances no better than to" in found[2] and found[1] == 60
-    assert smallest_radius([Nearest(3), CutoffRule(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
-    assert smallest_radius([Nearest(3)]) == np.inf
+@settings(max_examples=25)
+@given(at=st.floats(0.05, 0.98), size=st.integers(1, 200), byte=st.integers(0, 255))
+def test_a_damaged_xtc_never_ends_the_process(small, at, size, byte):
+    whole = list(open_trajectory(small / "small.xtc").frames())
+    data = bytearray((small / "small.xtc").read_bytes())
+    begin = int(at * len(data))
+    data[begin : begin + size] = bytes([byte]) * len(data[begin : begin + size])
+    path = small / "damaged.xtc"
+    for old in small.glob(".damaged*"):
+        old.unlink()
+    path.write_bytes(bytes(data))
+    frames, error = read(open_trajectory(path, small / "small.gro"))
+    assert error is None or (isinstance(error, UnreadableFrame) and error.frame == len(frames))
+    first = begin * 12 // len(data)
+    for frame, good in zip(frames[:first], whole, strict=False):
+        np.testing.assert_array_equal(frame.positions, good.positions)
+    assert len(frames) >= first
 
 
-def test_a_leap_is_told_and_wrapping_is_none(tmp_path):
-    here = gas()
-    found = leap(here, moved(here, 9, (5e3, 0.0, 0.0)))
-    assert found is not None and found[0] == 9
-    assert leap(here, moved(here, 9, (5e3, 0.0, 0.0)), np.arange(9)) is None
-    assert leap(here, moved(here, 9, (600.0, 0.0, 0.0))) is None
-    frames = [Atoms("Ar60", here.positions, cell=[20.0] * 3, pbc=True) for _ in range(5)]
-    frames[3].positions[9] = [1e5, 1.0, 1.0]
-    ase.io.write(tmp_path / "a.traj", frames)
-    found = mdnum.flips(tmp_path / "a.traj", cutoffs=[4.0], out=tmp_path / "f", report=False).summary
-    assert found["leaps"] == {"frames": 2, "frame": 3, "atom": 9, "distance": pytest.approx(1e5, rel=1e-3)}
-    said = next(one for one in found["findings"] if one["code"] == "LEAP")
-    assert said["severity"] == "warning" and "at frame 3" in said["title"] and "Atom 9" in said["text"]
+def test_the_guard_takes_every_real_file():
+    for path in (datafiles.XTC, datafiles.XTC_multi_frame, datafiles.XTC_sub_sol):
+        with MDAnalysis.lib.formats.libmdaxdr.XTCFile(path) as file:
+            count = len(file)
+        guard = XtcFile(path)
+        for number in range(count):
+            guard.check(number)
+        with pytest.raises(ValueError, match="ends"):
+            guard.check(count)
+        guard.close()
+
+
+@pytest.mark.parametrize("kind", ["cut", "hole"])
+def test_the_analysis_keeps_what_it_read_of_a_damaged_file(tmp_path, small, kind):
+    data = bytearray((small / "small.xtc").read_bytes())
+    begin = int(0.62 * len(data))
+    if kind == "cut":
+        del data[begin:]
+    else:
+        data[begin : begin + 150] = b"\x7f" * 150
+    shutil.copy(small / "small.gro", tmp_path)
+    (tmp_path / "small.xtc").write_bytes(bytes(data))
+    universe = MDAnalysis.Universe(tmp_path / "small.gro", tmp_path / "small.xtc")
+    good = NeighborFlips(MDAnalysis.Universe(small / "small.gro", small / "small.xtc"), 6.0).run(stop=7)
+    for parts in (1, 3):
+        analysis = NeighborFlips(universe, 6.0)
+        with pytest.raises(UnreadableFrame, match="frame 7 cannot be read") as caught:
+            analysis.run(n_parts=parts)
+        assert caught.value.frame == 7 and "7 frames before it are kept" in str(caught.value)
+        assert analysis.frames.tolist() == list(range(7))
+        np.testing.assert_array_equal(analysis.results.flips.frame, good.results.flips.frame)
+        np.testing.assert_array_equal(analysis.results.flips.margin, good.results.flips.margin)
+
+
+def test_a_dcd_that_was_cut_says_so(cut_dcd):
+    def opened(path):
+        return open_trajectory(path, datafiles.PSF)
+
+    frames, error = read(opened(cut_dcd))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 24
+    # who asks for no more than there is gets it
+    assert read(opened(f"{cut_dcd}@:24"))[1] is None and read(opened(datafiles.DCD))[1] is None
+    universe: Any = MDAnalysis.Universe(datafiles.PSF, str(cut_dcd))
+    for parts, asked in ((1, {}), (3, {}), (1, {"stop": 25}), (1, {"step": 5})):
+        analysis = NeighborFlips(universe.atoms[:200], 5.0)
+        with pytest.raises(UnreadableFrame, match="frame 24 cannot be read") as caught:
+            analysis.run(n_parts=parts, **asked)
+        assert caught.value.frame == 24
+        assert analysis.frames.tolist() == list(range(0, 24, asked.get("step", 1)))
+        assert len(analysis.results.flips)
+    for asked in ({"stop": 24}, {"frames": [0, 23]}):
+        NeighborFlips(universe.atoms[:200], 5.0).run(**asked)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("coordinates", r"frame 2 cannot be read \(the file ends in it\)"),
+        ("head", r"frame 2 cannot be read \(the file ends after 30 bytes of it\)"),
+        ("damaged", r"frame 2 cannot be read \(the .* bytes behind the frame before are no frame\)"),
+    ],
+)
+def test_a_trr_that_was_cut_or_damaged_says_so(tmp_path, kind, said):
+    universe: Any = MDAnalysis.Universe.empty(40, trajectory=True)
+    x = np.random.default_rng(0).uniform(0, 20, (4, 40, 3)).astype(np.float32)
+    universe.load_new(x, dimensions=[20, 20, 20, 90, 90, 90])
+    universe.atoms.write(str(tmp_path / "whole.trr"), frames="all")
+    data = bytearray((tmp_path / "whole.trr").read_bytes())
+    each = len(data) // 4
+    if kind == "damaged":
+        data[2 * each : 2 * each + 200] = b"\xff" * 200
+    else:
+        del data[2 * each + {"coordinates": 300, "head": 30}[kind] :]
+    path = tmp_path / "bad.trr"
+    path.write_bytes(bytes(data))
+    ends(path, 2, said)
+    assert read(open_trajectory(f"{path}@:2"))[1] is None
+    assert read(open_trajectory(tmp_path / "whole.trr"))[1] is None
+    universe.load_new(str(path))
+    analysis = NeighborFlips(universe, 5.0)
+    with pytest.raises(UnreadableFrame, match="frame 2 cannot be read"):
+        analysis.run()
+    assert analysis.frames.tolist() == [0, 1] and len(analysis.results.pairs) == 2
+    NeighborFlips(universe, 5.0).run(stop=2)
+
+
+@pytest.mark.parametrize("name", ["NCDF", "NCDFtruncoct", "TRJ_NCBOX", "PFncdf_Trj"])
+def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
+    path = getattr(datafiles, name)
+    head = head_of(path)
+    assert head is not None and not head.cut and head.rest == 0
+    data, whole = Path(path).read_bytes(), list(open_trajectory(path).frames())
+    assert len(whole) == head.records
+    cut = tmp_path / "cut.ncdf"
+    for kept in (1, len(whole) - 1):
+        begin = len(data) - (head.whole - kept) * head.record
+        cut.write_bytes(data[: begin + head.record // 2])
+        opened = open_trajectory(cut)
+        assert opened.reader == "mdnum" and opened.count == kept + 1
+        found = ends(cut, kept, f"its head tells of {head.records} frames")
+        for one, good in zip(found, whole[:kept], strict=True):
+            assert (one.index, one.time) == (good.index, good.time)
+            np.testing.assert_array_equal(one.positions, good.positions)
+            np.testing.assert_array_equal(one.box.matrix, good.box.matrix)
+            assert (one.velocities is None) == (good.velocities is None)
+            if one.velocities is not None:
+                np.testing.assert_array_equal(one.velocities, good.velocities)
+    # whole in what was asked for
+    assert len(list(open_trajectory(f"{cut}@:1").frames())) == 1
+
+
+def test_amber_files_without_a_whole_frame_or_with_more_than_their_head_names(
+    tmp_path,
+):
+    head, data = head_of(datafiles.NCDF), bytearray(Path(datafiles.NCDF).read_bytes())
+    assert head is not None
+    path = tmp_path / "a.nc"
+    for size in (len(data) - head.whole * head.record + 100, 300, 2):
+        path.write_bytes(data[:size])
+        refuse("", path)
+    path.write_bytes(data[:-40])
+    refuse("47,681 atoms and the trajectory 2,661", path, datafiles.GRO)
+    data[4:8] = (27).to_bytes(4, "big")
+    path.write_bytes(data)
+    ends(path, 27, "3 frames more than its head tells of")
+
+
+def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
+    path = written(tmp_path, "traj", images())
+    path.write_bytes(path.read_bytes()[:-300])
+    ends(path, 4, "the file ends in it")
+
+
+# ---- text
+
+
+@pytest.mark.parametrize("kind", ["extxyz", "lammpstrj", "gro", "xyz"])
+@pytest.mark.parametrize("damage", ["cut", "words", "number"])
+def test_text_is_read_up_to_where_it_goes_wrong(tmp_path, kind, damage):
+    path = written(tmp_path, kind, images())
+    lines = path.read_text().splitlines(keepends=True)
+    each = len(lines) // 5
+    at = 2 * each + each - (2 if kind == "gro" else 1)
+    if damage == "cut":
+        del lines[at:]
+    else:
+        odd = "something else altogether\n", re.sub(r"(\.\d)\d", r"\1x", lines[at], count=1)
+        lines[at] = odd[damage == "number"]
+    path.write_text("".join(lines))
+    ends(path, 2, "@:2")
+    if damage == "number":
+        # a word in the middle is not the end of the file
+        assert "ends" not in str(read(open_trajectory(path))[1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "word"),
+    [
+        # as programs write the last column: so many decimals, so many digits in all, with exponents
+        ("extxyz", "{:16.8f}"), ("extxyz", "{:.8e}"), ("extxyz", "{:g}"), ("lammpstrj", "{:g}"),
+        ("lammpstrj", "{:.8e}"), ("xyz", "{:9.4f}"), ("gro", "{}"),
+    ],
+)  # fmt: skip
+def test_a_number_that_was_cut_is_not_read_as_another(tmp_path, kind, word):
+    text = text_of(kind, images(), word.format).rstrip("\n")
+    path = tmp_path / f"run.{kind}"
+    for cut in range(len(text.split()[-1]) + 1):
+        path.write_text(text[: len(text) - cut])
+        for old in tmp_path.glob(".run*"):
+            old.unlink()
+        if cut:
+            ends(path, 4)
+        else:
+            # whole, only the end of the line is missing
+            frames, error = read(open_trajectory(path))
+            assert error is None and len(frames) == 5
+
+
+@pytest.mark.parametrize("packed", ["", ".gz", ".bz2"])
+def test_what_stands_behind_the_last_whole_frame_is_a_frame_too(tmp_path, packed):
+    path = tmp_path / f"run.xyz{packed}"
+    pack = {"": bytes, ".gz": gzip.compress, ".bz2": bz2.compress}[packed]
+    lines = text_of("xyz", images()).splitlines(keepends=True)
+    # a number cut in its fourth atom, whole lines of it, and a number cut in its last line
+    for text, said in (
+        ("".join(lines[:-5])[:-3], "after 6 lines of it"),
+        ("".join(lines[:-4]), "after 7 lines of it"),
+        ("".join(lines)[:-4], "ends in the middle of a number"),
+    ):
+        path.write_bytes(pack(text.encode()))
+        for old in tmp_path.glob(".run*"):
+            old.unlink()
+        ends(path, 4, said)
+        assert read(open_trajectory(f"{path}@:4"))[1] is None
+        error = read(open_trajectory(f"{path}@::2"))[1]
+        assert isinstance(error, UnreadableFrame) and error.frame == 4
+
+
+def test_a_compressed_file_that_ends_early_is_no_wish_to_stop(tmp_path):
+    """EOFError is what a terminal sends for control-D: it must not get as far as the command line."""
+    for kind in ("extxyz", "xyz"):
+        data = gzip.compress(text_of(kind, images(60)).encode())
+        (tmp_path / f"a.{kind}.gz").write_bytes(data[: len(data) // 2])
+    refuse("ended before", tmp_path / "a.xyz.gz")
+    shutil.copy(tmp_path / "a.xyz.gz", tmp_path / "POSCAR.gz")
+    refuse("", tmp_path / "POSCAR.gz")
+    found = mdnum.flips(tmp_path / "a.extxyz.gz", cutoffs=[4.0], out=tmp_path / "f", report=False).summary
+    assert 0 < found["frames"] < 60 and "cannot be read" in found["stopped"]
+
+
+def test_a_box_that_was_cut_to_three_numbers_is_not_a_rectangular_one(tmp_path):
+    side = "   1.00000"
+    text = text_of("gro", images(2), side=side).replace(
+        3 * side, 3 * side + "   0.00000   0.00000   0.50000   0.00000   0.50000   0.50000"
+    )
+    path = tmp_path / "run.gro"
+    path.write_text(text.rstrip("\n"))
+    assert read(open_trajectory(path))[1] is None
+    path.write_text(text.rstrip("\n")[:-60])
+    ends(path, 1, "3 numbers of the box")
+
+
+# ---- other atoms
+
+
+@pytest.mark.parametrize("kind", ["traj", "extxyz"])
+def test_atoms_that_come_and_go_are_refused(tmp_path, kind):
+    path = written(tmp_path, kind, [*images()[:2], Atoms("Ar8", np.ones((8, 3)))])
+    frames, error = read(open_trajectory(path))
+    assert len(frames) == 2 and "frame 2 has 8 atoms and the first 9" in str(error)
+    # whoever tells of it need not find out where
+    assert isinstance(error, FrameError) and error.frame == 2
+
+
+def test_lammps_atoms_that_are_others_are_refused(tmp_path):
+    path = written(tmp_path, "lammpstrj", images(2))
+    first, second = path.read_text().split("TIMESTEP\n1\n")
+    path.write_text(first + "TIMESTEP\n1\n" + second.replace("\n2 Ar", "\n17 Ar"))
+    frames, error = read(open_trajectory(path))
+    assert len(frames) == 1 and "frame 1 lacks atom 2" in str(error)
+
+
+@pytest.mark.parametrize("kind", ["extxyz", "traj", "xyz", "pdb", "gro", "lammpstrj"])
+def test_atoms_that_change_their_order_or_element_in_mid_file_end_it(tmp_path, kind):
+    rng = np.random.default_rng(4)
+    path = written(tmp_path, kind, [
+        Atoms("OH2C" if number < 3 else "OHCH", rng.uniform(0, 8, (4, 3)), cell=np.eye(3) * 9, pbc=True)
+        for number in range(6)
+    ])  # fmt: skip
+    trajectory = open_trajectory(path)
+    seen = []
+    with pytest.raises(FrameError, match=r"frame 3: atom 2 is .*C, and .*H in the first one") as told:
+        for frame in checked(trajectory.frames(), where=str(path)):
+            seen.append(frame.index)
+    assert seen == [0, 1, 2] and told.value.frame == 3
+    # those atoms are not looked at
+    assert len(list(checked(trajectory.frames(), np.array([0, 1])))) == 6
+    # what came before is kept, and said
+    summary = mdnum.flips(path, cutoffs=[3.0], out=tmp_path / "out", report=False).summary
+    assert summary["frames"] == 3 and summary["status"] == "stopped"
+    assert "atom 2" in summary["stopped"]
+    if kind in ("xyz", "pdb"):
+        with pytest.raises(FrameError, match="frame 3: atom 2"):
+            NeighborFlips(MDAnalysis.Universe(str(path)), r_cut=3.0).run()
 
 
 def test_garbage_in_a_dcd_keeps_what_came_before(tmp_path):
@@ -114,109 +423,3 @@ def test_garbage_in_a_dcd_keeps_what_came_before(tmp_path):
     with pytest.raises(FrameError, match="atom 77"):
         analysis.run()
     assert analysis.frames.tolist() == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize("name", ["NCDF", "NCDFtruncoct", "TRJ_NCBOX", "PFncdf_Trj"])
-def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
-    path = getattr(datafiles, name)
-    head = head_of(path)
-    assert head is not None and not head.cut and head.rest == 0
-    data, whole = Path(path).read_bytes(), list(open_trajectory(path).frames())
-    assert len(whole) == head.records
-    cut = tmp_path / "cut.ncdf"
-    for kept in (1, len(whole) - 1):
-        begin = len(data) - (head.whole - kept) * head.record
-        cut.write_bytes(data[: begin + head.record // 2])
-        opened = open_trajectory(cut)
-        assert opened.reader == "mdnum" and opened.count == kept + 1
-        frames = opened.frames()
-        for good in whole[:kept]:
-            read = next(frames)
-            assert (read.index, read.time) == (good.index, good.time)
-            np.testing.assert_array_equal(read.positions, good.positions)
-            np.testing.assert_array_equal(read.box.matrix, good.box.matrix)
-            assert (read.velocities is None) == (good.velocities is None)
-            if read.velocities is not None:
-                np.testing.assert_array_equal(read.velocities, good.velocities)
-        with pytest.raises(UnreadableFrame, match=f"frame {kept} .*its head tells of {head.records} frames"):
-            next(frames)
-    # whole in what was asked for
-    assert len(list(open_trajectory(f"{cut}@:1").frames())) == 1
-
-
-def test_an_amber_file_without_a_whole_frame_is_refused(tmp_path):
-    head, data = head_of(datafiles.NCDF), Path(datafiles.NCDF).read_bytes()
-    assert head is not None
-    path = tmp_path / "a.nc"
-    for size in (len(data) - head.whole * head.record + 100, 300, 2):
-        path.write_bytes(data[:size])
-        with pytest.raises(InputError):
-            open_trajectory(path)
-    path.write_bytes(data[:-40])
-    with pytest.raises(InputError, match="47,681 atoms and the trajectory 2,661"):
-        open_trajectory(path, datafiles.GRO)
-
-
-def test_an_amber_file_that_goes_on_behind_its_head_says_so(tmp_path):
-    data = bytearray(Path(datafiles.NCDF).read_bytes())
-    data[4:8] = (27).to_bytes(4, "big")
-    path = tmp_path / "a.ncdf"
-    path.write_bytes(data)
-    frames = open_trajectory(path).frames()
-    assert sum(1 for _ in zip(range(27), frames, strict=False)) == 27
-    with pytest.raises(UnreadableFrame, match="3 frames more than its head tells of"):
-        next(frames)
-
-
-@pytest.mark.parametrize(("suffix", "packed"), [("gz", gzip.compress), ("bz2", bz2.compress)])
-def test_a_number_cut_in_a_compressed_file_is_no_number(tmp_path, suffix, packed):
-    frames = [Atoms("Ar30", gas(atoms=30).positions + n) for n in range(4)]
-    ase.io.write(tmp_path / "a.xyz", frames, format="xyz")
-    data = (tmp_path / "a.xyz").read_bytes()
-    path = tmp_path / f"a.xyz.{suffix}"
-    path.write_bytes(packed(data))
-    assert len(list(open_trajectory(path).frames())) == 4
-    path.write_bytes(packed(data[:-6]))
-    frames = open_trajectory(path).frames()
-    assert [next(frames).index for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(UnreadableFrame, match="ends in the middle of a number"):
-        next(frames)
-
-
-def test_a_compressed_file_that_ends_early_is_no_wish_to_stop(tmp_path):
-    """EOFError is what a terminal sends for control-D: it must not get as far as the command line."""
-    frames = [Atoms("Ar30", gas(atoms=30).positions + n) for n in range(6)]
-    for name, form in (("a.extxyz", "extxyz"), ("a.xyz", "xyz")):
-        ase.io.write(tmp_path / name, frames, format=form)
-        data = gzip.compress((tmp_path / name).read_bytes())
-        (tmp_path / f"{name}.gz").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match="ended before"):
-        open_trajectory(tmp_path / "a.xyz.gz")
-    shutil.copy(tmp_path / "a.xyz.gz", tmp_path / "POSCAR.gz")
-    with pytest.raises(InputError):
-        open_trajectory(tmp_path / "POSCAR.gz")
-    found = mdnum.flips(tmp_path / "a.extxyz.gz", cutoffs=[4.0], out=tmp_path / "f", report=False).summary
-    assert 0 < found["frames"] < 6 and "cannot be read" in found["stopped"]
-
-
-def test_boxes_of_dl_poly_are_turned_as_its_atoms_are():
-    ours = open_trajectory(DLPOLY, format="HISTORY")
-    assert ours.reader == "MDAnalysis"
-    cells = [atoms.cell.array for atoms in ase.io.iread(DLPOLY, ":", format="dlp-history")]
-    for frame, cell in zip(ours.frames(), cells, strict=True):
-        np.testing.assert_array_equal(frame.box.matrix, cell)
-        assert np.triu(frame.box.matrix, 1).any()
-    # read out of order too
-    last = list(open_trajectory(f"{DLPOLY}@2", format="HISTORY").frames())[-1]
-    np.testing.assert_array_equal(last.box.matrix, cells[2])
-
-
-def test_a_folder_and_nothing_at_all_are_refused(tmp_path):
-    with pytest.raises(InputError, match="it is a folder"):
-        open_trajectory(tmp_path)
-    for name in ("a.xtc", "a.nc", "a.pdb"):
-        (tmp_path / name).touch()
-        with pytest.raises(InputError, match="the file is empty"):
-            open_trajectory(tmp_path / name)
-        with pytest.raises(InputError, match="the file is empty"):
-            open_trajectory(datafiles.XTC, tmp_path / name)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trajectories import brute_force
-from trajectories.boxes import atoms, boxes
+from trajectories.brute_force import as_dict, atoms, boxes, same
 
 from mdnum.errors import InputError
 from mdnum.trajectories import search as pairs
@@ -19,19 +19,6 @@ from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.tracker import HORIZON, Tracker
 
 PERIODIC = np.ones(3, bool)
-
-
-def as_dict(members) -> dict:
-    keys = zip(members.i.tolist(), members.j.tolist(), members.rank.tolist(), strict=True)
-    made = dict(zip(keys, members.distance.tolist(), strict=True))
-    assert list(made) == sorted(made) and len(made) == len(members)
-    return made
-
-
-def same(ours: dict, theirs: dict) -> None:
-    assert set(ours) == set(theirs)
-    for key, distance in theirs.items():
-        assert ours[key] == pytest.approx(distance, abs=1e-9)
 
 
 @settings(max_examples=60)

@@ -14,8 +14,7 @@ from trajectories.liquid import CUTOFF, liquid, memberships, missed_and_invented
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.grid_effect import grid_effect
-from mdnum.trajectories.resolution import infer
+from mdnum.trajectories.resolution import grid_effect, infer
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker

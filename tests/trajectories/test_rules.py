@@ -7,8 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trajectories import brute_force
-from trajectories.boxes import atoms, boxes
-from trajectories.test_pairs import as_dict, same
+from trajectories.brute_force import as_dict, atoms, boxes, same
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame

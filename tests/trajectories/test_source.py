@@ -11,7 +11,6 @@ import MDAnalysis
 import numpy as np
 import pytest
 from ase import Atoms, units
-from MDAnalysis.lib.formats.libdcd import DCDFile
 from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
@@ -84,63 +83,6 @@ def test_atoms_nobody_names_can_be_looked_at_all_the_same():
     with pytest.raises(InputError, match="-s TOPOLOGY"):
         select(trajectory, "name OW")
     np.testing.assert_array_equal(select(trajectory, "index 3:5"), [3, 4, 5])
-
-
-def test_a_charmm_box_is_turned_as_its_coordinates_are():
-    trajectory = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC, slice="::5")
-    with DCDFile(datafiles.DCD_TRICLINIC) as file:
-        cells = [frame.unitcell.copy() for frame in file]
-    for frame in trajectory.frames():
-        xx, xy, yy, xz, yz, zz = cells[frame.index]
-        np.testing.assert_array_equal(frame.box.matrix, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # lengths and cosines stand in the same places of another program's file
-    other = next(open_trajectory(datafiles.DCD_NAMD_TRICLINIC, datafiles.PSF_NAMD_TRICLINIC).frames())
-    assert other.box.matrix[0, 1] == 0 and abs(other.box.matrix[1, 0]) > 1
-
-
-def test_cosines_near_zero_are_no_symmetric_box(tmp_path):
-    with DCDFile(str(tmp_path / "run.dcd"), "w") as file:
-        file.write_header(remarks="", natoms=2, istart=0, nsavc=1, delta=1.0, is_periodic=1)
-        # lengths, and cosines of the angles between
-        file.write(xyz=np.eye(2, 3, dtype=np.float32), box=np.array([30.0, 0.001, 31.0, 0.0, 0.002, 32.0]))
-    matrix = next(open_trajectory(tmp_path / "run.dcd").frames()).box.matrix
-    np.testing.assert_allclose(np.linalg.norm(matrix, axis=1), [30, 31, 32], rtol=1e-6)
-    assert matrix[0, 1] == 0 and matrix[1, 0] == pytest.approx(31 * 0.001, rel=1e-2)
-
-
-def test_the_tilt_of_a_hoomd_box_is_no_cosine(tmp_path):
-    hoomd = pytest.importorskip("gsd.hoomd")
-    with hoomd.open(str(tmp_path / "run.gsd"), "w") as file:
-        for size in (10.0, 10.0, 11.0):
-            frame = hoomd.Frame()
-            frame.particles.N, frame.particles.types = 2, ["A"]
-            frame.particles.position = np.eye(2, 3, dtype=np.float32)
-            frame.configuration.box = [size, 8.0, 9.0, 0.5, -0.25, 0.125]
-            file.append(frame)
-    trajectory = open_trajectory(tmp_path / "run.gsd")
-    assert trajectory.length == "" and trajectory.species.tolist() == ["A", "A"]
-    for frame, size in zip(trajectory.frames(), (10.0, 10.0, 11.0), strict=True):
-        np.testing.assert_array_equal(frame.box.matrix, [[size, 0, 0], [4, 8, 0], [-2.25, 1.125, 9]])
-
-
-def test_the_vectors_of_an_h5md_box_point_where_they_do(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    universe = MDAnalysis.Universe(datafiles.two_water_gro)
-    matrix = np.array([[0.0, 20.0, 1.0], [18.0, 0.0, 0.5], [3.0, 2.0, -22.0]])
-    with MDAnalysis.Writer(str(tmp_path / "run.h5md"), 6) as writer:
-        universe.dimensions = [20, 21, 22, 80, 85, 95]
-        writer.write(universe)
-        writer.write(universe)
-    with h5py.File(tmp_path / "run.h5md", "r+") as file:
-        file["particles/trajectory/box/edges/value"][1] = matrix
-    trajectory = open_trajectory(tmp_path / "run.h5md", datafiles.two_water_gro)
-    # MDAnalysis converts where all units are named, and here that of time is not
-    assert trajectory.length == "nm"
-    frames = list(trajectory.frames())
-    np.testing.assert_allclose(frames[1].box.matrix, matrix, rtol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(frames[0].box.matrix, axis=1), [2.0, 2.1, 2.2], rtol=1e-6)
-    with pytest.raises(InputError, match=r"47,681 atoms and the trajectory 6"):
-        open_trajectory(tmp_path / "run.h5md", datafiles.GRO)
 
 
 @pytest.mark.parametrize("name", ["GRO", "GRO_velocity", "two_water_gro"])

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trajectories import brute_force
-from trajectories.boxes import atoms, boxes
+from trajectories.brute_force import atoms, boxes
 
 from mdnum.errors import InputError
 from mdnum.trajectories import superset

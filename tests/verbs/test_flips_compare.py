@@ -15,7 +15,7 @@ from ase.io import write
 import mdnum
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.trajectories import compare
+from mdnum.trajectories import follow
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule
 from mdnum.trajectories.tracker import Tracker
@@ -114,7 +114,7 @@ def test_what_is_certain_is_found_among_pairs_that_stay_different(
     assert said.severity == "warning" and said.values["certain"] == "frame 3"
     assert "certain_later" in codes_of(found) and (found.folder / "report.html").exists()
     # with more pairs than the table has room for, each of them is looked at
-    monkeypatch.setattr(compare, "ROWS", 2)
+    monkeypatch.setattr(follow, "ROWS", 2)
     a, b = pairs_at([4.0, 4.0, 4.0], 3), pairs_at([4.0, 4.0, 4.0], 3)
     for one, r in ((a, 4.19), (b, 4.21)):
         one[1].positions[[1, 5, 7, 9], 2] = round(0.37 + r, 2)

@@ -11,18 +11,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
 
-from mdnum.audit.base import (
-    TIME_UP,
-    AuditCheck,
-    CalculatorError,
-    CheckResult,
-    Observed,
-    Progress,
-    Skipped,
-    TimeUp,
-    ask_each,
-    finding,
-)  # fmt: skip
+from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
 from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
 from mdnum.audit.structures import group, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, largest, rms
@@ -104,23 +93,21 @@ class InvarianceCheck(AuditCheck):
         judge = _Judge(subject, rng)
         same = _in_turns(all_of(judge.atoms, subject.atoms, rng))
         refused: list[tuple[Same, CalculatorError]] = []
-        late: list[Skipped] = []
+        ways = Ways()
 
-        def failed(place: int, error: CalculatorError) -> None:
-            if same[place].code == "NARROW_CELL" and error.cause is not None:
-                late.append((same[place].what, error.message))
+        def failed(one: Same, error: CalculatorError) -> None:
+            if one.code == "NARROW_CELL" and error.cause is not None:
+                ways.skip(one.what, error.message)
                 # a calculator that takes four atoms in a wide cell only is safe
-                if not isinstance(subject.fresh().try_both(same[place].atoms), CalculatorError):
-                    values = {"what": same[place].what, "why": error.message}
+                if not isinstance(subject.fresh().try_both(one.atoms), CalculatorError):
+                    values = {"what": one.what, "why": error.message}
                     judge.notes.append(finding("NARROW_CELL_REFUSED", "info", **values))
             else:
-                refused.append((same[place], error))
+                refused.append((one, error))
 
-        ways = [(one.what, lambda one=one: judge(one)) for one in same]
-        found = ask_each(subject, ways, progress, self.name, late, failed=failed)
-        unasked = sum(why == TIME_UP for _, why in late)
-        if unasked == len(ways):
-            raise TimeUp
+        found = ways.each(
+            subject, same, lambda one: one.what, judge, progress, self.name, required=True, failed=failed
+        )
         differences = list(found.values())
         wrong = [one for one in differences if not one.agrees]
         worst = max(wrong or differences, key=lambda one: one.energy, default=None)
@@ -142,9 +129,9 @@ class InvarianceCheck(AuditCheck):
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
             numbers=numbers,
-            skipped=[*((one.what, error.message) for one, error in refused), *late],
-            asked=len(ways) - unasked,
-            possible=len(ways),
+            skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
+            asked=ways.asked,
+            possible=ways.possible,
         )
 
     def _findings(

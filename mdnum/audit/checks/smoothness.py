@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, Skipped, TimeUp, finding
+from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, finding
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.structures import FARTHEST
 from mdnum.audit.subject import CalculatorSubject
@@ -42,13 +43,12 @@ class SmoothnessCheck(AuditCheck):
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
         find_thresholds(subject)
-        around = walk_surroundings(subject, progress, routes=self.routes)
-        late: list[Skipped] = []
-        crowds = crowd(subject, progress, late, self.neighbors)
-        skipped = [*walks.skipped, *around.skipped, *late]
-        if not crowds and not late:
-            why = "the calculator takes no crowd of single atoms"
-            skipped.append(("caps on the number of neighbors", why))
+        ways = deepcopy(walks.ways)
+        around = walk_surroundings(subject, progress, ways, routes=self.routes)
+        left = len(ways.skipped)
+        crowds = crowd(subject, progress, ways, self.neighbors)
+        if not crowds and len(ways.skipped) == left:
+            ways.skip("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
         kT = subject.kT
         return CheckResult(
             says=summary(walks, around, crowds, kT),
@@ -61,9 +61,7 @@ class SmoothnessCheck(AuditCheck):
             tables=_tables(walks, around, crowds, kT),
             charts=_charts(walks, crowds, subject),
             numbers=_numbers(walks, around, crowds, kT),
-            skipped=skipped,
-            asked=walks.possible - walks.left + around.asked + len(crowds),
-            possible=walks.possible + around.possible + len(crowds) + len(late),
+            **vars(ways),
         )
 
 

@@ -19,19 +19,10 @@ from mdnum.audit.base import (
     Skipped,
     TimeUp,
     finding,
-)  # fmt: skip
+)
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.structures import Pair, molecules, pairs, whole
-from mdnum.audit.subject import (
-    Answered,
-    CalculatorSubject,
-    Forces,
-    differences,
-    largest,
-    not_repeatable,
-    only_trying,
-    rms,
-)  # fmt: skip
+from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -94,7 +85,6 @@ class StateCheck(AuditCheck):
         tolerance = _tolerance(subject, atoms)
         alone = Alone(subject, atoms, noise)
         self.structures |= alone.structures
-        broken = [row for row in rows if row.remembers and row.broken]
         stale = [row for row in rows if row.remembers and not row.broken]
         chance: dict[str, Any] = {}
         if stale and not _again(subject, sequences, stale):
@@ -120,7 +110,9 @@ class StateCheck(AuditCheck):
             says=([f"state_{says}", f"state_{how}"], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
-                *self._judged(stale, tolerance, atoms, broken, refused),
+                *self._memory(stale),
+                *_kept(tolerance, atoms),
+                *self._failures(rows),
                 *_changed_input(subject, atoms),
                 *alone.findings(),
             ],
@@ -132,21 +124,14 @@ class StateCheck(AuditCheck):
             numbers=numbers,
             skipped=[
                 *skipped,
-                *((row.what, row.refused.message) for row in refused if row.refused),
+                *((row.what, row.why) for row in refused),
                 *((what, error.message) for what, error in alone.refused),
             ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
 
-    def _judged(
-        self,
-        stale: list[Comparison],
-        tolerance: float,
-        atoms: Atoms,
-        broken: list[Comparison],
-        refused: list[Comparison],
-    ) -> Iterator[Observed]:
+    def _memory(self, stale: list[Comparison]) -> Iterator[Observed]:
         if stale:
             worst = max(stale, key=lambda row: row.energy)
             self.structures |= {"stale-before": worst.before, "stale-after": worst.atoms}
@@ -155,14 +140,14 @@ class StateCheck(AuditCheck):
                 energy=worst.energy, force=worst.force, allowed=worst.allowed, why=worst.why,
                 questions=len(stale), sequences=", ".join(sorted({row.sequence for row in stale})),
             )  # fmt: skip
-        if tolerance:
-            severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
-            yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
-        if broken:
-            yield finding("BROKEN_BY_FAILURE", "info", step=broken[0].what, why=broken[0].why)
-        if empty := [row for row in refused if row.refused and row.refused.cause is None]:
-            self.structures["not-finite"] = empty[0].atoms
-            yield finding("NOT_FINITE", "error", step=empty[0].what, why=empty[0].why)
+
+    def _failures(self, rows: list[Comparison]) -> Iterator[Observed]:
+        for row in [row for row in rows if row.remembers and row.broken][:1]:
+            yield finding("BROKEN_BY_FAILURE", "info", step=row.what, why=row.why)
+        empty = (row for row in rows if row.refused and not row.remembers and row.refused.cause is None)
+        if row := next(empty, None):
+            self.structures["not-finite"] = row.atoms
+            yield finding("NOT_FINITE", "error", step=row.what, why=row.why)
 
 
 @dataclass
@@ -207,15 +192,12 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
-        with only_trying(subject):
+        with subject.trying():
             found = pairs(subject)[0]
     except CalculatorError as error:
         return {}, [(what, error.message)]
-    for pair in found[:1]:
-        radii = [one.radius for one in thresholds if set(one.species) == set(pair.species)]
-        if radii:
-            return dict(approaches(pair, max(radii))), []
-    return {}, [(what, "no cutoff was found")]
+    radii = [one.radius for one in thresholds if found and set(one.species) == set(found[0].species)]
+    return (dict(approaches(found[0], max(radii))), []) if radii else ({}, [(what, "no cutoff was found")])
 
 
 def _through(
@@ -291,7 +273,7 @@ def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
             used.forget()
     objects = [within[0], *(subject.fresh().both(atoms) for _ in range(_NEW - 1))]
 
-    def spread(answers: list[tuple[float, Forces]]) -> tuple[bool, float, float]:
+    def spread(answers: list[tuple[float, np.ndarray]]) -> tuple[bool, float, float]:
         (energy, forces), *others = answers
         same = all(one[0] == energy and one[1].tobytes() == forces.tobytes() for one in others)
         force = np.max(np.ptp([one[1] for one in answers], axis=0), initial=0.0)
@@ -313,12 +295,12 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
     within = not repeats["bit-identical"]
     if not within and repeats["bit-identical between objects"] and not chance:
         return
-    sizes = [
+    energy, force = (
         max(repeats[f"{what} scatter by"], repeats[f"{what} between objects"], chance.get(one, 0.0))
         for what, one in (("energies", "energy"), ("forces", "force"))
-    ]
+    )
     how = "chance" if chance else "within" if within else "between"
-    yield not_repeatable(how, *sizes, repeats["typical force"], kT, answers=chance.get("answers", 0))
+    yield not_repeatable(how, energy, force, repeats["typical force"], kT, answers=chance.get("answers", 0))
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
@@ -371,13 +353,19 @@ def _grain(atoms: Atoms) -> float:
     return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
 
 
+def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
+    if tolerance:
+        severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
+        yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
+
+
 def _changed_input(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
     for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other = subject.fresh()
         try:
-            with only_trying(other):
+            with other.trying():
                 changed = other.writes(there)
         except CalculatorError:
             continue  # reported elsewhere

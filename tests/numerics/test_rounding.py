@@ -1,18 +1,75 @@
-"""The bound of a margin, for every combination of roles: against rationals, and not far too large."""
+"""Floats as integers against nextafter; bounds of margins, for all roles, against rationals."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from fractions import Fraction
+from typing import Any
 
-import hypothesis.strategies as st
+import ml_dtypes
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mdnum.md.cell import Cell, HostCell, complete, wrap_positions
 from mdnum.md.decide import CONVENTIONS, PairDecider
+from mdnum.numerics.rounding import gamma, neighbor, ordinal, ulp_distance, unit_roundoff
+
+WIDTHS: dict[type, Any] = {np.float64: 64, np.float32: 32, np.float16: 16, ml_dtypes.bfloat16: 32}
+
+
+def numbers(dtype):
+    drawn = st.floats(width=WIDTHS[dtype], allow_nan=False, allow_infinity=False).map(dtype)
+    # the largest float32 rounds to infinity in bfloat16
+    return drawn.filter(np.isfinite)
+
+
+@pytest.mark.parametrize("dtype", WIDTHS)
+@given(data=st.data(), ulps=st.integers(-20, 20))
+@np.errstate(over="ignore")  # above the largest float comes infinity
+def test_ordinals_count_steps_of_nextafter_and_keep_the_order_of_the_floats(dtype, data, ulps):
+    a, b = data.draw(numbers(dtype)), data.draw(numbers(dtype))
+    difference = int(ordinal(np.asarray(b))) - int(ordinal(np.asarray(a)))
+    assert np.sign(difference) == np.sign(float(b) - float(a))
+    walked = a
+    for _ in range(abs(ulps)):
+        walked = np.nextafter(walked, dtype(np.inf if ulps > 0 else -np.inf))
+    if np.isfinite(walked):
+        found = neighbor(a, ulps, dtype)
+        assert found == walked and found.dtype == dtype
+        assert int(ulp_distance(a, found, dtype)) == ulps
+
+
+def test_both_zeros_are_one_place():
+    for dtype in WIDTHS:
+        assert int(ulp_distance(-0.0, 0.0, dtype)) == 0
+        tiny = np.nextafter(dtype(0), dtype(1))
+        assert int(ulp_distance(-tiny, tiny, dtype)) == 2
+        assert neighbor(-tiny, 1, dtype) == 0
+
+
+def test_unit_roundoff_is_the_largest_error_of_one_rounding():
+    assert unit_roundoff(np.float64) == 2.0**-53
+    assert unit_roundoff(np.float32) == 2.0**-24
+    assert unit_roundoff(ml_dtypes.bfloat16) == 2.0**-8
+    for dtype in (np.float64, np.float32):
+        u = unit_roundoff(dtype)
+        # half way rounds to even, a little more goes up: nothing is further than u away
+        assert dtype(1) + dtype(u) == 1
+        assert dtype(1) + dtype(u * 1.001) > 1 or dtype is np.float64
+        assert np.nextafter(dtype(1), dtype(2)) == dtype(1 + 2 * u)
+
+
+def test_gamma_bounds_a_product_of_roundings():
+    u = 2.0**-53
+    for n in (1, 3, 7, 100):
+        assert (1 + Fraction(u)) ** n - 1 <= Fraction(gamma(n))
+        assert gamma(n) >= n * u
+
+
+# --- the bound of a margin --------------------------------------------------------------------------------
 
 ROLES = [(state, dtype) for state in ("float64", "float32") for dtype in ("float64", "float32")]
 #: Lattice vectors as rows, and which of them are periodic.
@@ -58,27 +115,6 @@ def nearest_square(start, end, cell: Cell) -> Fraction:
 def root(x: Fraction) -> Fraction:
     """The square root to some sixty digits."""
     return Fraction(math.isqrt((x.numerator << 400) // x.denominator), 1 << 200)
-
-
-@settings(max_examples=60)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    box=st.sampled_from(sorted(BOXES)),
-    compare=st.sampled_from(CONVENTIONS),
-    roles=st.sampled_from(ROLES),
-    widest=st.sampled_from([0.0, 4.0, 1000.0]),
-)
-def test_no_margin_is_further_from_the_exact_one_than_its_bound(seed, box, compare, roles, widest):
-    state, dtype = roles
-    cell, start, end = pairs(box, state, dtype, 8, seed, widest)
-    decider = decider_of(cell, compare, state, dtype, np.concatenate([start, end]))
-    quantity = decider.host_quantity(*HostCell(cell, dtype).displacement(start, end))
-    exact_value = Fraction(RADIUS) if decider.space == "r" else Fraction(RADIUS * RADIUS)
-    for k in range(len(start)):
-        margin = Fraction(decider.thresholds[0].value) - Fraction(float(quantity[k]))
-        square = nearest_square(start[k], end[k], cell)
-        exact = exact_value - (root(square) if decider.space == "r" else square)
-        assert abs(margin - exact) <= decider.bounds[0], (box, roles, compare, float(abs(margin - exact)))
 
 
 def random_box(rng: np.random.Generator) -> Cell:

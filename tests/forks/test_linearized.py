@@ -13,8 +13,7 @@ from forks.harness import crystal, pair
 from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
-from mdnum.forks.forecast import forecast
-from mdnum.forks.tangent import lyapunov, tangents
+from mdnum.forks.linearized import forecast, lyapunov, tangents
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs
@@ -203,7 +202,7 @@ def test_the_tangent_is_the_difference_of_two_runs():
     runs = [MdProgram(replace(a, positions=a.positions + sign * size * u)).history(250) for sign in (1, -1)]
     assert runs[0].first_difference(runs[1]) is None
     seen = np.sqrt(((runs[0].x - runs[1].x) ** 2).sum(axis=1)).max() / (2 * size)
-    parts = list(tangents(a, 250, u, 0 * u, clock=0.1))
+    parts = list(tangents(a, 250, u, 0 * u))
     assert len({part.segment.epoch for part in parts}) > 1
     assert np.exp(parts[-1].furthest[-1]) == pytest.approx(seen, rel=1e-5)
 

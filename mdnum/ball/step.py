@@ -1,4 +1,8 @@
-"""Contact models: a force (penalty), an iterated constraint (projection), an instant (impact)."""
+"""One step of a ball: schemes of flight, and contact models: a force, an iterated constraint, an instant.
+
+Every scheme says at which height the contact decision is made; the record holds that height. All products
+are rounded before they are added (no fused multiply-add), so numpy in the same dtype has the same bits.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,82 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.ball.integrators import Balls, EventLocated, Push, Rounding, Scheme
-from mdnum.ball.state import BallRecord, Reason, Solve
-from mdnum.ball.stopping import StopRule, elementwise, iterate, no_solve
+from mdnum.ball.stopping import Maximum, Reason, Solve, StopRule, elementwise, iterate, no_solve
+from mdnum.numerics.exact import fence
 from mdnum.numerics.roles import RolePrecision
+
+Balls = Float[Array, "balls"]
+Touching = Bool[Array, "balls"]
+
+
+class BallState(NamedTuple):
+    """A batch of balls between two steps.
+
+    Attributes:
+        step: number of steps made.
+        y: heights above the floor, m, shape (balls,).
+        v: velocities, upward positive, m/s, shape (balls,).
+        a: accelerations that velocity Verlet carries from one step to the next, m/s², shape (balls,).
+        touching: the contact decision of the step before, shape (balls,); what hysteresis looks back to.
+    """
+
+    step: Int[Array, ""]
+    y: Float[Array, "balls"]
+    v: Float[Array, "balls"]
+    a: Float[Array, "balls"]
+    touching: Bool[Array, "balls"]
+
+
+class BallDecisions(NamedTuple):
+    """Everything that a step decides; or what is imposed on a step, in part or in whole.
+
+    Attributes:
+        contact: whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1,
+            and a negative number where the step is to decide by itself.
+        iterations: iterations of the step's solver, shape () where one rule stops it for all balls,
+            (balls,) where each ball has its own; impacts located in the step for an event-located one. A
+            negative number, imposed, leaves it to the step.
+    """
+
+    contact: Bool[Array, "balls"] | Int[Array, "balls"]
+    iterations: Int[Array, "..."]
+
+
+class BallRecord(NamedTuple):
+    """What a step leaves.
+
+    Attributes:
+        height: what the contact decision compared with zero, m, shape (balls,).
+        contact: the decision, shape (balls,).
+        left: penetration that the contact model left, m, shape (balls,); carries derivatives.
+        solve: of the step's solver.
+    """
+
+    height: Float[Array, "balls"]
+    contact: Bool[Array, "balls"]
+    left: Float[Array, "balls"]
+    solve: Solve
+
+    @property
+    def decisions(self) -> BallDecisions:
+        """What the step decided, to be imposed on another."""
+        return BallDecisions(self.contact, self.solve.iterations)
+
+
+class Rounding(eqx.Module):
+    """Rounds a product (or anything) before it is used: the fence, with the zero it needs.
+
+    Attributes:
+        zero: an integer zero that the compiler must not know (see mdnum.numerics.exact).
+    """
+
+    zero: Int[Array, ""]
+
+    def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """x, rounded here."""
+        return fence(x, self.zero)
 
 
 class Motion(NamedTuple):
@@ -34,7 +108,7 @@ class Motion(NamedTuple):
     v: Balls
     carried: Balls
     free: Balls
-    judge: Callable[[Balls], Bool[Array, "balls"]]
+    judge: Callable[[Balls], Touching]
     imposed: Int[Array, "..."] | None
     integrator: Scheme
     policy: RolePrecision
@@ -51,6 +125,174 @@ class Moved(NamedTuple):
     record: BallRecord
 
 
+#: Acceleration from height, velocity and the contact decision.
+Pull = Callable[[Balls, Balls, Touching], Balls]
+
+
+# --- schemes --------------------------------------------------------------------------------------------
+
+
+class Scheme(Protocol):
+    """The contract of a scheme.
+
+    Attributes:
+        h: time step, s.
+    """
+
+    h: Any
+
+    def fly(self, y: Balls, v: Balls, a: Balls, r: Rounding) -> tuple[Balls, Balls]:
+        """One step under a constant acceleration."""
+        ...
+
+    def push(self, pull: Pull, motion: Motion) -> Moved:
+        """One step under a contact force; what it leaves of the penetration is not on the record yet."""
+        ...
+
+
+def _pushed(y, v, a, height, contact, solve=None, *, policy: RolePrecision) -> Moved:
+    solve = no_solve(policy.dtype("decision")) if solve is None else solve
+    return Moved(y, v, a, BallRecord(height, contact, jnp.zeros_like(y), solve))
+
+
+class _Euler(eqx.Module):
+    h: Any
+
+    def push(self, pull, motion):
+        """The decision is made at the old height."""
+        y, v = motion.y, motion.v
+        contact = motion.judge(y)
+        a = pull(y, v, contact)
+        return _pushed(*self.fly(y, v, a, motion.rounding), a, y, contact, policy=motion.policy)  # type: ignore[attr-defined]
+
+
+class ExplicitEuler(_Euler):
+    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact gains energy at any step."""
+
+    def fly(self, y, v, a, r):
+        return r(y + r(self.h * v)), r(v + r(self.h * a))
+
+
+class SemiImplicitEuler(_Euler):
+    """v += h a(y); y += h v with the new velocity. Order 1, symplectic; stable for h sqrt(k) < 2."""
+
+    def fly(self, y, v, a, r):
+        v = r(v + r(self.h * a))
+        return r(y + r(self.h * v)), v
+
+
+class BallVerlet(eqx.Module):
+    """Half kick, drift, force, half kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
+
+    h: Any
+
+    def _drift(self, y, v, a, r):
+        half = r(0.5 * self.h)
+        v = r(v + r(half * a))
+        return r(y + r(self.h * v)), v, half
+
+    def fly(self, y, v, a, r):
+        y, v, half = self._drift(y, v, a, r)
+        return y, r(v + r(half * a))
+
+    def push(self, pull, motion):
+        """The decision is made at the new height; a damping force sees the velocity of the half step."""
+        r = motion.rounding
+        y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
+        contact = motion.judge(y)
+        a = pull(y, v, contact)
+        return _pushed(y, r(v + r(half * a)), a, y, contact, policy=motion.policy)
+
+
+class ImplicitMidpoint(eqx.Module):
+    """The acceleration of the middle of the step, found by Newton's method. Order 2, stable at any step.
+
+    The derivative is the implicit one: of the equation that the solve ends at, not of its iterations.
+
+    Attributes:
+        h: time step, s.
+        stop: when the solve ends; its residual is h times the error in the acceleration, m/s.
+    """
+
+    h: Any
+    stop: StopRule = Maximum(1e-12, 50)
+
+    def fly(self, y, v, a, r):
+        half = r(0.5 * self.h)
+        middle = r(v + r(half * a))
+        return r(y + r(self.h * middle)), r(v + r(self.h * a))
+
+    def push(self, pull, motion):
+        """The decision is made at the height of the middle of the step."""
+        y, v, r, judge = motion.y, motion.v, motion.rounding, motion.judge
+        half = r(0.5 * self.h)
+        quarter = r(half * half)
+        ahead = r(y + r(half * v))
+
+        def middle(a):
+            return r(ahead + r(quarter * a)), r(v + r(half * a))
+
+        def defect(a, contact):
+            return a - pull(*middle(a), contact)
+
+        def newton(a, contact):
+            value, slope = jax.jvp(lambda x: defect(x, contact), (a,), (jnp.ones_like(a),))
+            return r(a - value / slope)
+
+        free = pull(*middle(motion.carried), jnp.zeros(y.shape, bool))
+        free = lax.stop_gradient(free)
+        # which balls touch, and after how many iterations: decided without derivatives
+        found, solve = iterate(
+            self.stop,
+            free,
+            lambda a: lax.stop_gradient(newton(a, judge(middle(a)[0]))),
+            lambda a: jnp.abs(self.h * defect(a, judge(middle(a)[0]))),
+            motion.policy,
+            r.zero,
+            imposed=motion.imposed,
+            history=motion.history,
+        )
+        contact = judge(middle(found)[0])
+        # the same iterations under the decision that was reached: as a step under imposed decisions
+        count = solve.iterations
+
+        def body(carry):
+            a, n = carry
+            return jnp.where(n < count, lax.stop_gradient(newton(a, contact)), a), n + 1
+
+        a, _ = lax.while_loop(lambda carry: jnp.any(carry[1] < count), body, (free, jnp.zeros((), jnp.int32)))
+        a = lax.stop_gradient(a)
+        # one more Newton step has the derivative of the equation; its value is taken off again
+        _, slope = jax.jvp(lambda x: defect(x, contact), (a,), (jnp.ones_like(a),))
+        more = -defect(a, contact) / lax.stop_gradient(slope)
+        a = a + (more - lax.stop_gradient(more))
+        height, _ = middle(a)
+        y, v = self.fly(y, v, a, r)
+        return _pushed(y, v, a, height, contact, solve, policy=motion.policy)
+
+
+class EventLocated(eqx.Module):
+    """Flight along the exact parabola, with every impact located inside the step. For impacts only.
+
+    Attributes:
+        h: time step, s; the trajectory does not depend on it, only where it is looked at.
+        max_impacts: the cap on impacts inside one step.
+    """
+
+    h: Any
+    max_impacts: int = eqx.field(static=True, default=200)
+
+    def fly(self, y, v, a, r):
+        drift = r(self.h * r(v + r(r(0.5 * self.h) * a)))
+        return r(y + drift), r(v + r(self.h * a))
+
+    def push(self, pull, motion):
+        raise TypeError("an event-located step has no contact force")
+
+
+# --- contact models -------------------------------------------------------------------------------------
+
+
 class Contact(Protocol):
     """What happens at the floor."""
 
@@ -58,11 +300,17 @@ class Contact(Protocol):
         """One step."""
         ...
 
-    def acceleration(
-        self, y: Balls, v: Balls, free: Balls, contact: Bool[Array, "balls"], r: Rounding
-    ) -> Balls:
+    def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
         """Acceleration of a state, for schemes that carry it."""
         ...
+
+
+class _Forceless(eqx.Module):
+    """A contact that resets the state."""
+
+    def acceleration(self, y, v, free, contact, r):
+        """There is no contact force."""
+        return free
 
 
 class Penalty(eqx.Module):
@@ -104,14 +352,11 @@ class Penalty(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, r)
 
-        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
-        made = motion.integrator.push(push, motion.y, motion.v, motion.carried, r)
-        left = self.depth(made.y, made.y < 0)
-        record = BallRecord(made.height, made.contact, left, made.solve)
-        return Moved(made.y, made.v, made.a, record)
+        made = motion.integrator.push(pull, motion)
+        return made._replace(record=made.record._replace(left=self.depth(made.y, made.y < 0)))
 
 
-class Projection(eqx.Module):
+class Projection(_Forceless):
     """y ← y + alpha k p with p = max(0, -y) until the rule stops it; then the clamp, and restitution.
 
     Each iteration leaves 1 - alpha k of the penetration, so tol is reached after
@@ -132,10 +377,6 @@ class Projection(eqx.Module):
     stop: StopRule
     restitution: Any = 0.8
     derivative: Any = None
-
-    def acceleration(self, y, v, free, contact, r):
-        """There is no contact force."""
-        return free
 
     def move(self, motion: Motion) -> Moved:
         """Flight, and the projection back where it ends below the floor."""
@@ -173,7 +414,7 @@ class Projection(eqx.Module):
         return Moved(y, v, motion.free, BallRecord(height, contact, left, solve))
 
 
-class Impact(eqx.Module):
+class Impact(_Forceless):
     """v ← -restitution v at the floor.
 
     With an event-located step the impact happens at its exact time, and the rest of the step flies on from
@@ -188,10 +429,6 @@ class Impact(eqx.Module):
 
     restitution: Any = 0.8
     rest_speed: Any = 1e-6
-
-    def acceleration(self, y, v, free, contact, r):
-        """There is no contact force."""
-        return free
 
     def move(self, motion: Motion) -> Moved:
         """Flight with the impacts of this step."""

@@ -6,7 +6,7 @@ little, it differs by little too: pairs are counted with hats and not in boxes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -20,38 +20,15 @@ from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, 
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation
 
-#: Nodes of the pair histogram.
-NODES = 24
-#: The histogram reaches so many times the cutoff, or to half the box.
-_REACH = 1.5
-
-
-@dataclass(frozen=True)
-class Ruler:
-    """What the features are measured on; the same for every run of a comparison.
-
-    Attributes:
-        nodes: distances at which the hats of the pair histogram peak, length, ascending; the last one is
-            where the histogram ends.
-    """
-
-    nodes: Float[np.ndarray, "nodes"]
-
-    @classmethod
-    def of(cls, simulation: Simulation, start: Start) -> Ruler:
-        """A ruler from the closest pairs of a start to as far as pairs are counted."""
-        half = float(np.min(simulation.cell.widths)) / 2
-        reach = min(half, _REACH * simulation.r_cut)
-        distances = pair_distances(simulation, np.asarray(start.state.x, np.float64).T, reach)
-        closest = float(np.quantile(distances, 0.01)) if len(distances) else 0.5 * reach
-        return cls(np.linspace(closest, reach, NODES + 1))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The features, in the order in which `measure` gives them."""
-        pairs = (f"pairs at distance {r:.3g}" for r in self.nodes[:-1])
-        return (*_NUMBERS, *pairs)
-
+#: Hats of the pair histogram, which reaches so many times the cutoff, or to half the box.
+HATS, _REACH = 24, 1.5
+#: Displacement of the furthest atom of a start, in float32 ulps of the largest coordinate. An atom then
+#: moves by more than ten: the rounding of a single precision run must drown in it.
+NOISE = 40
+#: A pair of members is followed no further than this, and compared so often.
+_LONGEST, _EVERY = 20_000, 50
+#: What planted changes multiply the time step and the cutoff radii by.
+_TIMESTEP, _RADIUS = 1.025, 0.96
 
 _NUMBERS = (
     "potential energy",
@@ -64,18 +41,32 @@ _NUMBERS = (
 )
 
 
-def measure(simulation: Simulation, segment: Segment, ruler: Ruler) -> Float[np.ndarray, "features"]:
-    """The features at the last step of a segment.
+# --- features -------------------------------------------------------------------------------------------
+
+
+def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
+    """Distances at which the hats of the pair histogram peak, and where it ends, length, ascending.
+
+    From the closest pairs of a start to as far as pairs are counted.
+    """
+    half = float(np.min(simulation.cell.widths)) / 2
+    reach = min(half, _REACH * simulation.r_cut)
+    distances = pair_distances(simulation, np.asarray(start.state.x, np.float64).T, reach)
+    closest = float(np.quantile(distances, 0.01)) if len(distances) else 0.5 * reach
+    return np.linspace(closest, reach, HATS + 1)
+
+
+def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
+    """The features, in the order in which `measure` gives them."""
+    return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
+
+
+def measure(
+    simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
+) -> Float[np.ndarray, "features"]:
+    """The features at the last step of a segment, in the internal units of the system.
 
     Energies, virial and forces are the run's own; pairs are counted by a list of their own.
-
-    Args:
-        simulation: whose segment it is.
-        segment: with at least one row.
-        ruler: from the first run of the comparison.
-
-    Returns:
-        in the internal units of the system, in the order of `ruler.names`.
     """
     potential, kinetic, virial = (
         float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
@@ -86,19 +77,19 @@ def measure(simulation: Simulation, segment: Segment, ruler: Ruler) -> Float[np.
     square = (force**2).sum(axis=0)
     v = np.asarray(segment.state.v, np.float64)
     each = 0.5 * simulation.masses * (v**2).sum(axis=0)
-    apart = each - each.mean()
+    off = each - each.mean()
     volume = simulation.cell.volume if all(simulation.pbc) else 1.0
     numbers = [
         potential,
         kinetic,
         (2 * kinetic + virial) / (3 * float(volume)),
-        np.sqrt(np.mean(apart**2)),
-        np.cbrt(np.mean(apart**3)),
+        np.sqrt(np.mean(off**2)),
+        np.cbrt(np.mean(off**3)),
         np.sqrt(square.mean()),
         np.mean(square**2) ** 0.25,
     ]
-    distances = pair_distances(simulation, np.asarray(x, np.float64).T, float(ruler.nodes[-1]))
-    return np.concatenate([np.asarray(numbers, np.float64), hats(distances, ruler.nodes)])
+    distances = pair_distances(simulation, np.asarray(x, np.float64).T, float(nodes[-1]))
+    return np.concatenate([np.asarray(numbers, np.float64), hats(distances, nodes)])
 
 
 @eqx.filter_jit
@@ -136,13 +127,6 @@ def hats(
 
 # --- runs -----------------------------------------------------------------------------------------------
 
-#: Displacement of the furthest atom of a start, in float32 ulps of the largest coordinate. An atom then
-#: moves by more than ten: the rounding of a single precision run must drown in it.
-NOISE = 40
-#: A pair of members is followed no further than this, and looked at so often.
-_LONGEST = 20_000
-_GLANCE = 50
-
 
 def noise_size(simulation: Simulation) -> float:
     """Displacement of the furthest atom of a start, length."""
@@ -156,33 +140,21 @@ def starts(simulation: Simulation, count: int, seed: int, start: Start | None = 
     return [program.start for program in programs]
 
 
-class Member:
-    """One run, taken from one step to a later one.
-
-    The start is carried along with the capacity of the list, so that every member uses one compiled program.
-    """
-
-    def __init__(self, simulation: Simulation, start: Start):
-        self.simulation = simulation
-        self.at = start
-
-    def to(self, step: int) -> Segment | None:
-        """The segment that ends with a step; None where the run blew up before."""
-        engine = Engine(self.simulation, step, start=self.at, record=False)
-        segment = None
-        for segment in engine.segments():
+def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
+    """The segments of a run that end with each of some steps, ascending; they end where it blows up."""
+    for step in steps:
+        for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
-                return None
-        assert segment is not None
-        self.at = resume_point(segment)
-        return segment
+                return
+        yield segment
+        start = resume_point(segment)
 
 
 def ensemble(
     simulation: Simulation,
     begin: Sequence[Start],
     windows: Sequence[int],
-    ruler: Ruler,
+    nodes: Float[np.ndarray, "nodes"],
     note: Callable[[], None] | None = None,
 ) -> Float[np.ndarray, "windows runs features"]:
     """Features of every run at every window; not a number from where a run blew up.
@@ -191,45 +163,38 @@ def ensemble(
         simulation: the program.
         begin: a start for each run.
         windows: steps, ascending.
-        ruler: of the comparison.
+        nodes: of the comparison, see `nodes_of`.
         note: called after each run.
     """
-    out = np.full((len(windows), len(begin), len(ruler.names)), np.nan)
+    out = np.full((len(windows), len(begin), len(feature_names(nodes))), np.nan)
     slots = 0
     for run, start in enumerate(begin):
-        member = Member(simulation, replace(start, slots=max(start.slots, slots)))
-        for w, window in enumerate(windows):
-            segment = member.to(window)
-            if segment is None:
-                break
+        # with the capacity of the lists before, so that every member uses one compiled program
+        start = replace(start, slots=max(start.slots, slots))
+        for w, segment in enumerate(stretches(simulation, start, windows)):
             slots = segment.table.slots
-            out[w, run] = measure(simulation, segment, ruler)
+            out[w, run] = measure(simulation, segment, nodes)
         if note is not None:
             note()
     return out
 
 
-def parting(simulation: Simulation, start: Start | None, apart: float, seed: int) -> int | None:
-    """The step at which two members of an ensemble are a given length apart.
+def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
+    """The step at which two members of an ensemble are a given length from each other.
 
     None where they are not within 20,000 steps, or blow up.
     """
-    pair = [Member(simulation, one) for one in starts(simulation, 2, seed, start)]
-    for step in range(_GLANCE, _LONGEST + 1, _GLANCE):
-        segments = [member.to(step) for member in pair]
-        if any(segment is None for segment in segments):
-            return None
-        a, b = (np.asarray(segment.state.x, np.float64) for segment in segments if segment is not None)
+    steps = range(_EVERY, _LONGEST + 1, _EVERY)
+    pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
+    for step, *segments in zip(steps, *pair, strict=False):
+        a, b = (np.asarray(segment.state.x, np.float64) for segment in segments)
         d = simulation.cell.minimum_image(*(a - b))
-        if float(np.sqrt(sum(np.asarray(c) ** 2 for c in d)).max()) > apart:
+        if float(np.sqrt(sum(np.asarray(c) ** 2 for c in d)).max()) > separation:
             return step
     return None
 
 
 # --- planted changes ------------------------------------------------------------------------------------
-
-_TIMESTEP = 1.025
-_RADIUS = 0.96
 
 
 @dataclass(frozen=True)
@@ -237,7 +202,7 @@ class Change:
     """A program that is changed on purpose.
 
     Attributes:
-        name: of the change, in words.
+        name: of the change, for readers.
         must_fail: whether it is another model; else only other rounding.
         simulation: the changed program.
         once: whether one verdict on it is enough, because its runs take long.

@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.child import positions_of
-from mdnum.forks.variants import REFERENCE, VARIANTS, Ran, Variant, _causes, _clustered, variants
+from mdnum.forks.processes import (
+    REFERENCE,
+    VARIANTS,
+    Ran,
+    Variant,
+    causes_of,
+    clustered,
+    positions_of,
+    variants,
+)
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 from mdnum.systems.load import System, load
+from mdnum.verbs.fork_certify import _cause
 
 # processes of their own
 pytestmark = pytest.mark.slow
@@ -23,45 +32,45 @@ def crystal() -> System:
     return load("argon/crystal-108", world="md")
 
 
-def ran(name: str, hashes: str, seed: int | None = None) -> Ran:
+def ran(name: str, hashes: str, first_bit: int | None = None) -> Ran:
     known = {variant.name: variant for variant in VARIANTS}
-    return Ran(known.get(name, Variant(name)), tuple(hashes), -1, seed, 0.0, 1.0, "" if hashes else "no flag")
+    failed = "" if hashes else "no flag"
+    return Ran(known.get(name, Variant(name)), tuple(hashes), failed, first_bit=first_bit)
+
+
+SCAN, AVX = ran("scan", "abcd"), ran("AVX", "axyz", 2)
+NO_FMA = [AVX, ran("SSE4.2", "axyz", 2)]
 
 
 def test_equal_hashes_are_one_cluster_and_a_short_run_joins_whom_it_agrees_with():
-    rows = [
-        ran("scan", "abcd"),
-        ran("eager", "ax", 2),
-        ran("AVX", "axyz", 2),
-        ran("bogus", ""),
-        ran("x", "abcd"),
-    ]
-    assert [row.cluster for row in _clustered(rows)] == [0, 1, 1, -1, 0]
+    rows = [SCAN, ran("eager", "ax", 2), AVX, ran("bogus", ""), ran("x", "abcd")]
+    assert [row.cluster for row in clustered(rows)] == [0, 1, 1, -1, 0]
 
 
-def test_fused_multiply_add_is_named_when_all_that_cannot_fuse_agree():
-    avx = [ran("AVX", "axyz", 2), ran("SSE4.2", "axyz", 2), ran("unoptimized", "axyz", 2)]
-    told = _causes([ran("scan", "abcd"), *avx, ran("eager", "ax", 2)])
-    assert told[0].startswith("Fused multiply-add") and "at step 2" in told[0]
-    assert "nothing to fuse" in told[1]
-    other = _causes([ran("scan", "abcd"), *avx[:2], ran("unoptimized", "awww", 2)])
-    assert "among each other" in other[0] and not any("Fused" in line for line in other)
-    none = _causes([ran("scan", "abcd"), ran("AVX", "abcd"), ran("SSE4.2", "abcd")])
-    assert "no fused multiply-add shows" in none[0]
-    assert _causes([ran("scan", "abcd")]) == []
-
-
-def test_a_batch_or_a_gradient_is_told_from_what_it_fuses():
-    scan, avx = ran("scan", "abcd"), ran("AVX", "axyz", 2)
-    fuses = _causes([scan, avx, ran("grad", "abyz", 3), ran("grad, AVX", "axyz", 2)])
-    assert "value_and_grad leaves the reference at step 3 because it fuses other products" in fuses[-1]
-    orders = _causes([scan, avx, ran("vmap", "abyz", 3), ran("vmap, AVX", "axxx", 2)])
-    assert "A batch leaves the reference at step 3, without fused multiply-add too" in orders[-1]
-    same = _causes([scan, ran("vmap", "abcd"), ran("reversed", "abxx", 3)])
-    assert same == [
-        "A batch has the reference's bits.",
-        "Order: sums in reverse leave the reference at step 3.",
-    ]
+@pytest.mark.parametrize(
+    ("rows", "causes"),
+    [
+        ([], []),
+        # fused multiply-add is named when all that cannot fuse agree
+        (
+            [*NO_FMA, ran("unoptimized", "axyz", 2), ran("eager", "ax", 2)],
+            [("fused", 2), ("eager_plain", None)],
+        ),
+        ([*NO_FMA, ran("unoptimized", "awww", 2)], [("others", None)]),
+        ([ran("AVX", "abcd"), ran("SSE4.2", "abcd")], [("not_fused", None)]),
+        ([ran("eager", "ay", 2)], [("eager_leaves", 2)]),
+        ([AVX, ran("eager", "a")], [("eager_short", None)]),
+        # a batch or a gradient is told from what it fuses
+        ([AVX, ran("grad", "abyz", 3), ran("grad, AVX", "axyz", 2)], [("fuses", 3)]),
+        ([AVX, ran("vmap", "abyz", 3), ran("vmap, AVX", "axxx", 2)], [("orders", 3)]),
+        ([ran("rollout", "abyz", 3)], [("leaves", 3)]),
+        ([ran("vmap", "abcd"), ran("reversed", "abxx", 3)], [("same", None), ("reversed", 3)]),
+    ],
+)
+def test_the_pattern_of_agreement_tells_the_cause(rows, causes):
+    found = list(causes_of([SCAN, *rows]))
+    assert [(cause["code"], cause.get("step")) for cause in found] == causes
+    assert all(_cause(**cause) for cause in found)
 
 
 def test_a_program_is_the_trajectory_of_the_rollout_up_to_rounding(crystal: System):
@@ -101,17 +110,17 @@ def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: System):
     found = variants(crystal, 40, which, progress=lambda done, total, name: told.append((done, total)))
     assert sorted(told) == [(k, 5) for k in range(1, 6)]
     scan, again, avx, reverse, bogus = found.rows
-    assert scan.cluster == again.cluster == 0 and again.seed is None and again.separation == 0
+    assert scan.cluster == again.cluster == 0 and again.first_bit is None and again.separation == 0
     assert len(scan.hashes) == found.steps == 40
     # another order of the sum is another program on every machine
-    assert reverse.cluster > 0 and reverse.seed is not None and 0 < reverse.separation < 1e-12
-    assert any("Order: sums in reverse" in line for line in found.causes)
+    assert reverse.cluster > 0 and reverse.first_bit is not None and 0 < reverse.separation < 1e-12
+    assert "reversed" in [cause["code"] for cause in found.causes]
     assert not avx.failed and len(avx.hashes) == 40
     assert bogus.failed and bogus.cluster == -1 and "xla_no_such_flag" in bogus.failed
     # where this machine fuses, the flag is seen to do something
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists() and " fma " in cpuinfo.read_text(encoding="utf-8"):
-        assert avx.cluster > 0 and avx.seed is not None
+        assert avx.cluster > 0 and avx.first_bit is not None
     assert not any("bogus" in names for names in found.clusters)
 
 

@@ -1,0 +1,409 @@
+"""Binary files that are read with care: GROMACS's xtc when damaged, Amber's NetCDF when it ends early.
+
+The library that decodes xtc files divides by zero, or writes where it must not, when bytes are wrong, and all
+that was read before is lost with the process. So each frame is looked at first. The compressed stream says
+how many bits each atom takes, and walking through it (decoding nothing) tells whether it is one: head, number
+of atoms, step sizes and length have to come out. Damage that leaves a stream which could have been written is
+not found. Source: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), the walk alone.
+
+The libraries that read Amber's NetCDF take a file with fewer records than its head names, which is what a run
+that was killed leaves, for no file at all. Classic format, with 32 or 64 bit offsets
+(docs.unidata.ucar.edu/netcdf-c, "File Format Specifications"); frames as MDAnalysis hands over those of whole
+files (ambermd.org/netcdf/nctraj.xhtml).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
+from mdnum.trajectories.topology import NARROWED, box_of, file_of
+from mdnum.trajectories.trajectory import Trajectory
+
+# magic number, and bytes of the length of the stream: files with more than 2^31 bytes a frame have another
+_MAGIC = {1995: 4, 2023: 8}
+# magic, atoms, step; time and box as floats; then atoms again
+_HEAD = struct.Struct(">3i10fi")
+# precision; smallest and largest of three coordinates; first step size
+_PACKED = struct.Struct(">f3i3ii")
+# up to this many atoms are written as plain floats
+_PLAIN = 9
+# step sizes in the table that both sides have, the first and the last that a stream may use
+_FIRST, _LAST = 9, 72
+# a coordinate this wide is written by itself
+_WIDE = 0xFFFFFF
+
+# NetCDF's bytes of each type: byte, char, short, int, float, double
+_TYPES = {1: ">i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8"}
+_OFFSETS = {1: ">I", 2: ">Q"}
+# what a writer leaves in the place of the number of records until it knows
+_STREAMING = 0xFFFFFFFF
+# heads have some kilobytes; no name or attribute is longer
+_LONGEST = 1 << 24
+
+
+def opened(trajectory: Any) -> XtcFile | None:
+    """The file behind an MDAnalysis trajectory; None where that is no xtc file."""
+    path = file_of(trajectory)
+    return None if trajectory.format != "XTC" or path is None else XtcFile(path)
+
+
+class XtcFile:
+    """Frames of an xtc file, by number.
+
+    Raises:
+        ValueError: by every method, where bytes are not what they have to be or the file ends.
+    """
+
+    def __init__(self, path: str | Path):
+        self._file = open(path, "rb")  # noqa: SIM115 -- as long as frames are read
+        self.path = path
+        self._size = Path(path).stat().st_size
+        self._starts = [0]
+        self._library: Any = None
+        self._at = 0
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+        if self._library is not None:
+            self._library.close()
+
+    @property
+    def atoms(self) -> int:
+        """Atoms of the first frame."""
+        return self._head(0)[1]
+
+    def whole_frames(self) -> int:
+        """Frames up to the end of the file, or to the first whose head is damaged or whose end is missing."""
+        number = 0
+        try:
+            while self._starts[number] < self._size:
+                self._start(number + 1)
+                number += 1
+        except ValueError:
+            pass
+        return number
+
+    def ends_at(self, number: int) -> bool:
+        """Whether the file ends with the frame before this one."""
+        return self._start(number) == self._size
+
+    def check(self, number: int) -> None:
+        """Looks at a frame without decoding it."""
+        self._stream(number, look=True)
+
+    def read(self, number: int) -> Any:
+        """A frame as the library decodes it, in nm and ps, once it has been checked."""
+        self.check(number)
+        if self._library is None:
+            from MDAnalysis.lib.formats.libmdaxdr import XTCFile
+
+            self._library = XTCFile(str(self.path))
+        if number != self._at:
+            # its own search for frames trusts their heads
+            self._library.set_offsets(np.array(self._starts[: number + 1], np.int64))
+            self._library.seek(number)
+        self._at = number + 1
+        return self._library.read()
+
+    def _start(self, number: int) -> int:
+        while len(self._starts) <= number:
+            at = len(self._starts) - 1
+            self._stream(at, look=False)
+            end = self._file.tell()
+            if end > self._size:
+                raise ValueError("the file ends in it")
+            self._starts.append(end)
+        return self._starts[number]
+
+    def _head(self, number: int) -> tuple[Any, ...]:
+        self._file.seek(self._start(number))
+        head = _HEAD.unpack(self._read(_HEAD.size))
+        if head[0] not in _MAGIC or head[1] != head[-1] or head[1] < 0:
+            raise ValueError("damaged: no head of a frame where one has to be")
+        return head
+
+    def _stream(self, number: int, look: bool) -> None:
+        """Goes to the end of a frame, through its compressed coordinates or past them."""
+        head = self._head(number)
+        atoms = head[1]
+        if atoms <= _PLAIN:
+            self._read(12 * atoms)
+            return
+        precision, *limits, small = _PACKED.unpack(self._read(_PACKED.size))
+        size = int.from_bytes(self._read(_MAGIC[head[0]]), "big", signed=True)
+        if size < 0:
+            raise ValueError("damaged: a negative length")
+        if not look:
+            self._file.seek((size + 3) // 4 * 4, 1)
+            return
+        sizes = [high - low + 1 for low, high in zip(limits[:3], limits[3:], strict=True)]
+        if not _FIRST <= small <= _LAST or min(sizes) <= 0 or not precision > 0:
+            raise ValueError("damaged: the head of the compressed coordinates makes no sense")
+        product = sizes[0] * sizes[1] * sizes[2]
+        wide = max(sizes) > _WIDE
+        bits = sum(one.bit_length() for one in sizes) if wide else product.bit_length()
+        stream = np.frombuffer(self._read(size), np.uint8)
+        self._read(-size % 4)
+        if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
+            raise ValueError("damaged: the compressed coordinates do not end where their length says")
+
+    def _read(self, count: int) -> bytes:
+        data = self._file.read(min(count, self._size + 1))
+        if len(data) < count:
+            raise ValueError("the file ends in it")
+        return data
+
+
+@numba.njit(cache=True, nogil=True)
+def _bits(stream, at, count):
+    """The number that `count` bits hold, the first of them the largest."""
+    value = 0
+    while count > 0:
+        free = 8 - (at & 7)
+        take = min(free, count)
+        part = (np.int64(stream[at >> 3]) >> (free - take)) & ((1 << take) - 1)
+        value = (value << take) | part
+        at += take
+        count -= take
+    return value
+
+
+@numba.njit(cache=True, nogil=True)
+def _walk(stream, atoms, whole, small):
+    """Bits that the coordinates of so many atoms take; -8 where the stream is none.
+
+    An atom takes `whole` bits, and after it comes a flag; where it is set, five bits that say how many atoms
+    follow as differences of `small` bits each, and whether `small` changes.
+    """
+    at, done, run = 0, 0, 0
+    most = 8 * stream.shape[0]
+    while done < atoms:
+        at += whole
+        done += 1
+        if at >= most:
+            return -8
+        flag = _bits(stream, at, 1)
+        at += 1
+        change = 0
+        if flag:
+            if at + 5 > most:
+                return -8
+            value = _bits(stream, at, 5)
+            at += 5
+            run = value - value % 3
+            change = value % 3 - 1
+        at += run // 3 * small
+        done += run // 3
+        small += change
+        if small < _FIRST or small > _LAST:
+            return -8
+    return at if done == atoms and at <= most else -8
+
+
+class XtcTrajectory(Trajectory):
+    """An xtc file, in Å and ps. Its coordinates are integers, and float32 by the time they come here."""
+
+    format = "XTC"
+    reader = "MDAnalysis"
+    bits = 32
+    time = "ps"
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+        super().__init__(path, topology, frames)
+        file = XtcFile(path)
+        try:
+            atoms = file.atoms
+        except ValueError as error:
+            raise self._refused(f"it is no xtc file, or a damaged one ({error})") from None
+        whole = file.whole_frames()
+        # a frame that is cut is one to read
+        self._count = whole + (not file.ends_at(whole))
+        file.close()
+        self._has(atoms)
+        self.notes = (NARROWED, *self.table.notes)
+
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        file = XtcFile(self.path)
+        try:
+            for number in numbers:
+                try:
+                    found = file.read(number)
+                except self._fails as error:
+                    raise self._unreadable(number, error) from error
+                yield number, found
+        finally:
+            file.close()
+
+    def _frame(self, number: int, raw: Any) -> Frame:
+        # in Å by the operations that MDAnalysis makes, so that both see the same numbers
+        from MDAnalysis.lib.mdamath import triclinic_box
+
+        ten = np.float32(10)
+        dimensions: Any = triclinic_box(*raw.box)
+        dimensions[:3] *= ten
+        return Frame(number, float(raw.time), (np.array(raw.x) * ten).astype(np.float64), box_of(dimensions))
+
+
+# ---- NetCDF
+
+
+class RecordVariable(NamedTuple):
+    """A variable with a value in every record."""
+
+    begin: int  # of the first value in the file, bytes
+    dtype: np.dtype  # of a value, as stored
+    shape: tuple[int, ...]
+    size: int  # of a value, bytes
+    scale: float | None  # factor that values are meant to be multiplied with; None for none
+
+
+@dataclass(frozen=True)
+class NetcdfHead:
+    """What the head of a NetCDF file says."""
+
+    records: int | None  # how many there should be; None where the writer did not get to say
+    whole: int  # how many there are from beginning to end
+    rest: int  # bytes behind them
+    record: int  # bytes of one
+    atoms: int  # the dimension of that name; 0 without one
+    variables: dict[str, RecordVariable]  # those with a value in every record, by name
+
+    @property
+    def cut(self) -> bool:
+        """Whether the file ends before its head says."""
+        return self.records is not None and self.whole < self.records
+
+
+def head_of(path: str | Path) -> NetcdfHead | None:
+    """The head of a NetCDF file in classic format; None for another file, or where the head itself is cut."""
+    try:
+        with Path(path).open("rb") as file:
+            return _head(file, Path(path).stat().st_size)
+    except (OSError, struct.error, ValueError, KeyError, IndexError, UnicodeDecodeError):
+        return None
+
+
+def _head(file: BufferedReader, size: int) -> NetcdfHead | None:
+    magic = file.read(4)
+    if magic[:3] != b"CDF" or magic[3] not in _OFFSETS:
+        return None
+    records = _number(file)
+    dimensions = [(_word(file), _number(file)) for _ in range(_count(file))]
+    _attributes(file)
+    variables, sizes = {}, []
+    for _ in range(_count(file)):
+        name = _word(file)
+        of = [dimensions[_number(file)] for _ in range(_number(file))]
+        scale = _attributes(file).get("scale_factor")
+        dtype = np.dtype(_TYPES[_number(file)])
+        # its size is told too, rounded up; too large a one is told wrong
+        _number(file)
+        (begin,) = struct.unpack(_OFFSETS[magic[3]], file.read(struct.calcsize(_OFFSETS[magic[3]])))
+        # the dimension without a length is that of the records
+        if of and of[0][1] == 0:
+            shape = tuple(length for _, length in of[1:])
+            bytes_of_it = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            scale = None if scale is None else float(scale[0])
+            variables[name] = RecordVariable(begin, dtype, shape, bytes_of_it, scale)
+            sizes.append(bytes_of_it)
+    if not variables:
+        return None
+    # each begins at a multiple of four, unless it is the only one
+    record = sizes[0] if len(sizes) == 1 else sum(-(-one // 4) * 4 for one in sizes)
+    there = size - min(one.begin for one in variables.values())
+    told = None if records == _STREAMING else records
+    whole = max(there, 0) // record if told is None else min(max(there, 0) // record, told)
+    atoms = next((length for name, length in dimensions if name == "atom"), 0)
+    return NetcdfHead(told, whole, there - whole * record, record, atoms, variables)
+
+
+def _number(file: BufferedReader) -> int:
+    return struct.unpack(">I", file.read(4))[0]
+
+
+def _count(file: BufferedReader) -> int:
+    """Elements of a list, behind its kind."""
+    _number(file)
+    return _number(file)
+
+
+def _word(file: BufferedReader) -> str:
+    length = _number(file)
+    if length > _LONGEST:
+        raise ValueError("no name is as long")
+    return file.read(-(-length // 4) * 4)[:length].decode()
+
+
+def _attributes(file: BufferedReader) -> dict[str, Any]:
+    found = {}
+    for _ in range(_count(file)):
+        name, dtype = _word(file), np.dtype(_TYPES[_number(file)])
+        size = _number(file) * dtype.itemsize
+        if size > _LONGEST:
+            raise ValueError("no attribute is as long")
+        found[name] = np.frombuffer(file.read(-(-size // 4) * 4)[:size], dtype)
+    return found
+
+
+class NetcdfTrajectory(Trajectory):
+    """An Amber NetCDF file that ends early, in Å and ps."""
+
+    format = "NCDF"
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+        super().__init__(path, topology, frames)
+        head = head_of(path)
+        if head is None or "coordinates" not in head.variables or not head.atoms:
+            raise self._refused("it is no Amber NetCDF file, or one that ends in its head")
+        self._head, self._count = head, head.whole + 1
+        if not head.whole:
+            raise self._ends(0)
+        self.bits = 8 * head.variables["coordinates"].dtype.itemsize
+        self.time = "ps" if "time" in head.variables else "frame"
+        self._has(head.atoms)
+        self.notes = self.table.notes
+
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        names = {"coordinates", "velocities", "time", "cell_lengths", "cell_angles"}
+        with self.path.open("rb") as file:
+            for number in numbers:
+                if number >= self._head.whole:
+                    raise self._ends(number)
+                variables = self._head.variables
+                yield (
+                    number,
+                    {name: self._value(file, variables[name], number) for name in names & set(variables)},
+                )
+
+    def _ends(self, number: int) -> UnreadableFrame:
+        count = self._head.records or 0
+        return self._unreadable(number, f"the file ends in it, and its head tells of {count:,} frames")
+
+    def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
+        box, velocities = Box(), raw.get("velocities")
+        if {"cell_lengths", "cell_angles"} <= set(raw):
+            box = box_of(np.concatenate([raw["cell_lengths"], raw["cell_angles"]]).astype(np.float32))
+        return Frame(
+            index=number,
+            time=float(raw.get("time", number)),
+            positions=raw["coordinates"].astype(np.float64),
+            box=box,
+            velocities=None if velocities is None else velocities.astype(np.float64),
+        )
+
+    def _value(self, file: BufferedReader, one: RecordVariable, number: int) -> np.ndarray:
+        file.seek(one.begin + number * self._head.record)
+        values = np.frombuffer(file.read(one.size), one.dtype).reshape(one.shape)
+        values = values.astype(one.dtype.newbyteorder("="))
+        # rounded once, as MDAnalysis does
+        return values if one.scale is None else (values * np.float64(one.scale)).astype(values.dtype)
