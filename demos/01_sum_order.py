@@ -11,8 +11,7 @@ import numpy as np
 from mdnum.ball import BallRun, GlobalSum, Projection, SemiImplicitEuler, World, simulate
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.numerics.roles import RolePrecision
-from mdnum.numerics.running import RunningSum, running_sum_table
-from mdnum.numerics.sums import Reduction
+from mdnum.numerics.sums import Reduction, RunningSum, running_sum_table
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: The tolerance, and five penetrations (m) whose exact sum it is: one just below it and four that are each

@@ -22,8 +22,7 @@ from mdnum.gradients.ball import ThroughIterations
 from mdnum.gradients.problem import Gradient
 from mdnum.numerics.roles import ALL, RolePrecision
 from mdnum.numerics.rounding import neighbor
-from mdnum.numerics.running import RunningSum, running_sum_table
-from mdnum.numerics.sums import Reduction, Sequential
+from mdnum.numerics.sums import Reduction, RunningSum, Sequential, running_sum_table
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
 
 K = ALPHA = 0.5

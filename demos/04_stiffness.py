@@ -13,10 +13,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from mdnum.ball.contacts import Penalty
 from mdnum.ball.exact import ExactPenalty
-from mdnum.ball.integrators import BallVerlet, ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler
-from mdnum.ball.state import BallDecisions
+from mdnum.ball.step import (
+    BallDecisions,
+    BallVerlet,
+    ExplicitEuler,
+    ImplicitMidpoint,
+    Penalty,
+    SemiImplicitEuler,
+)
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.numerics.roles import RolePrecision

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int8
 
-from mdnum.ball.state import Reason
+from mdnum.ball.stopping import Reason
 from mdnum.errors import InputError
 from mdnum.numerics.formats import matmul
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table

@@ -5,16 +5,13 @@ the bits of a run, its start included. Forks, parameter maps, screening and cert
 against it and know neither atoms nor balls. Decide outside, act inside: a program acts on decisions that it
 is given, so a ledger holds what was used, and the decisions of one program can be imposed on another.
 
-Molecular dynamics: `mdnum.rollout.program.MdProgram`. The ball: `mdnum.ball.program.BallProgram`, made of a
-`Problem` (world, y0, v0, steps, loss). That adapter needs of `mdnum.ball`: `simulate(world, start, steps,
-told=decisions)` and its `BallRun` with all decisions, margins and heights; `Problem.with_values` and
-`Problem.value_and_grad`; `height_bound` and `residual_bound`; `counts_alike`.
+Molecular dynamics: `mdnum.rollout.program.MdProgram`. The ball: `mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,26 +22,20 @@ class Program(Protocol):
     """One way to run one system.
 
     Attributes:
-        name: of the system.
         size: number of atoms or balls.
         steps: that the system's own run makes.
         timestep: in the units of the system's file.
-        unit: of lengths.
         scale: the length that tolerances are shares of: the longest cutoff, the largest start height.
         streams: whether runs may go on beyond the steps that were asked for; one that is kept whole does not.
         imposable: why decisions cannot be imposed on it; None where they can.
     """
 
     @property
-    def name(self) -> str: ...
-    @property
     def size(self) -> int: ...
     @property
     def steps(self) -> int: ...
     @property
     def timestep(self) -> float: ...
-    @property
-    def unit(self) -> str: ...
     @property
     def scale(self) -> float: ...
     @property
@@ -167,13 +158,13 @@ class PairRows:
     energy: dict[str, Float[np.ndarray, "rows"]]
     cross: Int[np.ndarray, "rows"]
     flips: Sequence[Any]
-    overridden: dict[str, Real[np.ndarray, "rows"]]
-    furthest: dict[str, Float[np.ndarray, "rows"]]
-    nearest: dict[str, Float[np.ndarray, "rows"]]
-    bound: dict[str, Float[np.ndarray, "rows"]]
-    ambiguous: dict[str, Float[np.ndarray, "rows"]]
-    doubts: dict[str, Any]
-    failed: dict[str, str]
+    overridden: dict[str, Real[np.ndarray, "rows"]] = field(default_factory=dict)
+    furthest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    nearest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    bound: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    ambiguous: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    doubts: dict[str, Any] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -186,25 +177,21 @@ class PairRows:
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
-        # whatever has a value for each row, in an array or in a dictionary of arrays, and nothing else
-        cut = {one.name: _first_rows(getattr(self, one.name), rows) for one in fields(self)}
-        doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
-        flips = [flip for flip in self.flips if flip.step <= last]
-        # a run that failed within these rows has no separation at the last of them; A has rows up to its end
-        failed = {
-            run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
-            for run, word in self.failed.items()
+        columns = ("separation", "energy", "overridden", "furthest", "nearest", "bound", "ambiguous")
+        cut: dict[str, Any] = {
+            name: {run: values[:rows] for run, values in getattr(self, name).items()} for name in columns
         }
-        return PairRows(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
-
-
-def _first_rows(value: Any, rows: int) -> Any:
-    """The first rows of an array, or of each array of a dictionary; anything else as it is."""
-    if isinstance(value, np.ndarray):
-        return value[:rows]
-    if isinstance(value, dict):
-        return {name: _first_rows(one, rows) for name, one in value.items()}
-    return value
+        # a run that failed within these rows has no separation at the last of them; A has rows up to its end
+        ended = {run: np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) for run in self.failed}
+        return replace(
+            self,
+            **cut,
+            bits=self.bits[:rows],
+            cross=self.cross[:rows],
+            flips=[flip for flip in self.flips if flip.step <= last],
+            doubts={run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()},
+            failed={run: word if ended[run] else "" for run, word in self.failed.items()},
+        )
 
 
 @dataclass(frozen=True)

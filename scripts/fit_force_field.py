@@ -39,7 +39,7 @@ from ase.build import bulk
 from jaxtyping import Array, Float
 
 from mdnum.gradients import Problem, method
-from mdnum.gradients.ensemble import Replicas, settled
+from mdnum.gradients.differences import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
 from mdnum.gradients.problem import Method
 from mdnum.gradients.tape import RunTape

@@ -157,10 +157,11 @@ def answered(words: list[str], turns: int) -> dict[str, Any]:
 def mapped(low: float, high: float, steps: int, most: int) -> dict[str, Any]:
     """Seconds of a map along sigma, compilation and the processes that confirm it included."""
     from mdnum.forks.boundaries import boundaries
+    from mdnum.systems import load
 
     say(f"{most} boundaries along sigma")
     busy, wall, beside = time.process_time(), time.perf_counter(), children_seconds()
-    found = boundaries("argon/crystal-108", "potential.sigma", low, high, steps, most=most)
+    found = boundaries(load("argon/crystal-108"), "potential.sigma", low, high, steps, most=most)
     return {
         "boundaries": len(found.boundaries),
         "runs": found.evaluations,

@@ -39,7 +39,7 @@ from ase.build import bulk
 
 from mdnum.gradients import Problem
 from mdnum.gradients.averages import BoundaryTerm, distances, frames
-from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, settled
+from mdnum.gradients.differences import Ensemble, Replicas, SmoothedDifferences, settled
 from mdnum.gradients.losses import MeanPotential, MeanTemperature, VelocityAutocorrelation
 from mdnum.gradients.recorded import EventAware, Symmetric
 from mdnum.gradients.tape import RunTape

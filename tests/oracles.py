@@ -115,3 +115,33 @@ def recomputed_flips(frames, cell, pbc, r_cut, compare="r2 <"):
                 rows.append((step, int(i[k]), int(j[k]), bool(inside[k]), float(margin[k]), distance))
         before = inside
     return rows, counts
+
+
+def broken_alternations(ledger) -> int:
+    """Rows that repeat the direction of the same subject's flip before: 0 for a complete ledger.
+
+    A decision that turned yes can only turn no next, so a missed flip of a subject that flips again
+    leaves two equal directions in a row.
+    """
+    if not len(ledger):
+        return 0
+    keys = tuple(ledger.subject[:, k] for k in range(ledger.subject.shape[1]))
+    order = np.lexsort((ledger.step, *keys))
+    subject, entered = ledger.subject[order], ledger.entered[order]
+    same = np.all(subject[1:] == subject[:-1], axis=1)
+    return int(np.sum(same & (entered[1:] == entered[:-1])))
+
+
+def cut_energy(kind, r, rc, ro, u, slope, cos=np.cos, pi=np.pi):
+    """A pair energy u(r) that ends at rc, from the definition of each cutoff in the literature.
+
+    For any kind of number: complex, so that its derivative comes from a complex step, or of many digits. Of
+    those that switch it holds past the onset ro.
+    """
+    if kind in ("hard", "shifted", "force-shifted"):
+        return u(r) - (kind != "hard") * u(rc) - (kind == "force-shifted") * (r - rc) * slope(rc)
+    if kind == "switched":
+        # HOOMD-blue's xplor; jax_md.energy.multiplicative_isotropic_cutoff; ase LennardJones(smooth=True)
+        return u(r) * (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
+    t = (r - ro) / (rc - ro)
+    return u(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5 if kind == "quintic" else (1 + cos(pi * t)) / 2)

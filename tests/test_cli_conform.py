@@ -331,47 +331,40 @@ _ENDS = """
 import os, signal
 from pathlib import Path
 
-import numpy as np
+from mine import nearest_image
 
 calls = 0
 
-def nearest_image(positions, cell, pbc, r_cut):
+def drops_coincident(positions, cell, pbc, r_cut):
     global calls
     calls += 1
     if calls > 75 and Path("armed").exists():
         Path("armed").unlink()
         os.kill(os.getppid(), signal.SIGKILL)
-    i, j = np.triu_indices(len(positions), 1)
-    apart = positions[j] - positions[i]
-    if pbc.all():
-        apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
-    near = (apart**2).sum(axis=1) < r_cut**2
-    near &= apart.any(axis=1)
-    return i[near], j[near]
+    i, j = nearest_image(positions, cell, pbc, r_cut)
+    apart = (positions[i] != positions[j]).any(axis=1)
+    return i[apart], j[apart]
 """
 
 
-def test_an_examination_that_is_killed_is_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_an_examination_that_is_killed_is_resumed(mine: Path, capsys: pytest.CaptureFixture[str]):
     """By SIGKILL: what was found is there, and its summary is that of one that was not stopped."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "ends.py").write_text(_ENDS)
+    (mine / "ends.py").write_text(_ENDS)
     limits = "minimum-image,orthorhombic,all-axes"
-    asked = f"conform ends.py:nearest_image --cases 5 --no-large --no-report --limits {limits}".split()
+    asked = f"conform ends.py:drops_coincident --cases 2 --no-large --no-report --limits {limits}".split()
     assert call(*asked, "-o", "whole") == 1
-    (tmp_path / "armed").touch()
+    (mine / "armed").touch()
     done = subprocess.run(
         [sys.executable, "-m", "mdnum", *asked, "-o", "killed"], capture_output=True, check=False
     )
-    assert done.returncode == -9 and not (tmp_path / "armed").exists()
-    kept = json.loads((tmp_path / "killed" / "answers.json").read_text())
+    assert done.returncode == -9 and not (mine / "armed").exists()
+    kept = json.loads((mine / "killed" / "answers.json").read_text())
     wrong = [result for result in kept["cases"].values() if result["failures"]]
     assert 20 < len(kept["cases"]) < 120 and wrong
     before = RunFolder.open("killed").summary
     assert before["status"] == "stopped" and before["left"] > 20
     assert call("report", "killed") == 0
-    assert "As far as asked (" in (tmp_path / "killed" / "report.html").read_text()
+    assert "As far as asked (" in (mine / "killed" / "report.html").read_text()
     capsys.readouterr()
     assert call("conform", "mine", "--resume", "killed") == 2
     assert "LIST is an option of a new examination" in capsys.readouterr().err
@@ -380,8 +373,8 @@ def test_an_examination_that_is_killed_is_resumed(
     assert {**whole, "seconds": 0} == {**resumed, "seconds": 0} and whole["status"] == "complete"
     for name in ("areas", "failures"):
         assert RunFolder.open("whole").table(name).equals(RunFolder.open("killed").table(name))
-    scripts = sorted(path.name for path in (tmp_path / "whole").glob("reproduce-*.py"))
-    assert scripts and scripts == sorted(path.name for path in (tmp_path / "killed").glob("reproduce-*.py"))
+    scripts = sorted(path.name for path in (mine / "whole").glob("reproduce-*.py"))
+    assert scripts and scripts == sorted(path.name for path in (mine / "killed").glob("reproduce-*.py"))
     # nothing is asked again of one that is whole
     assert call("conform", "--resume", "killed", "--no-report", "--time", "1e-6") == 1
     assert RunFolder.open("killed").summary["asked"] == whole["asked"]

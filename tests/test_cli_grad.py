@@ -13,9 +13,10 @@ from command_line import call, printed
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem, parameters
-from mdnum.gradients.ensemble import Ensemble, SmoothedDifferences
+from mdnum.gradients.differences import Ensemble, SmoothedDifferences
 from mdnum.gradients.losses import parse
 from mdnum.store import RunFolder
+from mdnum.store.files import write_text
 from mdnum.systems import build
 from mdnum.verbs import frame
 
@@ -265,7 +266,9 @@ def summary(**changes: Any) -> dict[str, Any]:
 def write(path: Path, report: bool = False, **changes: Any) -> frame.Outcome:
     """A finished gradient folder, judged."""
     folder = RunFolder.create(path, world="grad")
-    folder.write_system('name = "argon/synthetic"\nunits = "lj"\n\n[dynamics]\ntimestep = 0.01\n')
+    write_text(
+        folder.path / "system.toml", 'name = "argon/synthetic"\nunits = "lj"\n\n[dynamics]\ntimestep = 0.01\n'
+    )
     folder.write_provenance({"command": "mdnum grad"})
     horizon, flips = np.arange(STEPS + 1), np.arange(len(WEIGHTS))
     size = np.exp(RATE * horizon)

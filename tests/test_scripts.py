@@ -29,6 +29,7 @@ STUDIES = (
     "hard_cutoff_gradient",
     "precision_fork",
     "reduction_order",
+    "scaling",
     "skin_sensitivity",
     "termination_precision",
     "topology_flip_report",

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracles import broken_alternations
 from rollout.harness import assert_ledger_is_complete, go
 
-from mdnum.numerics import Ledger, broken_alternations
+from mdnum.numerics import Ledger
 from mdnum.systems import names
 
 # steps of a short run that sees some flips; a pair of atoms moves little and is cheap

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from ase import Atoms
+from oracles import broken_alternations
 from small_systems import make
 
 from mdnum import ball
 from mdnum.md.pairforce import MdState, PairDynamics
-from mdnum.numerics.events import Ledger, broken_alternations
+from mdnum.numerics.events import Ledger
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import build
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mdnum.audit.subject import CalculatorSubject
 
-T = TypeVar("T")
+Item, T = TypeVar("Item"), TypeVar("T")
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
 Severity = Literal["info", "warning", "error"]
@@ -175,43 +175,67 @@ class AuditCheck:
         return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
 
 
-def ask_each(
-    subject: CalculatorSubject,
-    ways: Sequence[tuple[str, Callable[[], T]]],
-    progress: Progress,
-    phase: str,
-    skipped: list[Skipped],
-    *,
-    unit: str = "ways",
-    spread: bool = False,
-    failed: Callable[[int, CalculatorError], None] | None = None,
-) -> dict[int, T]:
-    """The answers to many ways of asking, by their place; ways that come after the deadline are skipped.
+@dataclass
+class Ways:
+    """Ways of asking, of which some may be left: what every check counts."""
 
-    Args:
-        subject: whose deadline it is.
-        ways: (name, what asks).
-        phase: words for the progress.
-        skipped: gets (name, why) of ways that were left out.
-        unit: what a way is, for the progress.
-        spread: ask in an order in which a few answers tell of the beginning, the middle and the end.
-        failed: called where the calculator fails; otherwise that is raised.
-    """
-    found: dict[int, T] = {}
-    stride = 4 if spread else 1
-    for done, place in enumerate(k for first in range(stride) for k in range(first, len(ways), stride)):
-        what, ask = ways[place]
-        progress(done, len(ways), {"phase": phase, "unit": unit})
-        try:
-            with subject.meter.limited():
-                found[place] = ask()
-        except TimeUp:
-            skipped.append((what, TIME_UP))
-        except CalculatorError as error:
-            if failed is None:
-                raise
-            failed(place, error)
-    return dict(sorted(found.items()))
+    skipped: list[Skipped] = field(default_factory=list)
+    asked: int = 0  # those on which the calculator failed included
+    possible: int = 0
+
+    def skip(self, what: str, why: str) -> None:
+        """Take note of what was not asked, and why."""
+        self.skipped.append((what, why))
+
+    def each(
+        self,
+        subject: CalculatorSubject,
+        items: Sequence[Item],
+        name: Callable[[Item], str],
+        ask: Callable[[Item], T],
+        progress: Progress,
+        phase: str,
+        *,
+        unit: str = "ways",
+        spread: bool = False,
+        required: bool = False,
+        failed: Callable[[Item, CalculatorError], None] | None = None,
+        tolerant: bool = False,
+    ) -> dict[int, T]:
+        """The answers about many items, by their place; those that come after the deadline are skipped.
+
+        Args:
+            subject: whose deadline it is.
+            name: of an item, where it is skipped.
+            phase, unit: words for the progress.
+            spread: ask in an order in which a few answers tell of the beginning, the middle and the end.
+            required: raise `TimeUp` where none could be asked.
+            failed: called where the calculator fails; otherwise that is raised.
+            tolerant: skip those on which it fails instead.
+        """
+        found: dict[int, T] = {}
+        stride = 4 if spread else 1
+        self.possible += len(items)
+        for done, place in enumerate(k for n in range(stride) for k in range(n, len(items), stride)):
+            item = items[place]
+            progress(done, len(items), {"phase": phase, "unit": unit})
+            try:
+                with subject.meter.limited():
+                    found[place] = ask(item)
+            except TimeUp:
+                self.skip(name(item), TIME_UP)
+                continue
+            except CalculatorError as error:
+                if tolerant:
+                    self.skip(name(item), error.message)
+                elif failed is None:
+                    raise
+                else:
+                    failed(item, error)
+            self.asked += 1
+        if required and not self.asked:
+            raise TimeUp
+        return dict(sorted(found.items()))
 
 
 def in_order(names: Sequence[str]) -> list[str]:

@@ -241,9 +241,9 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
             curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
             if not exact:
                 doubt += (high - low) * (_bend(curve, low, -1, room) + _bend(curve, high, 1, room))
-    jumps, doubts = [*map(float, values), float(curvature)], (*map(float, spread), float(doubt))
+    jumps, doubts = np.array([*values, curvature]).tolist(), np.array([*spread, doubt]).tolist()
     order = next((k for k in range(3) if abs(jumps[k]) > _SURE * doubts[k]), SMOOTH)
-    return Jump(low, high, *jumps, (doubts[0], doubts[1], doubts[2]), order, exact)
+    return Jump(low, high, jumps[0], jumps[1], jumps[2], (doubts[0], doubts[1], doubts[2]), order, exact)
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:

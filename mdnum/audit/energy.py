@@ -9,19 +9,17 @@ a force that is not the energy's derivative.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 from ase import Atoms
+from ase.neighborlist import neighbor_list
 from jaxtyping import Float
 
+from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
-from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import SpeciesCutoffs
-from mdnum.trajectories.tracker import Tracker
 
 #: Å before and after a crossing at which the energy is asked for.
 _BESIDE = 1e-7
@@ -40,16 +38,17 @@ _MOST_STEPS, _CALLS = 40, 800
 #: Of kT: what a step leaves unexplained below this is not searched.
 _SMALL = 1e-6
 _BLOCKS = 8
+#: Å by which a list of pairs reaches further than the threshold, so that it lasts for some steps.
+_SKIN = 1.0
 
 Steps = Float[np.ndarray, "steps"]
-#: Energy, and force along the way, by the share of a step's straight way.
-Along = Callable[[float], tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class NveRun:
     """A run at constant energy."""
 
+    start: Atoms  # its species and cell
     timestep: float  # internal time (length * sqrt(mass / energy))
     potential: Float[np.ndarray, "steps"]  # of every step, eV
     kinetic: Float[np.ndarray, "steps"]  # of every step, eV
@@ -67,13 +66,16 @@ class NveRun:
         """Internal time of every step."""
         return self.timestep * np.arange(len(self.potential))
 
+    def at(self, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
+        """The structure with its atoms somewhere else, and no constraints."""
+        there = self.start.copy()
+        there.set_constraint()
+        there.positions = positions
+        return there
 
-def at(like: Atoms, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
-    """The structure with its atoms somewhere else."""
-    there = like.copy()
-    there.set_constraint()
-    there.positions = positions
-    return there
+    def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
+        """Positions at a share of the straight way of a step."""
+        return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class RunCrossing:
     """A pair that crossed a threshold between two steps.
 
     Attributes:
-        i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
+        i, j, rank: the pair, and how many of its images inside are nearer.
     """
 
     step: int  # after it; the step before is one less
@@ -89,7 +91,7 @@ class RunCrossing:
     j: int
     rank: int
     entered: bool  # whether it is inside afterwards
-    threshold: int  # its place among the thresholds
+    threshold: PairThreshold
     distance: float  # at `step`, Å
     margin: float  # at `step`, Å
     share: float  # of the step's straight way at which the distance is the threshold's
@@ -101,73 +103,37 @@ class RunCrossing:
         return 1.0 if self.entered else -1.0
 
 
-def crossings(run: NveRun, like: Atoms, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
-    """All flips of a run, in the order of steps and of their places on the way.
-
-    Args:
-        like: species and cell.
-        thresholds: any number for each pair of species.
-    """
-    box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
-    species = like.get_chemical_symbols()
-    found = []
-    for level in _levels(thresholds, set(species)):
-        radii = {thresholds[place].species: thresholds[place].radius for place in level}
-        places = {frozenset(thresholds[place].species): place for place in level}
-        tracker = Tracker(SpeciesCutoffs(radii), species=species)
-        for step, positions in enumerate(run.positions):
-            flips = tracker.step(Frame(step, float(step), positions, box))
-            # the flips of one pair one way, by place on the way: which image a rank means does not matter
-            taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
-            for row in range(len(flips)):
-                i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
-                place = places[frozenset((species[i], species[j]))]
-                if (i, j, entered) not in taken:
-                    before, after = (run.positions[n][j] - run.positions[n][i] for n in (step - 1, step))
-                    taken[i, j, entered] = _ways(before, after, entered, thresholds[place], box)
-                ways = taken[i, j, entered]
-                share, slack = ways.pop(0) if ways else (0.5, 1e-3)
+def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
+    """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
+    species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
+    for threshold in (one for one in thresholds if set(one.species) <= species):
+        radius, skin, reference = threshold.radius, 0.0, run.positions[0]
+        for step in range(1, len(run.positions)):
+            before, after = run.positions[step - 1 : step + 1]
+            if step == 1 or 2 * _furthest(after - reference) > skin:
+                skin, reference = max(_SKIN, 3 * _furthest(after - before)), before
+                i, j, image = neighbor_list("ijS", run.at(before), {threshold.species: radius + skin})
+                once = (i < j) | ((i == j) & (image @ [1_000_000, 1000, 1] > 0))
+                i, j, shift = i[once], j[once], image[once] @ cell
+            start, end = (positions[j] - positions[i] + shift for positions in (before, after))
+            was, now = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
+            for k in np.flatnonzero((was < radius) != (now < radius)):
+                entered, way = bool(now[k] < radius), end[k] - start[k]
+                distances = now if entered else was
+                nearer = (i == i[k]) & (j == j[k]) & (distances < distances[k])
+                clear = max(_BESIDE, 3 * threshold.located) / max(float(np.linalg.norm(way)), 1e-300)
                 found.append(
                     RunCrossing(
-                        step, i, j, int(flips.rank[row]), entered, place,
-                        float(flips.distance[row]), float(flips.margin[row]), share, slack,
+                        step, int(i[k]), int(j[k]), int(nearer.sum()), entered, threshold, float(now[k]),
+                        radius - float(now[k]), _root(start[k], way, radius**2),
+                        float(np.clip(clear, 1e-9, 1e-3)),
                     )
                 )  # fmt: skip
     return sorted(found, key=lambda one: (one.step, one.share))
 
 
-def _levels(thresholds: Sequence[PairThreshold], species: set[str]) -> list[list[int]]:
-    """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
-    levels: list[list[int]] = []
-    seen: Counter[frozenset[str]] = Counter()
-    for place, one in enumerate(thresholds):
-        if set(one.species) <= species:
-            level = seen[frozenset(one.species)]
-            seen[frozenset(one.species)] += 1
-            levels += [[]] if level == len(levels) else []
-            levels[level].append(place)
-    return levels
-
-
-def _ways(
-    before: Float[np.ndarray, "3"],
-    after: Float[np.ndarray, "3"],
-    entered: bool,
-    threshold: PairThreshold,
-    box: Box,
-) -> list[tuple[float, float]]:
-    """Where on the way of a step images of a pair cross a threshold one way, and what to stay clear of there.
-
-    Ranks name images by their distance: which image a flip belongs to is not known, those that cross are.
-    """
-    end, way = _images(after, threshold.radius, box), after - before
-    start = end - way
-    square = threshold.radius**2
-    was, is_now = np.sum(start**2, axis=1) < square, np.sum(end**2, axis=1) < square
-    crossing = (is_now & ~was) if entered else (was & ~is_now)
-    length = float(np.linalg.norm(way))
-    slack = float(np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3))
-    return sorted((_root(one, way, square), slack) for one in start[crossing])
+def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
+    return float(np.linalg.norm(moved, axis=1).max())
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
@@ -182,49 +148,29 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
     return float(np.clip(min(roots, key=lambda one: abs(one - 0.5)), 0.0, 1.0))
 
 
-def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np.ndarray, "images 3"]:
-    """The periodic images of a vector that may be as long as a radius, and some more."""
-    if not box.periodic:
-        return vector[None]
-    rows = box.matrix[box.pbc]
-    shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
-    base = vector - shares @ rows
-    # distance between the planes of the cell: one over the length of a reciprocal vector
-    widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
-    reach = [range(-int(radius / width) - 2, int(radius / width) + 3) for width in widths]
-    return base + np.array(list(product(*reach)), np.float64) @ rows
+def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
+    """Energy, and force along it, by the share of the straight way of a step; at its ends the run's own."""
+    way = run.positions[step] - run.positions[step - 1]
 
+    def at_share(share: float) -> tuple[float, float]:
+        energy, forces = subject.both(run.at(run.way(step, share)))
+        return energy, float(np.sum(forces * way))
 
-def along_step(subject: CalculatorSubject, run: NveRun, like: Atoms, step: int) -> Along:
-    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
-    known: dict[float, tuple[float, float]] = {}
-
-    def asked(share: float) -> tuple[float, float]:
-        if share not in known:
-            energy, forces = subject.both(at(like, start + share * way))
-            known[share] = energy, float(np.sum(forces * way))
-        return known[share]
-
-    return asked
+    curve = Curve(at_share)
+    for share, n in ((0.0, step - 1), (1.0, step)) if ends else ():
+        curve.known[share] = float(run.potential[n]), float(np.sum(run.forces[n] * way))
+    return curve
 
 
 def account(
-    subject: CalculatorSubject,
-    run: NveRun,
-    like: Atoms,
-    step: int,
-    crossed: Sequence[RunCrossing],
-    thresholds: Sequence[PairThreshold],
-    smooth: int = 2,
+    subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
     """Work of the forces along the straight way of a step, in pieces between its crossings.
 
     Args:
         subject: another object than the run's; asked three times for each crossing and once more.
-        like: species and cell.
         step: at its end.
         crossed: those of this step, by their share.
-        thresholds: as `crossings` was given them.
         smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
             force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
 
@@ -235,40 +181,30 @@ def account(
     Error:
         Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
     """
-    asked, way = along_step(subject, run, like, step), run.positions[step] - run.positions[step - 1]
-    left, end = (
-        (share, (float(run.potential[n]), float(np.sum(run.forces[n] * way))))
-        for share, n in ((0.0, step - 1), (1.0, step))
-    )
+    curve, left = along_step(subject, run, step, ends=True), 0.0
     jumps, rest = [], 0.0
     for one in crossed:
-        order = thresholds[one.threshold].order
+        order = one.threshold.order
         if order >= smooth:
             jumps.append(0.0)
             continue
-        below, above = max(one.share - one.slack, left[0]), min(one.share + one.slack, 1.0)
-        before = (below, asked(below)) if below > left[0] else left
-        after = (above, asked(above)) if above < 1.0 else end
-        rest += _unexplained(left, before, asked)
+        below, above = max(one.share - one.slack, left), min(one.share + one.slack, 1.0)
+        rest += _unexplained(curve, left, below)
+        (before, first), (after, last) = curve(below), curve(above)
         # what the smooth forces do between the two places is no jump
-        mean = 0.5 * (before[1][1] + after[1][1])
-        change = after[1][0] - before[1][0] + mean * (after[0] - before[0])
+        change = after - before + 0.5 * (first + last) * (above - below)
         jumps.append(change if order == 0 else 0.0)
         rest += 0.0 if order == 0 else change
-        left = after
-    return jumps, rest + _unexplained(left, end, asked)
+        left = above
+    return jumps, rest + _unexplained(curve, left, 1.0)
 
 
-def _unexplained(
-    first: tuple[float, tuple[float, float]], last: tuple[float, tuple[float, float]], asked: Along
-) -> float:
+def _unexplained(curve: Curve, low: float, high: float) -> float:
     """Energy gained plus work done between two places, by Simpson's rule; 0 if forces have this energy."""
-    width = last[0] - first[0]
-    if width <= 0:
+    if high <= low:
         return 0.0
-    middle = asked(0.5 * (first[0] + last[0]))[1]
-    work = width * (first[1][1] + 4 * middle + last[1][1]) / 6
-    return last[1][0] - first[1][0] + work
+    (before, first), (after, last) = curve(low), curve(high)
+    return after - before + (high - low) * (first + 4 * curve(0.5 * (low + high))[1] + last) / 6
 
 
 @dataclass(frozen=True)
@@ -315,12 +251,7 @@ class HiddenJumps:
 
 
 def hidden_jumps(
-    probe: CalculatorSubject,
-    run: NveRun,
-    like: Atoms,
-    rest: Steps,
-    sharp: Mapping[int, Sequence[float]],
-    noise: float,
+    probe: CalculatorSubject, run: NveRun, rest: Steps, sharp: Mapping[int, Sequence[float]], noise: float
 ) -> HiddenJumps:
     """Search the steps that leave most unexplained: is it all at single places of their way?
 
@@ -340,37 +271,30 @@ def hidden_jumps(
         if searched and probe.meter.calls - began > _CALLS:
             break
         searched[step] = float(rest[step])
-        jumps += _within(probe, run, like, step, np.asarray(sharp.get(step, ()), np.float64), limit)
+        jumps += _within(probe, run, step, np.asarray(sharp.get(step, ()), np.float64), limit)
     return HiddenJumps(tuple(jumps), searched, tuple(candidates))
 
 
 def _within(
-    probe: CalculatorSubject, run: NveRun, like: Atoms, step: int, sharp: np.ndarray, limit: float
+    probe: CalculatorSubject, run: NveRun, step: int, sharp: np.ndarray, limit: float
 ) -> list[HiddenJump]:
     """The jumps on the way of one step."""
-    asked = along_step(probe, run, like, step)
-
-    def unexplained(low: float, high: float) -> float:
-        return _unexplained((low, asked(low)), (high, asked(high)), asked)
-
-    parts = [(0.0, 1.0)]
-    first = unexplained(0.0, 1.0)
+    curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
+    first = _unexplained(curve, 0.0, 1.0)
     for level in range(_LEVELS):
         middles = [(low, 0.5 * (low + high), high) for low, high in parts]
         halves = [half for low, middle, high in middles for half in ((low, middle), (middle, high))]
-        sizes = [abs(unexplained(*half)) for half in halves]
+        sizes = [abs(_unexplained(curve, *half)) for half in halves]
         floor = max(limit, _FOLLOWED * max(max(sizes), abs(first) if level >= _SPREAD_AT else 0.0))
         parts = [half for half, size in zip(halves, sizes, strict=True) if size > floor]
         if not parts:
             return []
     found = []
-    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
     for low, high in parts:
         middle = 0.5 * (low + high)
-        if len(sharp) and np.abs(sharp - middle).min() < 1e-3:
-            continue
-        ties = _exchanged(at(like, start + low * way), at(like, start + high * way))
-        found.append(HiddenJump(step, middle, unexplained(low, high), ties))
+        if not len(sharp) or np.abs(sharp - middle).min() >= 1e-3:
+            ties = _exchanged(*(run.at(run.way(step, share)) for share in (low, high)))
+            found.append(HiddenJump(step, middle, _unexplained(curve, low, high), ties))
     return found
 
 
@@ -412,9 +336,9 @@ class EnergyBalance:
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
-    def means(self) -> dict[int, float]:
+    def means(self) -> dict[PairThreshold, float]:
         """Jump of a pair that enters, by threshold, eV."""
-        found: dict[int, list[float]] = {}
+        found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
@@ -430,7 +354,6 @@ class EnergyBalance:
 def balance(
     probe: CalculatorSubject,
     run: NveRun,
-    like: Atoms,
     limits: Sequence[PairThreshold],
     rng: np.random.Generator,
     noise: float = 0.0,
@@ -443,12 +366,12 @@ def balance(
         rng: picks the steps whose flips are measured where there are too many.
         noise: of the energy, eV.
     """
-    crossed = crossings(run, like, limits)
+    crossed = crossings(run, limits)
     by_step: dict[int, list[int]] = {}
     for place, one in enumerate(crossed):
         by_step.setdefault(one.step, []).append(place)
     # a step without a crossing that needs care costs one call; of the others a sample must do
-    orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
+    orders = np.array([one.threshold.order for one in crossed], np.int64)
     sharp = int((orders < 2).sum())
     stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
     # a sample of steps is as good as all, unless it is a handful because each step has so many
@@ -465,7 +388,7 @@ def balance(
         places = by_step.get(step, [])
         if step not in left_out:
             here = [crossed[place] for place in places]
-            jumped, rest[step] = account(probe, run, like, step, here, limits, smooth)
+            jumped, rest[step] = account(probe, run, step, here, smooth)
             measured |= dict(zip(places, jumped, strict=True))
     means = EnergyBalance(crossed, rest, measured, rest).means
     jumps = np.zeros(count)
@@ -474,7 +397,7 @@ def balance(
         jumps[one.step] += measured.get(place, one.sign * means.get(one.threshold, 0.0))
         if orders[place] == 0:
             known.setdefault(one.step, []).append(one.share)
-    hidden = hidden_jumps(probe, run, like, rest, known, noise)
+    hidden = hidden_jumps(probe, run, rest, known, noise)
     return EnergyBalance(crossed, jumps, measured, rest, hidden)
 
 

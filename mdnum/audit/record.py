@@ -98,7 +98,7 @@ def _of_system(text: str) -> LoadedCalculator:
         ) from error
 
     def make() -> Any:
-        from mdnum.references.calculator import MdnumCalculator
+        from mdnum.references.ase_models import MdnumCalculator
 
         return MdnumCalculator(system)
 

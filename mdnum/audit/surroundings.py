@@ -12,17 +12,17 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from ase import Atoms
 from ase.neighborlist import neighbor_list
 from jaxtyping import Float, Int
 
-from mdnum.audit.base import CalculatorError, Progress, Skipped, ask_each
+from mdnum.audit.base import CalculatorError, Progress, Ways
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
 from mdnum.audit.structures import Pair, molecules, whole
-from mdnum.audit.subject import CalculatorSubject, differences, only_trying
+from mdnum.audit.subject import CalculatorSubject, differences
 from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
 
 #: Half the stretch around an expected crossing in which it is located, length.
@@ -139,9 +139,6 @@ class EnvironmentWalks:
     events: tuple[Event, ...]  # places at which something jumps
     measured: int  # crossings of known thresholds that were measured
     routes: tuple[str, ...]  # names of routes that were scanned for unknown ones
-    skipped: tuple[Skipped, ...]  # (what, why)
-    asked: int = 0  # crossings and routes that were walked, those on which the calculator failed included
-    possible: int = 0  # all of them
 
     @property
     def unexplained(self) -> list[Event]:
@@ -150,11 +147,16 @@ class EnvironmentWalks:
 
 
 def walk_surroundings(
-    subject: CalculatorSubject, progress: Progress, crossings: int = _CROSSINGS, routes: int = _ROUTES
+    subject: CalculatorSubject,
+    progress: Progress,
+    ways: Ways,
+    crossings: int = _CROSSINGS,
+    routes: int = _ROUTES,
 ) -> EnvironmentWalks:
     """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
 
     Args:
+        ways: counts crossings and routes.
         crossings: of known thresholds in the structure that are measured.
         routes: through the structure on which others are searched.
     """
@@ -164,39 +166,32 @@ def walk_surroundings(
     single = bool(walks) and walks[0].pair.moves == "atom"
     atoms = subject.atoms
     subject.forces(atoms)
-    skipped: list[Skipped] = []
     if len(atoms) > _MANY and walks:
         atoms = _cut_out(atoms, _groups(atoms, single), walks[0].pair)
         try:
             subject.forces(atoms)
         except CalculatorError as error:
-            skipped.append((f"{_CUT_OUT} atoms cut out of the structure", error.message))
+            ways.skip(f"{_CUT_OUT} atoms cut out of the structure", error.message)
             atoms = subject.atoms
     groups = _groups(atoms, single)
     targeted = _targeted(atoms, thresholds, groups)
     if len(targeted) > crossings:
         more = len(targeted) - crossings
-        skipped.append((f"{more} more crossings of known thresholds", f"{crossings} were measured"))
+        ways.skip(f"{more} more crossings of known thresholds", f"{crossings} were measured")
         targeted = targeted[:crossings]
     triples = _triples(subject) if single else []
     scans = [*triples, *_random(atoms, groups, routes)]
-    ways = [(route.name, lambda way=(route, hit): [_at_crossing(subject, *way)]) for route, hit in targeted]
-    ways += [(scan[0].name, lambda scan=scan: _scanned(subject, thresholds, *scan)) for scan in scans]
-    failed: set[int] = set()
+    routed: list[tuple[Any, ...]] = [*targeted, *scans]
 
-    def note(place: int, error: CalculatorError) -> None:
-        failed.add(place)
-        skipped.append((ways[place][0], error.message))
+    def walked(way: tuple[Any, ...]) -> list[Event]:
+        return [_at_crossing(subject, *way)] if len(way) == 2 else _scanned(subject, thresholds, *way)
 
-    found = ask_each(subject, ways, progress, "walking through the structure", skipped, failed=note)
-    asked = {*found, *failed}
+    before, phase = ways.asked, "walking through the structure"
+    found = ways.each(subject, routed, lambda way: way[0].name, walked, progress, phase, tolerant=True)
     return EnvironmentWalks(
         tuple(one for events in found.values() for one in events if not _rounded(one, quantum)),
-        sum(place < len(targeted) for place in asked),
-        tuple(ways[place][0] for place in found if place >= len(targeted)),
-        tuple(skipped),
-        len(asked),
-        len(ways),
+        min(ways.asked - before, len(targeted)),
+        tuple(routed[place][0].name for place in found if place >= len(targeted)),
     )
 
 
@@ -358,13 +353,11 @@ class Crowd:
     jumps: tuple[tuple[int, float], ...]
 
 
-def crowd(
-    subject: CalculatorSubject, progress: Progress, skipped: list[Skipped], most: int = _MOST
-) -> list[Crowd]:
+def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
     """Crowd an atom of each species that the calculator takes alone.
 
     Args:
-        skipped: gets what was not asked, and why.
+        ways: counts them.
         most: neighbors given to the center.
 
     Returns:
@@ -380,12 +373,12 @@ def crowd(
     def crowded(walk: PairWalk) -> Crowd | None:
         for count in sorted({max(most // part, fewest) for part in (1, 2, 4, 8)}, reverse=True):
             # some refuse what is too dense for them
-            with contextlib.suppress(CalculatorError), only_trying(subject):
+            with contextlib.suppress(CalculatorError), subject.trying():
                 return _crowded(subject, walk, count, _TIES // len(alike))
         return None
 
-    ways = [(f"crowding {walk.pair.species[0]}", lambda walk=walk: crowded(walk)) for walk in alike]
-    found = ask_each(subject, ways, progress, "crowding atoms", skipped, unit="elements")
+    name = lambda walk: f"crowding {walk.pair.species[0]}"  # noqa: E731
+    found = ways.each(subject, alike, name, crowded, progress, "crowding atoms", unit="elements")
     return [one for one in found.values() if one]
 
 

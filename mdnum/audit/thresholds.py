@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
-from mdnum.audit.base import CalculatorError, Progress, Skipped, ask_each, idle
+from mdnum.audit.base import CalculatorError, Progress, Ways, idle
 from mdnum.audit.curve import (
     SMOOTH,
     Curve,
@@ -28,10 +28,10 @@ from mdnum.audit.curve import (
     scatter,
     slope,
     smallest_steps,
-)  # fmt: skip
+)
 from mdnum.audit.noise import digits
 from mdnum.audit.structures import FARTHEST, Pair, coarse_scan, pairs
-from mdnum.audit.subject import CalculatorSubject, only_trying
+from mdnum.audit.subject import CalculatorSubject
 
 #: Spacing of a scan, in the unit of length. Two thresholds closer than this may be taken for one.
 STEP = 0.025
@@ -136,12 +136,10 @@ class PairWalks:
     """What walking pairs found."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
-    skipped: tuple[Skipped, ...]  # what was left out, and why
+    ways: Ways  # all pairs that there are to walk, and what was left out
     # pairs of species of the structure without a walk of their own, "Cu-Zr" say; none where whole molecules
     # were walked, whose atoms are not asked about one by one
     not_walked: tuple[str, ...] = ()
-    possible: int = 0  # pairs that there are to walk
-    left: int = 0  # those that were not, because the time was up or there are too many
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
@@ -161,41 +159,38 @@ def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWal
         return subject.known["walks"]
     found, skipped = pairs(subject)
     # those beyond the most frequent ones are skipped already
-    possible = len(found) + sum(what.startswith("pair ") for what, _ in skipped)
-    calls, errors = _CALLS, 0
+    ways = Ways(skipped, possible=sum(what.startswith("pair ") for what, _ in skipped))
+    calls = _CALLS
 
-    def walked(k: int, pair: Pair) -> PairWalk | None:
+    def walked(numbered: tuple[int, Pair]) -> PairWalk | None:
         nonlocal calls
+        k, pair = numbered
         if calls < _FEWEST_CALLS:
-            skipped.append((f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs"))
+            ways.skip(f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs")
+            ways.asked -= 1
             return None
         made = walk(subject, pair, calls=max(calls // (len(found) - k), _FEWEST_CALLS))
         calls -= made.calls
         return made
 
-    def failed(k: int, error: CalculatorError) -> None:
-        nonlocal errors
-        errors += 1
-        skipped.append((f"pair {found[k].name}", error.message))
-
-    ways = [(f"pair {one.name}", lambda k=k, one=one: walked(k, one)) for k, one in enumerate(found)]
-    asked = ask_each(subject, ways, progress, "walking pairs", skipped, unit="pairs", failed=failed)
+    asked = ways.each(
+        subject, list(enumerate(found)), lambda numbered: f"pair {numbered[1].name}", walked, progress,
+        "walking pairs", unit="pairs", tolerant=True,
+    )  # fmt: skip
     walks = [one for one in asked.values() if one is not None]
     known = {frozenset(one.pair.species) for one in walks}
     species = combinations_with_replacement(sorted(set(subject.atoms.get_chemical_symbols())), 2)
     not_walked = tuple("-".join(two) for two in species if frozenset(two) not in known)
     if any(one.pair.moves == "molecule" for one in walks):
         not_walked = ()
-    left = possible - len(walks) - errors
-    subject.known["walks"] = PairWalks(tuple(walks), tuple(skipped), not_walked, possible, left)
+    subject.known["walks"] = PairWalks(tuple(walks), ways, not_walked)
     return subject.known["walks"]
 
 
-def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
+def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
     """Walk one pair.
 
     Args:
-        step: of the scan.
         calls: after so many, only the place that stands out most of the scan is zoomed into.
 
     Raises:
@@ -223,13 +218,13 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         end = edge[1] if edge else min(far, 15.0)
     thresholds: list[PairThreshold] = []
     left_out, smallest = 0, None
-    margin = 8 * step
+    margin = 8 * STEP
     distance = np.append(coarse[coarse >= near][:12], near + margin)
-    if end > near + 12 * step:
-        jumps, left_out = find_jumps(curve, near + margin, end + margin, step, calls=calls)
+    if end > near + 12 * STEP:
+        jumps, left_out = find_jumps(curve, near + margin, end + margin, STEP, calls=calls)
         thresholds = [_at_jump(pair, jump) for jump in jumps]
-        smallest = smallest_steps(curve, near + margin, end + margin, step)
-        scanned = grid(near + margin, end + margin, step)
+        smallest = smallest_steps(curve, near + margin, end + margin, STEP)
+        scanned = grid(near + margin, end + margin, STEP)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
     knots = sum(one.order == SMOOTH for one in thresholds)
     knots = knots if knots > _KNOTS else 0
@@ -239,7 +234,7 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         thresholds = _with_end(pair, curve, edge, thresholds, near)
     further = None
     if edge is None and alive(far):
-        further = _beyond(subject, pair, end + margin, noise, step, calls)
+        further = _beyond(subject, pair, end + margin, noise, calls)
     if further:
         thresholds += further.thresholds
     if pair.moves == "atom":
@@ -391,12 +386,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 
 
 def _beyond(
-    subject: CalculatorSubject,
-    pair: Pair,
-    start: float,
-    noise: Float[np.ndarray, "2"],
-    step: float,
-    calls: float,
+    subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
     """Look outward from a distance, as far as something is left that could be lost at a cutoff.
 
@@ -414,7 +404,7 @@ def _beyond(
         high = low * _RATIO
         nodes = _at(low, high)
         try:
-            with only_trying(subject):
+            with subject.trying():
                 forces = curve.many(nodes)[1]
                 gone = curve(_RATIO * high)[0]
 
@@ -426,7 +416,7 @@ def _beyond(
                 if ended and alive(float(nodes[0])):
                     edge = _end_of(nodes, alive)
                 for one, other in _rough(curve, low, (edge[0] if edge else low) if ended else high, noise):
-                    jumps, _ = find_jumps(curve, one - 4 * step, other + 4 * step, step, calls=calls)
+                    jumps, _ = find_jumps(curve, one - 4 * STEP, other + 4 * STEP, STEP, calls=calls)
                     found += [_at_jump(pair, jump) for jump in jumps]
                 if ended:
                     break

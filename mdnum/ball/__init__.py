@@ -12,31 +12,39 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mdnum.ball.compare import BallDifference, first_difference
-    from mdnum.ball.contacts import Impact, Penalty, Projection
     from mdnum.ball.exact import ExactImpact, ExactPenalty
-    from mdnum.ball.integrators import (
+    from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration, arrive, loss_of
+    from mdnum.ball.rollout import BallDifference, BallRun, first_difference, simulate
+    from mdnum.ball.step import (
+        BallDecisions,
+        BallState,
         BallVerlet,
         EventLocated,
         ExplicitEuler,
+        Impact,
         ImplicitMidpoint,
+        Penalty,
+        Projection,
         SemiImplicitEuler,
     )
-    from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration, arrive, loss_of
-    from mdnum.ball.rollout import BallRun, simulate
-    from mdnum.ball.state import BallDecisions, BallState, Reason
-    from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
+    from mdnum.ball.stopping import (
+        FixedCount,
+        GlobalSum,
+        HysteresisStop,
+        Maximum,
+        PerInstance,
+        Reason,
+        Relative,
+    )
     from mdnum.ball.world import World
 
 _NAMES = {
-    "contacts": "Impact Penalty Projection",
     "exact": "ExactImpact ExactPenalty",
-    "integrators": "EventLocated ExplicitEuler ImplicitMidpoint SemiImplicitEuler BallVerlet",
     "problem": "FinalHeight MeanHeight BallProblem ResidualPenetration arrive loss_of",
-    "compare": "BallDifference first_difference",
-    "rollout": "BallRun simulate",
-    "state": "BallState BallDecisions Reason",
-    "stopping": "FixedCount GlobalSum HysteresisStop Maximum PerInstance Relative",
+    "rollout": "BallDifference BallRun first_difference simulate",
+    "step": "BallDecisions BallState BallVerlet EventLocated ExplicitEuler Impact ImplicitMidpoint Penalty "
+    "Projection SemiImplicitEuler",
+    "stopping": "FixedCount GlobalSum HysteresisStop Maximum PerInstance Reason Relative",
     "world": "World",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}

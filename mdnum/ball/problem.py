@@ -13,9 +13,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
-from mdnum.numerics.scaling import check_scale, scaled_gradient
+from mdnum.numerics.formats import check_scale, scaled_gradient
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.
 START = ("y0", "v0")
@@ -139,7 +139,7 @@ class BallProblem:
         Args:
             names: a batch moves as a whole along y0 and v0.
             imposed: decisions of every step to act on instead of its own, leading axis steps.
-            scale: of the loss in the reverse pass (`mdnum.numerics.scaling`), a power of two.
+            scale: of the loss in the reverse pass (`mdnum.numerics.formats`), a power of two.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """

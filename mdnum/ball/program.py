@@ -12,12 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.ball.compare import CrossDecision, cross_decisions, overridden
-from mdnum.ball.contacts import Projection
 from mdnum.ball.limits import spacing
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallDecisions
+from mdnum.ball.rollout import BallRun, CrossDecision, cross_decisions, overridden, simulate
+from mdnum.ball.step import BallDecisions, Projection
 from mdnum.errors import InputError
 from mdnum.numerics.events import Ledger
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
@@ -51,13 +49,11 @@ class BallProgram:
 
     Attributes:
         problem: the program.
-        name: of the system.
         order: its balls are those of the other program in this order; None where they are the same.
         pins: decisions that are imposed on it.
     """
 
     problem: BallProblem
-    name: str = "ball"
     order: tuple[int, ...] | None = None
     pins: tuple[ImposedDecision, ...] = ()
     _runs: dict[int, BallRun] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -76,11 +72,6 @@ class BallProgram:
     def timestep(self) -> float:
         """Seconds."""
         return float(self.problem.world.integrator.h)
-
-    @property
-    def unit(self) -> str:
-        """Of heights."""
-        return "m"
 
     @property
     def scale(self) -> float:
@@ -156,12 +147,9 @@ class BallProgram:
         for pin in self.pins:
             if pin.step > steps:
                 continue
-            if pin.channel == "contact":
-                contact[pin.step - 1, pin.ball] = pin.value
-            elif iterations.ndim == 1:
-                iterations[pin.step - 1] = pin.value
-            else:
-                iterations[pin.step - 1, pin.ball] = pin.value
+            decided = contact if pin.channel == "contact" else iterations
+            # the last of one column is all that there is: a count that all balls share is that of ball -1
+            decided.reshape(steps, -1)[pin.step - 1, pin.ball] = pin.value
         return BallDecisions(contact, iterations)  # type: ignore[arg-type]
 
     def lockstep(
@@ -197,10 +185,6 @@ class BallProgram:
             flips=flips,
             overridden=overridden_count,
             furthest=furthest,
-            nearest={},
-            bound={},
-            ambiguous={},
-            doubts={},
             failed=failed,
             runs=runs,
         )

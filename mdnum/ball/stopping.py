@@ -8,7 +8,8 @@ of summation; a rule per ball does neither.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from enum import IntEnum
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -18,13 +19,49 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.ball.state import Reason, Solve
 from mdnum.numerics.events import Threshold
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Pairwise, Reduction
 
 #: function(inputs, rest) -> (outputs, record); inputs and outputs are tuples of arrays of shape (balls,).
 Map = Callable[[tuple, Any], tuple[tuple, Any]]
+
+
+class Reason(IntEnum):
+    """What ended the solver of a step."""
+
+    NONE = 0
+    TOLERANCE = 1
+    CAP = 2
+    FIXED = 3
+    NOT_FINITE = 4
+    REST = 5
+
+    @property
+    def word(self) -> str:
+        """As people read it."""
+        return self.name.lower().replace("_", " ")
+
+
+class Solve(NamedTuple):
+    """The record of one iterative solve; shape () where one rule stops all balls, else (balls,).
+
+    Attributes:
+        iterations: how often it went on.
+        reason: a `Reason`.
+        residual: the residual at the last decision.
+        margin: threshold minus residual there: positive where the residual was low enough to stop.
+        before: the margin of the decision before, which was to go on; -inf where there was none.
+        history: residual at every decision, NaN where none was made, shape (max_iter + 1,), or (0,) unless
+            it was asked for; the largest over the balls where each ball has its own.
+    """
+
+    iterations: Int[Array, "..."]
+    reason: Int[Array, "..."]
+    residual: Float[Array, "..."]
+    margin: Float[Array, "..."]
+    before: Float[Array, "..."]
+    history: Float[Array, "decisions"]
 
 
 class StopRule(Protocol):
@@ -64,7 +101,6 @@ class _ToleranceRule(eqx.Module):
     max_iter: int = eqx.field(static=True, default=100)
 
     def threshold(self, first, iteration):
-        """The tolerance in the residual's dtype."""
         return jnp.broadcast_to(jnp.asarray(self.tol).astype(first.dtype), first.shape)
 
 
@@ -74,7 +110,6 @@ class GlobalSum(_ToleranceRule):
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
     def measure(self, terms, accumulate, decision, zero):
-        """The sum in the dtype of sums."""
         return self.reduction(terms.astype(accumulate), zero).astype(decision)
 
 
@@ -82,7 +117,6 @@ class PerInstance(_ToleranceRule):
     """A residual for each ball: a ball stops when its own is low enough, whatever the others do."""
 
     def measure(self, terms, accumulate, decision, zero):
-        """Each ball's own term."""
         return terms.astype(decision)
 
 
@@ -90,7 +124,6 @@ class Maximum(_ToleranceRule):
     """One residual for the batch: the largest term. No sum, so no order of summation."""
 
     def measure(self, terms, accumulate, decision, zero):
-        """The largest term."""
         return jnp.max(terms).astype(decision)
 
 
@@ -122,7 +155,6 @@ class HysteresisStop(eqx.Module):
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
-        """As the rule inside."""
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
@@ -145,9 +177,8 @@ class FixedCount(eqx.Module):
         """The count."""
         return self.count
 
-    def measure(self, terms, accumulate, decision, zero):
-        """The largest term, for the record only."""
-        return jnp.max(terms).astype(decision)
+    # for the record only
+    measure = Maximum.measure
 
     def threshold(self, first, iteration):
         """Stops when the count is reached, and not before."""

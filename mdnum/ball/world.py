@@ -13,9 +13,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mdnum.ball import limits, stopping
-from mdnum.ball.contacts import Contact, Impact, Motion, Penalty, Projection
-from mdnum.ball.integrators import Balls, EventLocated, Rounding, Scheme
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import (
+    BallDecisions,
+    BallRecord,
+    Balls,
+    BallState,
+    Contact,
+    EventLocated,
+    Impact,
+    Motion,
+    Projection,
+    Rounding,
+    Scheme,
+)
 from mdnum.errors import InputError
 from mdnum.numerics.events import Hysteresis, Threshold
 from mdnum.numerics.exact import zero_bits
@@ -35,6 +45,13 @@ _PLACES: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "h": (("integrator", "h"),),
     "gravity": (("gravity",),),
     "lift": (("lift",),),
+}
+#: Least and greatest value, and whether the least itself is too small.
+_RANGES: Mapping[str, tuple[float, float, bool]] = {
+    **dict.fromkeys(("k", "eps", "alpha", "tol", "h"), (0.0, math.inf, True)),
+    **dict.fromkeys(("damping", "rest_speed", "enter", "lift"), (0.0, math.inf, False)),
+    "restitution": (0.0, 1.0, False),
+    "gravity": (-math.inf, math.inf, False),
 }
 #: Compared in the dtype of decisions, so not rounded to the dtype of arithmetic before.
 _DECIDING = ("tol", "enter")
@@ -89,10 +106,9 @@ class World(eqx.Module):
             InputError: a number out of range, or parts that do not go together.
         """
         policy = RolePrecision() if policy is None else policy
-        _check(contact, integrator, gravity, control, policy, hysteresis)
-        world = cls(
-            contact, integrator, gravity, control, hysteresis, Rounding(zero_bits(np.float64)), policy
-        )
+        fence = Rounding(zero_bits(np.float64))
+        world = cls(contact, integrator, gravity, control, hysteresis, fence, policy)
+        _check(world)
         values = {name: world.value(name) for name in _PLACES if world.has(name)}
         if control is not None:
             world = eqx.tree_at(lambda w: w.control, world, jnp.asarray(control, policy.dtype("arithmetic")))
@@ -242,15 +258,14 @@ def _get(node: Any, path: tuple[str, ...]) -> Any:
     return node
 
 
-def _check(
-    contact: Any, integrator: Any, gravity: Any, control: Any, policy: RolePrecision, lift: Any
-) -> None:
+def _check(world: World) -> None:
     """Refuse numbers out of range and parts that do not go together, before anything runs."""
-    _in_range("timestep h", integrator.h, above=0.0)
-    _in_range("gravity", gravity, least=-np.inf)
-    if lift is not None and not float(lift) >= 0:
-        raise InputError(f"hysteresis = {lift}; a contact ends at a height of 0 or more")
-    if control is not None and not np.all(np.isfinite(np.asarray(control, np.float64))):
+    contact: Any = world.contact
+    integrator: Any = world.integrator
+    for name in world.parameters:
+        if name != "eps" or contact.smooth:
+            _in_range(name, world.value(name))
+    if world.control is not None and not np.all(np.isfinite(np.asarray(world.control, np.float64))):
         raise InputError("the control holds a number that is not finite")
     if isinstance(integrator, EventLocated):
         if not isinstance(contact, Impact):
@@ -259,18 +274,7 @@ def _check(
                 remedy="A penalty or a projection has no instant of contact; choose another integrator",
             )
         _count("max_impacts", integrator.max_impacts)
-    if isinstance(contact, Penalty):
-        _in_range("stiffness k", contact.k, above=0.0)
-        _in_range("damping", contact.damping)
-        if contact.smooth:
-            _in_range("softplus width eps", contact.eps, above=0.0)
-    else:
-        _in_range("restitution", contact.restitution, most=1.0)  # type: ignore[union-attr]
-    if isinstance(contact, Impact):
-        _in_range("rest_speed", contact.rest_speed)
     if isinstance(contact, Projection):
-        _in_range("gain k", contact.k, above=0.0)
-        _in_range("alpha", contact.alpha, above=0.0)
         gain = float(contact.alpha) * float(contact.k)
         if gain >= 2:
             raise InputError(
@@ -278,10 +282,9 @@ def _check(
                 " so the projection cannot converge",
                 remedy="Choose alpha * k below 2; at 1 one iteration is enough",
             )
-        _check_stop(contact.stop, policy, gain)
-    stop = getattr(integrator, "stop", None)
-    if stop is not None:
-        _check_stop(stop, policy, 1.0)
+        _check_stop(contact.stop, world.policy, gain)
+    if (stop := getattr(integrator, "stop", None)) is not None:
+        _check_stop(stop, world.policy, 1.0)
 
 
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
@@ -298,12 +301,11 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
             )
         return
     tol = float(rule.tol)
-    _in_range("tolerance tol", tol, above=0.0)
     relative, summed = isinstance(rule, stopping.Relative), isinstance(rule, stopping.GlobalSum)
     kind = "relative" if relative else "sum" if summed else "term"
     usable = limits.smallest_tolerance(policy, gain, kind)
     role = max(usable, key=lambda one: usable[one])
-    if tol < usable[role]:
+    if not tol >= usable[role]:
         raise InputError(
             f"tol = {tol:g} cannot be met with {role} in {getattr(policy, role)}",
             remedy=f"The smallest usable tolerance is {usable[role]:.3g}",
@@ -318,16 +320,12 @@ def _count(name: str, value: int) -> None:
         raise InputError(f"{name} = {value}; expected a number from 1 to {_MOST_ITERATIONS}")
 
 
-def _in_range(
-    name: str, value: Any, *, least: float = 0.0, most: float = math.inf, above: float | None = None
-) -> None:
+def _in_range(name: str, value: Any) -> None:
+    least, most, strictly = _RANGES[name]
     x = float(value)
-    if math.isfinite(x) and least <= x <= most and (above is None or x > above):
+    if math.isfinite(x) and least <= x <= most and not (strictly and x == least):
         return
-    if above is not None:
-        expected = f"finite number above {above:g}"
-    elif most < math.inf:
+    expected = f"finite number {'above' if strictly else 'of at least'} {least:g}"
+    if most < math.inf:
         expected = f"number from {least:g} to {most:g}"
-    else:
-        expected = "finite number" + (f", {least:g} or more" if least > -math.inf else "")
-    raise InputError(f"{name} = {value}; expected a {expected}")
+    raise InputError(f"{name} = {value}; expected a {expected if least > -math.inf else 'finite number'}")

@@ -7,20 +7,19 @@ otherwise between two adjacent floats, and everything after it may jump.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.child import digests_elsewhere
+from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program
-from mdnum.systems import BallSystem, System, load
+from mdnum.systems import BallSystem, System
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
@@ -62,7 +61,7 @@ class Boundary:
         subject: labels of its pair, or of its ball; empty where one decision is the whole batch's.
         bound: on the rounding error of its margin.
         also: further decisions that differ first at this step.
-        apart: largest distance between the two final states, length.
+        separation: largest distance between the two final states, length.
         confirmed: whether a fresh process found the same history on either side; None where none was asked.
     """
 
@@ -73,7 +72,7 @@ class Boundary:
     subject: tuple[int, ...]
     bound: float
     also: int
-    apart: float
+    separation: float
     confirmed: bool | None = None
 
     @property
@@ -111,19 +110,16 @@ class BoundaryMap:
     """A run as a piecewise function of a number.
 
     Attributes:
-        number: that was varied.
-        steps: last step of every run.
+        number, steps: that was varied, and the last step of every run.
         low, high: the interval that was searched.
-        intervals: with one history each, in order.
-        boundaries: between them, in order.
+        intervals, boundaries: with one history each and between them, in order.
         unresolved: stretches whose ends have different histories but were not searched to the last bit, and
             adjacent floats where a run fails on one side before anything is decided otherwise.
         complete: whether every float of the interval was run, so that nothing can hide.
         resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
             cancel each other may be missed.
-        evaluations: runs made to find them.
+        evaluations, failed: runs made to find them, and those that ended in a blow-up or a runaway.
         at, loss, energy: of every run made, in order; at its last step.
-        failed: runs among them that ended in a blow-up or a runaway.
     """
 
     number: Number
@@ -219,27 +215,19 @@ class NumberLine:
             )
         ]
         moved = (runs[1].x - runs[0].x).reshape(len(runs[0].x), -1)
-        apart = float(np.sqrt(np.max(np.sum(moved**2, axis=1))))
-        return Boundary(
-            sides[0],
-            sides[1],
-            decision.channel,
-            step,
-            decision.subject,
-            decision.bounds["A"],
-            decision.also,
-            apart,
-        )
+        separation = float(np.sqrt(np.max(np.sum(moved**2, axis=1))))
+        low, high = sides
+        bound, also = decision.bounds["A"], decision.also
+        return Boundary(low, high, decision.channel, step, decision.subject, bound, also, separation)
 
 
 def boundaries(
-    system: System | BallSystem | str | Path,
+    system: System | BallSystem,
     key: str,
     low: float,
     high: float,
     steps: int | None = None,
     *,
-    overrides: Mapping[str, Any] | None = None,
     cells: int = 64,
     most: int | None = None,
     loss: Callable[..., float] | None = None,
@@ -255,11 +243,10 @@ def boundaries(
     a fresh process.
 
     Args:
-        system: a loaded system of either world, or a name or path to load.
+        system: of either world.
         key: the number, such as "potential.sigma" or "position.17.x"; of a ball "k", "tol", "y0".
         low, high: the interval, in the units of the system's file; both belong to it.
         steps: last step; default the system's own.
-        overrides: as for `load`, where a name or path is given.
         cells: of the grid. With at least as many as there are floats, all are run.
         most: stop after this many boundaries; default 24, of a ball 64. What is left is unresolved.
         loss: of the final state of molecular dynamics, called with the simulation, unwrapped positions and
@@ -272,21 +259,14 @@ def boundaries(
 
     Error: none in a boundary: its sides are adjacent floats, and their runs decided differently.
     """
-    if not isinstance(system, System | BallSystem):
-        system = load(system, overrides)
-    assert isinstance(system, System | BallSystem)
-    is_ball = isinstance(system, BallSystem)
-    most = (MOST_BALL if is_ball else MOST) if most is None else most
+    most = (MOST_BALL if isinstance(system, BallSystem) else MOST) if most is None else most
     if cells < 1 or most < 1:
         raise InputError(f"cells = {cells} and most = {most}; expected at least 1")
-    if is_ball and loss is not None:
-        raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
     program = program_of(system, steps)
     last = program.steps if steps is None else steps
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
-    number = checked(program, key, low, high)
-    line = NumberLine(program, number, last, loss)
+    line = NumberLine(program, checked(program, key, low, high), last, loss)
     places = _grid(line, low, high, cells)
     note = progress or (lambda done, total, info: None)
     for k, place in enumerate(places):
@@ -299,11 +279,11 @@ def boundaries(
         total = min(most, len(found) + len(pending))
         note(len(found), total, {"phase": "bisecting", "unit": "boundaries"})
         found.append(line.bisect(*heapq.heappop(pending), pending))
-    annotated = []
-    for k, edge in enumerate(sorted(found)):
+    edges = []
+    for k, place in enumerate(sorted(found)):
         note(k, len(found), {"phase": "comparing both sides", "unit": "boundaries"})
-        annotated.append(line.boundary(*edge))
-    edges = [edge for edge in annotated if edge is not None]
+        edge = line.boundary(*place)
+        edges += [] if edge is None else [edge]
     if confirm and edges:
         edges = _confirmed(system, line, edges, note)
     return _mapped(line, edges)
@@ -348,10 +328,7 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
         processes=2 if line.number.compiles else 1,
     )
     same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
-    return [
-        replace(boundary, confirmed=below and above)
-        for boundary, below, above in zip(found, same[::2], same[1::2], strict=True)
-    ]
+    return [replace(edge, confirmed=all(same[2 * k : 2 * k + 2])) for k, edge in enumerate(found)]
 
 
 def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:

@@ -1,28 +1,44 @@
-"""How far the decisions of two runs can be trusted: each by itself, and one against the other.
+"""How far the decisions of runs can be trusted: each by itself, and one against the other.
 
 Three dates. Up to its *certified horizon* no decision of a run was within its rounding bound: in exact
 arithmetic, from the same states, every one would have come out the same. Up to the end of their *protection*
 the pair of atoms next to its cutoff was further from it than the separation of the runs can have moved it. As
 long as both hold, no decision can differ. And where one program is the wider one in every role, the other
 agrees with it on every decision up to the *shadow horizon*.
+
+All of this is about one step at a time. A decision that is right given the state is right for this run, which
+may have left the exact history long before (that is what `forks.exact.certify` dates).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.errors import InputError
 from mdnum.forks.pair import Fork
+from mdnum.forks.worlds import ROLES
+from mdnum.md.cell import Cell
 from mdnum.md.decide import PairDecider
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.program import Twin
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
 
-ROLES = ("state", "force", "decision", "accumulate")
+#: Ambiguous decisions that are listed; the count covers all of them.
+LISTED = 10_000
+#: Binary digits behind the point to which the square root of an exact squared distance is taken.
+_ROOT_BITS = 400
+
+
+# --- a pair of runs -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -65,19 +81,17 @@ class Certified:
 
 def certified(fork: Fork) -> Certified:
     """The dates of a pair that was followed."""
-    twin = fork.twin
-    last = fork.steps
+    twin, last = fork.twin, fork.steps
     if twin.a.imposable or twin.b.imposable:
         return Certified({}, None, None, None)
-    runs = (("A", twin.a.simulation), ("B", twin.b.simulation))
-    horizon = {name: _horizon(run, fork.series[f"ambiguous {name}"]) for name, run in runs}
+    runs = {"A": twin.a.simulation, "B": twin.b.simulation}
+    horizon = {name: _horizon(run, fork.series[f"ambiguous {name}"]) for name, run in runs.items()}
     away, needed = protection(fork)
     bare = np.flatnonzero(~(away > needed))
     shadow = wider(twin)
     agreed = last if fork.dates.fork is None else fork.dates.fork - 1
-    return Certified(
-        horizon, int(bare[0]) - 1 if len(bare) else last, shadow, None if shadow is None else agreed
-    )
+    protected = int(bare[0]) - 1 if len(bare) else last
+    return Certified(horizon, protected, shadow, None if shadow is None else agreed)
 
 
 def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
@@ -118,7 +132,8 @@ def wider(twin: Twin) -> str | None:
     if not (np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)):
         return None
     # a smaller roundoff is a wider float
-    first, second = (np.array([unit_roundoff(run.policy.dtype(role)) for role in ROLES]) for run in (a, b))
+    dtypes = ([run.policy.dtype(role) for role in ROLES["md"]] for run in (a, b))
+    first, second = (np.array([unit_roundoff(dtype) for dtype in each]) for each in dtypes)
     if (first == second).all():
         return None
     return "A" if (first <= second).all() else "B" if (second <= first).all() else None
@@ -127,5 +142,118 @@ def wider(twin: Twin) -> str | None:
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
     """What must be the same in a program and its shadow."""
     spec = run.system.spec.model_dump(mode="json")
-    spec["precision"] = {key: value for key, value in spec["precision"].items() if key not in ROLES}
+    spec["precision"] = {key: value for key, value in spec["precision"].items() if key not in ROLES["md"]}
     return spec, run.rule, run.builder, repr(run.reduction)
+
+
+# --- one run, its ambiguous decisions in exact arithmetic ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class AmbiguousDecision:
+    """A decision closer to its threshold than its rounding bound.
+
+    Attributes:
+        step, i, j: which decision; i < j.
+        inside: as the program decided.
+        margin: threshold - quantity as it computed it, in the quantity's space.
+        bound: on the rounding error of that margin.
+        exact: the margin of the same state without any rounding.
+        wrong: whether the exact margin asks for the other decision.
+    """
+
+    step: int
+    i: int
+    j: int
+    inside: bool
+    margin: float
+    bound: float
+    exact: float
+    wrong: bool
+
+
+@dataclass(frozen=True)
+class CertifiedHorizon:
+    """What is certain about the decisions of one run, from its own states.
+
+    Attributes:
+        horizon: first step with an ambiguous decision; every decision before it would have come out the same
+            in exact arithmetic from the same states. None where there is none.
+        wrong: first step with a decision that exact arithmetic decides otherwise; None where there is none.
+        total: ambiguous decisions.
+        decisions: the first of them.
+    """
+
+    horizon: int | None
+    wrong: int | None
+    total: int
+    decisions: tuple[AmbiguousDecision, ...]
+
+
+def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
+    """Every decision of a run against its rounding bound, and the ambiguous ones in exact arithmetic.
+
+    Args:
+        simulation: a pair potential.
+        steps: last step.
+
+    Raises:
+        InputError: a rebuild rule that may miss pairs.
+    """
+    if not simulation.rule.safe:
+        raise InputError(
+            "this rebuild rule may leave pairs out of the list, and then nothing is decided about them",
+            remedy="Use --set neighbors.rebuild.every=1 with check = true",
+            where="neighbors.rebuild",
+        )
+    decider, recorder = simulation.decider, PairRecorder(simulation)
+    found: list[AmbiguousDecision] = []
+    for segment in Engine(simulation, steps).segments():
+        for step, i, j, margin, bound in zip(*recorder.doubtful(segment), strict=True):
+            x = segment.unsorted("x", int(step) - segment.first)
+            kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
+            exact, inside = exact_margin(decider, simulation.cell, x[i], x[j], kind)
+            decided = bool(decider.inside(-margin, 0.0))
+            where = int(step), int(i), int(j), decided
+            found.append(
+                AmbiguousDecision(*where, float(margin), float(bound), float(exact), decided != inside)
+            )
+    wrong = next((one.step for one in found if one.wrong), None)
+    return CertifiedHorizon(found[0].step if found else None, wrong, len(found), tuple(found[:LISTED]))
+
+
+def exact_margin(
+    decider: PairDecider,
+    cell: Cell,
+    start: Float[np.ndarray, "3"],
+    end: Float[np.ndarray, "3"],
+    kind: int = 0,
+) -> tuple[Fraction, bool]:
+    """The margin of a pair without rounding, and the decision that it asks for.
+
+    Positions are the floats of the state; the threshold and the lattice vectors are the doubles of the
+    system, as in the exact program, whatever the decision holds. In the space of r the margin is good to 400
+    binary digits, the decision exact.
+
+    Args:
+        start, end: positions, length.
+        kind: pair type.
+    """
+    matrix = np.asarray(cell.matrix, np.float64)
+    inverse = [[Fraction(float(c)) for c in row] for row in np.asarray(cell.inverse)]
+    d = [Fraction(float(b)) - Fraction(float(a)) for a, b in zip(start, end, strict=True)]
+    n = [round(sum((d[c] * inverse[c][k] for c in range(3)), start=Fraction(0))) for k in range(3)]
+    for k in range(3):
+        if cell.pbc[k]:
+            d = [d[c] - n[k] * Fraction(float(matrix[k, c])) for c in range(3)]
+    squared = sum((c * c for c in d), start=Fraction(0))
+    value = Fraction(decider.exact_thresholds[kind])
+    against = value * value if decider.space == "r" else value
+    inside = squared <= against if decider.compare.endswith("<=") else squared < against
+    quantity = _root(squared) if decider.space == "r" else squared
+    return value - quantity, inside
+
+
+def _root(x: Fraction) -> Fraction:
+    scaled = (x.numerator << (2 * _ROOT_BITS)) // x.denominator
+    return Fraction(math.isqrt(scaled), 1 << _ROOT_BITS)

@@ -1,4 +1,4 @@
-"""Two finished runs of one world: where they part, from what they stored, and what was different about them.
+"""Two finished runs of one world: where they diverge, from what they stored, and what was different.
 
 Nothing is run. The first differing bit and the fork are read from the tables of both folders; when the
 positions are wanted, the runs are in the folders too (`twin_of`), and `mdnum.forks.fork` follows them again.
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import flat, program_of
+from mdnum.forks.worlds import ROLES, flat, program_of
 from mdnum.program import Twin
 from mdnum.store import RunFolder
 from mdnum.systems.load import load
@@ -35,8 +35,6 @@ _SYSTEM = {"md": ("units", "potential.kind"), "ball": ("contact.kind", "integrat
 _NUMBERS = ("potential", "kinetic", "displacement", "min_margin")
 #: Of the provenance, what bits depend on; its fingerprint is a hash of these and of the dtypes.
 _ARITHMETIC = ("versions", "cpu", "devices", "jax_settings", "environment")
-#: Dtypes by role are one choice: `--vary precision`.
-_ROLES = ("state", "force", "decision", "accumulate")
 #: What drawn velocities come from.
 _DRAWN = ("dynamics.temperature", "dynamics.seed", "dynamics.remove_drift", "structure.velocities")
 #: Boxes and masses are those of one system up to this part; they may differ in their last digits.
@@ -69,7 +67,7 @@ class StoredFlip:
 
 @dataclass(frozen=True)
 class FolderFork:
-    """What two run folders hold about where their runs part.
+    """What two run folders hold about where their runs diverge.
 
     Attributes:
         world: "md" or "ball".
@@ -95,13 +93,13 @@ class FolderFork:
     first_bit: int | None
     fork: int | None
     channel: str
-    iterations: tuple[int, int] | None
-    decisions: tuple[StoredFlip, ...]
     same_structure: bool
+    iterations: tuple[int, int] | None = None
+    decisions: tuple[StoredFlip, ...] = ()
 
 
 def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> FolderFork:
-    """Where two finished runs part.
+    """Where two finished runs diverge.
 
     Args:
         a, b: run folders of one world, finished or not.
@@ -139,7 +137,7 @@ def twin_of(found: FolderFork) -> Twin:
 
 
 def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    world = first.world
+    world, remedy = first.world, "Compare runs of one system"
     elsewhere = _ELSEWHERE[world]
     keys = _different(flat(first.system), flat(second.system))
     programs = [row for row in keys if row[0] not in elsewhere and row[0].split(".")[0] not in elsewhere]
@@ -147,46 +145,33 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     counts = [folder.summary.get(noun) for folder in (first, second)]
     # a run that was killed has no summary; its structure is compared with the other's
     if None not in counts and counts[0] != counts[1]:
-        raise InputError(
-            f"the runs have {counts[0]} and {counts[1]} {noun}",
-            where=where,
-            remedy="Compare runs of one system",
-        )
+        raise InputError(f"the runs have {counts[0]} and {counts[1]} {noun}", where=where, remedy=remedy)
     for key, one, other in programs:
         if key in _SYSTEM[world]:
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
-                remedy="Compare runs of one system, which differ in numbers or in choices of the program",
+                remedy=f"{remedy}, which differ in numbers or in choices of the program",
             )
-    iterations = None
-    if world == "md":
-        starts = _starts(first, second, programs, where)
-        steps, seed, fork, channel, flips = _md_dates(first, second)
-        # other starts need not show in a stored number at once
-        seed = 0 if starts else seed
-    else:
-        starts = []
-        steps, seed, fork, channel, flips, iterations = _ball_dates(first, second)
+    starts = _starts(first, second, programs, where) if world == "md" else []
+    found = (_md_dates if world == "md" else _ball_dates)(first, second)
     tables = (
         flat({key: folder.provenance[key] for key in _ARITHMETIC if key in folder.provenance})
         for folder in (first, second)
     )
     arithmetic = _different(*tables)
-    causes = [*choices(programs), *(["start"] if starts else []), *(["arithmetic"] if arithmetic else [])]
+    # other starts need not show in a stored number at once
+    first_bit = 0 if starts else found.pop("first_bit")
+    flips = sorted(found.pop("decisions", ()), key=lambda flip: abs(flip.margin))
     return FolderFork(
-        world,
-        first.path,
-        second.path,
-        (*programs, *starts, *arithmetic),
-        tuple(causes),
-        steps,
-        seed,
-        fork,
-        channel,
-        iterations,
-        tuple(sorted(flips, key=lambda flip: abs(flip.margin))),
-        not starts,
+        world=world,
+        a=first.path,
+        b=second.path,
+        differences=(*programs, *starts, *arithmetic),
+        causes=(*choices(programs), *["start"] * bool(starts), *["arithmetic"] * bool(arithmetic)),
+        same_structure=not starts,
+        decisions=tuple(flips),
+        **{**found, "first_bit": first_bit},
     )
 
 
@@ -196,7 +181,7 @@ def choices(programs: list[Difference]) -> list[str]:
     out: dict[str, None] = {}
     for key, one, other in programs:
         table, _, name = key.partition(".")
-        if table == "precision" and name in _ROLES:
+        if table == "precision" and name in ROLES["md"]:
             out["precision"] = None
         elif not (table == "cutoff" and "cutoff.kind" in keys and None in (one, other)):
             out[key] = None
@@ -235,7 +220,7 @@ def _alone(
     return step, flips
 
 
-def _md_dates(first: RunFolder, second: RunFolder):
+def _md_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
     series = [folder.read("series", ["step", "pairs", *_NUMBERS]) for folder in (first, second)]
     steps = min(len(table["step"]) for table in series) - 1
     if steps < 0:
@@ -244,30 +229,36 @@ def _md_dates(first: RunFolder, second: RunFolder):
     for name in _NUMBERS:
         one, other = (table[name][: steps + 1] for table in series)
         differ |= ~((one == other) | (np.isnan(one) & np.isnan(other)))
-    seed = int(differ.argmax()) if differ.any() else None
+    dates = {"steps": steps, "first_bit": int(differ.argmax()) if differ.any() else None}
     if series[0]["pairs"][0] != series[1]["pairs"][0]:
-        return steps, seed, 0, "pair", []
+        return {**dates, "fork": 0, "channel": "pair"}
     fork, flips = _alone(first, second, "flips", ("i", "j"), steps)
-    return steps, seed, fork, "" if fork is None else "pair", flips
+    return {**dates, "fork": fork, "channel": "" if fork is None else "pair", "decisions": flips}
 
 
-def _ball_dates(first: RunFolder, second: RunFolder):
+def _ball_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
     tables = [folder.read("steps") for folder in (first, second)]
     steps = min(int(table["step"][-1]) for table in tables)
     heights = [folder.read("heights") for folder in (first, second)]
     kept = [{name: values[table["step"] <= steps] for name, values in table.items()} for table in heights]
-    seed = None
+    first_bit = None
     if len(kept[0]["step"]) == len(kept[1]["step"]):
-        apart = (kept[0]["y"] != kept[1]["y"]) | (kept[0]["v"] != kept[1]["v"])
-        seed = int(kept[0]["step"][apart].min()) if apart.any() else None
+        differ = (kept[0]["y"] != kept[1]["y"]) | (kept[0]["v"] != kept[1]["v"])
+        first_bit = int(kept[0]["step"][differ].min()) if differ.any() else None
     contact, flips = _alone(first, second, "contacts", ("ball",), steps)
     counts = [table["iterations"][: steps + 1] for table in tables]
     off = np.flatnonzero(counts[0] != counts[1])
     stop = int(off[0]) if len(off) else None
     fork = min((step for step in (contact, stop) if step is not None), default=None)
-    channel = "" if fork is None else "contact" if fork == contact else "stop"
-    iterations = (int(counts[0][fork]), int(counts[1][fork])) if fork is not None and fork == stop else None
-    return steps, seed, fork, channel, flips if channel == "contact" else [], iterations
+    at_contact, at_stop = (fork is not None and fork == step for step in (contact, stop))
+    return {
+        "steps": steps,
+        "first_bit": first_bit,
+        "fork": fork,
+        "channel": "contact" if at_contact else "stop" if at_stop else "",
+        "decisions": flips if at_contact else [],
+        "iterations": (int(counts[0][fork]), int(counts[1][fork])) if at_stop else None,
+    }
 
 
 def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], where: str) -> list[Difference]:
@@ -285,18 +276,20 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
     # a single frame each, which ase types as if it were several
     atoms = [each for each in map(read, paths) if isinstance(each, Atoms)]
     one, other = atoms
-    for what, is_same, seen in _same_system(one, other):
-        if not is_same:
-            raise InputError(
-                f"the runs are of different systems: {what} differ{seen}",
-                where=where,
-                remedy="Compare runs of one system",
-            )
+    different = next((text for is_same, text in _same_system(one, other) if not is_same), None)
+    if different is not None:
+        raise InputError(
+            f"the runs are of different systems: {different}",
+            where=where,
+            remedy="Compare runs of one system",
+        )
     rows: list[Difference] = []
-    if not np.array_equal(one.cell.array, other.cell.array):
-        rows.append(("start: box", "", "other last digits"))
-    if not np.array_equal(one.get_masses(), other.get_masses()):
-        rows.append(("start: masses", "", "other last digits"))
+    for name, (a, b) in {
+        "box": (one.cell.array, other.cell.array),
+        "masses": (one.get_masses(), other.get_masses()),
+    }.items():
+        if not np.array_equal(a, b):
+            rows.append((f"start: {name}", "", "other last digits"))
     if not np.array_equal(one.positions, other.positions):
         moved = other.positions - one.positions
         images = np.round(moved @ np.linalg.pinv(one.cell.array)) * one.pbc
@@ -313,12 +306,12 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
     return rows
 
 
-def _same_system(one: Any, other: Any) -> Iterator[tuple[str, bool, str]]:
-    """(what, whether it is the same, what was seen)."""
-    yield "numbers of atoms", len(one) == len(other), f", {len(one)} and {len(other)}"
-    species = [each.get_chemical_symbols() for each in (one, other)]
-    yield "species", species[0] == species[1], " or their order"
-    yield "masses", np.allclose(one.get_masses(), other.get_masses(), rtol=_SAME), ""
-    yield "periodic directions", bool((one.pbc == other.pbc).all()), ""
+def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
+    """Whether something is the same, and what to say where it is not."""
+    yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
+    symbols = [each.get_chemical_symbols() for each in (one, other)]
+    yield symbols[0] == symbols[1], "species differ or their order"
+    yield np.allclose(one.get_masses(), other.get_masses(), rtol=_SAME), "masses differ"
+    yield bool((one.pbc == other.pbc).all()), "periodic directions differ"
     size = float(np.abs(one.cell.array).max())
-    yield "boxes", bool(np.allclose(one.cell.array, other.cell.array, atol=_SAME * size, rtol=0)), ""
+    yield bool(np.allclose(one.cell.array, other.cell.array, atol=_SAME * size, rtol=0)), "boxes differ"

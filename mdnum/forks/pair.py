@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from mdnum.errors import InputError
+from mdnum.forks.choices import Choice, shipped, twin_or_reason, world_of
 from mdnum.numerics.verdicts import (
     FEWEST,
     PATIENCE,
@@ -27,8 +28,9 @@ from mdnum.numerics.verdicts import (
     table,
 )
 from mdnum.program import Decision, PairRows, Twin
+from mdnum.systems import BallSystem, System
 
-#: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that part a
+#: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that split a
 #: crystal do so slowly, and its atoms have no room to be much further apart; docs/verdict-calibration.md has
 #: the verdicts by tolerance.
 SPLIT = 0.01
@@ -56,12 +58,10 @@ class Fork:
         tolerance: of the split, length.
         dates: first differing bit, fork and split.
         decision: at the fork; None without one.
-        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats,
-            NaN once all have split), from B "A|B" and "B|A from B" (length);
-            "cross", decisions that differ; "overridden" and "furthest" of B|A; "energy A", "energy B",
-            "energy B|A"; of molecular dynamics also "nearest A", the distance of the pair next to its cutoff
-            from it (length), "bound A", how far rounding can move a distance that is compared (length), and
-            "ambiguous A", ambiguous decisions, and the same of B.
+        series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
+            (repeats, NaN once all have split), from B "A|B" and "B|A from B"; "cross"; "overridden" and
+            "furthest" of B|A; "energy A", ...; of molecular dynamics "nearest A", "bound A", "ambiguous A"
+            and the same of B.
         flips: cross-run flips, the first `FLIPS_KEPT`.
         flips_total: of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
@@ -104,7 +104,6 @@ def fork(
     counterfactual: bool = True,
     back: bool | None = None,
     repeats: int | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Fork:
     """Follow two runs until they have split, and judge what the flips had to do with it.
@@ -115,12 +114,10 @@ def fork(
             a fifth further where the split comes too late to tell a cause from a delay.
         split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions; many-body potentials cannot.
-        back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
-            as the run of B under A's. Default where that is run.
+        back: whether to run A under B's decisions too; default where B is run under A's.
         repeats: runs of B at most whose start is displaced at random by as much as the choice separates the
             runs at first (an ulp at least), each free and under A's decisions; default 15. They are run where
             the runs split either way, until the verdict is clear.
-        seed: of the perturbations.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
@@ -142,10 +139,10 @@ def fork(
     total, last, end = 0, asked, None
     horizon = _beyond(asked) if a.streams else asked
     for rows in a.lockstep(b, horizon, forward=counterfactual, back=back, guard=guard):
-        apart = split_of(rows.separation["B"], tolerance)
-        if a.streams and end is None and apart is not None and rows.first + apart <= asked:
-            end = int(_BEYOND * (rows.first + apart)) + 100
-            last = min(end, max(asked, _beyond(rows.first + apart)))
+        at = split_of(rows.separation["B"], tolerance)
+        if a.streams and end is None and at is not None and rows.first + at <= asked:
+            end = int(_BEYOND * (rows.first + at)) + 100
+            last = min(end, max(asked, _beyond(rows.first + at)))
         # how many rows come at once is the program's own affair: the last may lie beyond the last step
         rows = rows.until(last)
         gathered.append(replace(rows, flips=(), doubts={}))
@@ -163,7 +160,7 @@ def fork(
         if reached >= last:
             break
     found = _judged(twin, asked, tolerance, gathered, flips, total, doubts, most)
-    return _repeated(found, most, seed, progress)
+    return _repeated(found, most, progress)
 
 
 def counterfactuals(
@@ -171,13 +168,8 @@ def counterfactuals(
 ) -> tuple[bool, bool, int]:
     """Whether to run B under A's decisions, A under B's, and how many repeats at most.
 
-    Args:
-        twin: the pair.
-        counterfactual: as asked.
-        back, repeats: as asked; None for what goes with it.
-
     Raises:
-        InputError: asked for, and not run.
+        InputError: one was asked for that would not be run.
     """
     reason = twin.a.imposable or twin.b.imposable
     runs = counterfactual and reason is None
@@ -192,12 +184,7 @@ def counterfactuals(
 
 
 def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those are left out") -> int:
-    """Repeats at most: those asked for, or the default where they would tell anything.
-
-    Args:
-        repeats: as asked; None for the default.
-        counterfactual: whether there are runs under the other run's decisions.
-        why: there are none.
+    """Repeats at most: those asked for, or the default where there are runs under imposed decisions.
 
     Raises:
         InputError: below 0, too few to tell anything, or asked for where they would not be run.
@@ -232,12 +219,12 @@ def perturbation(fork: Fork) -> float:
     return min(float(np.nanmax(soon, initial=0.0)), _LARGEST * fork.tolerance)
 
 
-def _repeated(found: Fork, most: int, seed: int, progress: Progress | None) -> Fork:
+def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
     """The same with as many repeats as its verdict wants."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
     programs: list[Any] = []
     while wanted := found.verdict.wanted:
-        programs = programs or b.nudged(perturbation(found), most, seed)
+        programs = programs or b.nudged(perturbation(found), most, seed=0)
         done = len(found.repeats)
         if progress is not None:
             progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
@@ -327,3 +314,79 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
     for name in head.nearest:
         series |= {f"{column} {name}": joined(column, name) for column in ("nearest", "bound", "ambiguous")}
     return series
+
+
+# --- all choices side by side ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What one choice did within the horizon.
+
+    Attributes:
+        choice: its name.
+        difference: one line; why it does not apply where it does not.
+        first_bit, fork, split: dates, steps; None where they did not come.
+        must_hold: whether it cannot change a bit by design.
+        reason_unavailable: why it was not run; None where it was.
+        steps: last step that was compared; 0 where it was not run.
+        failed: "blow-up" or "runaway" by run, where one ended that way.
+    """
+
+    choice: str
+    difference: str
+    first_bit: int | None
+    fork: int | None
+    split: int | None
+    must_hold: bool
+    reason_unavailable: str | None = None
+    steps: int = 0
+    failed: str = ""
+
+    @property
+    def held(self) -> bool | None:
+        """Whether no bit differed within the horizon; None where it was not run."""
+        return None if self.reason_unavailable is not None else self.first_bit is None
+
+
+def screen(
+    system: System | BallSystem,
+    steps: int | None = None,
+    choices: Sequence[Choice] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[Screened]:
+    """Every choice against a system, without counterfactuals: the earliest fork first.
+
+    Args:
+        system: as loaded.
+        steps: horizon; default the system's own.
+        choices: default all that ship for its world.
+        progress: called with how many are done, how many there are, and the name of the next.
+
+    Raises:
+        InputError: no choice, or steps below 1.
+    """
+    choices = list(shipped(world_of(system)).values()) if choices is None else choices
+    if not choices:
+        raise InputError("no choice to screen", remedy="Give at least one")
+    rows: list[Screened] = []
+    for done, choice in enumerate(choices):
+        if progress is not None:
+            progress(done, len(choices), choice.name)
+        twin = twin_or_reason(choice, system)
+        if isinstance(twin, str):
+            rows.append(Screened(choice.name, twin, None, None, None, choice.must_hold, twin))
+            continue
+        found = fork(twin, steps, counterfactual=False, repeats=0)
+        dates = found.dates
+        failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())
+        date = dates.seed, dates.fork, dates.split
+        rows.append(
+            Screened(choice.name, twin.difference, *date, choice.must_hold, None, found.steps, failed)
+        )
+
+    def rank(row: Screened) -> tuple[float, ...]:
+        dates = (np.inf if date is None else date for date in (row.fork, row.first_bit, row.split))
+        return row.reason_unavailable is not None, *dates
+
+    return sorted(rows, key=rank)

@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.deadline import fewest
 from mdnum.errors import InputError
 from mdnum.forks.pair import Fork
 from mdnum.md.cell import HostCell
@@ -53,12 +54,8 @@ class Neighborhood:
     bounds: tuple[float, float]
 
 
-def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
-    """The atoms around the pair at the fork, from both runs followed up to there; None where there is none.
-
-    Args:
-        reach: radius, in cutoffs of A.
-    """
+def neighborhood(fork: Fork) -> Neighborhood | None:
+    """The atoms around the pair at the fork, from both runs followed up to there; None without one."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -80,7 +77,7 @@ def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
     distance = np.sqrt((from_middle**2).sum(axis=1))
     distance[[i, j]] = -1.0
     order = np.argsort(distance, kind="stable")
-    chosen = order[distance[order] <= reach * a.r_cut]
+    chosen = order[distance[order] <= REACH * a.r_cut]
     chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
     moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
     margins = pair_margin(a, x_a, i, j), pair_margin(b, x_b, i, j, labels=a)
@@ -268,9 +265,6 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 # --- minimal causes -----------------------------------------------------------------------------------
 
 
-MinimalReason = Literal["alone", "fewest", "spent", "none"]
-
-
 @dataclass(frozen=True)
 class Minimal:
     """A smallest set of pairs that restores agreement.
@@ -278,23 +272,23 @@ class Minimal:
     Attributes:
         pairs: pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A;
             None where no set does.
-        proven: whether none of them can be left out; False where the runs allowed did not suffice.
-        fork_alone: whether pinning the pair at the fork alone is enough.
+        code: "alone": pinning the pair at the fork alone is enough; "none": no set is; "proven": none of the
+            pairs can be left out; "unproven": the runs allowed did not suffice to show that.
         candidates: pairs that the runs decided differently before the split.
         tests: runs that were made.
         horizon: up to which step B had to stay with A.
-        reason: "alone" (the pair at the fork is enough), "fewest" (none of them can be left out), "spent"
-            (they are enough; the runs allowed did not show whether fewer are), or "none" (with all of them
-            pinned the runs split as well: no set of pairs is the cause).
     """
 
     pairs: tuple[tuple[int, int], ...] | None
-    proven: bool
-    fork_alone: bool
+    code: str
     candidates: int
     tests: int
     horizon: int
-    reason: MinimalReason
+
+    @property
+    def proven(self) -> bool:
+        """Whether none of the pairs can be left out."""
+        return self.code in ("alone", "proven")
 
 
 def minimal_cause(
@@ -322,14 +316,15 @@ def minimal_cause(
     keys = list(dict.fromkeys(flip.i * atoms + flip.j for flip in differing))
     search = _Search(fork, keys, int(_BEYOND * split) + 1, tests, progress)
     i, j = fork.decision.subject
-    if search.holds([i * atoms + j]):
-        return search.answer([i * atoms + j], "alone")
-    if not search.holds(keys):
-        return search.answer(None, "none")
-    # bisection is quick where the decisions do not depend on one another; what it leaves is thinned further
-    best = _required(keys, search, search.made + (tests - search.made) // 2)
-    best = _ddmin(best if search.known(best) else keys, search)
-    return search.answer(best, "spent" if search.spent else "fewest")
+    best, code = [i * atoms + j], "alone"
+    if not search.holds(best):
+        # bisection is quick where decisions do not depend on one another; what it leaves is thinned further
+        best, code = (keys, "proven") if search.holds(keys) else ([], "none")
+        required = _required(best, search, search.made + (tests - search.made) // 2)
+        best = fewest(required if search.known.get(frozenset(required)) else best, search.holds, search.spent)
+        code = "unproven" if best and search.spent() else code
+    pairs = tuple(divmod(key, atoms) for key in sorted(best)) or None
+    return Minimal(pairs, code, len(keys), search.made, search.horizon)
 
 
 class _Search:
@@ -344,29 +339,16 @@ class _Search:
         progress: Callable[[int, int], None] | None,
     ):
         self.fork, self.horizon, self.allowed, self.progress = fork, horizon, allowed, progress
-        self.candidates = len(keys)
         self.made = 0
-        self._known: dict[frozenset[int], bool] = {}
+        self.known: dict[frozenset[int], bool] = {frozenset(): False}
         self._cell = HostCell(fork.twin.a.simulation.cell)
         self._every = max(1, horizon // _SAMPLES)
         self._positions: dict[int, np.ndarray] = {}
         self._decided = DecidedPairs.of(fork.twin.a, keys, horizon, self._keep)
 
-    @property
     def spent(self) -> bool:
         """Whether no more runs are allowed."""
         return self.made >= self.allowed
-
-    def known(self, keys: Sequence[int]) -> bool:
-        """Whether these pairs are known to be enough."""
-        return self._known.get(frozenset(keys), False)
-
-    def answer(self, keys: Sequence[int] | None, reason: MinimalReason) -> Minimal:
-        """The outcome."""
-        atoms = self.fork.twin.a.size
-        pairs = None if keys is None else tuple(divmod(key, atoms) for key in sorted(keys))
-        proven, alone = reason in ("alone", "fewest"), reason == "alone"
-        return Minimal(pairs, proven, alone, self.candidates, self.made, self.horizon, reason)
 
     def _keep(self, segment: Segment) -> None:
         """A's positions now and then."""
@@ -377,14 +359,14 @@ class _Search:
     def holds(self, keys: Sequence[int]) -> bool:
         """Whether B stays with A when these pairs are pinned; False once no more runs are allowed."""
         name = frozenset(keys)
-        if name not in self._known:
-            if self.spent:
+        if name not in self.known:
+            if self.spent():
                 return False
-            self._known[name] = self._stays(keys)
+            self.known[name] = self._stays(keys)
             self.made += 1
             if self.progress is not None:
                 self.progress(self.made, self.allowed)
-        return self._known[name]
+        return self.known[name]
 
     def _stays(self, keys: Sequence[int]) -> bool:
         b, tolerance = self.fork.twin.b, self.fork.tolerance
@@ -412,7 +394,7 @@ def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """
     required: list[int] = []
     pool = keys
-    while pool and search.made < until and not (required and search.holds(required)):
+    while pool and search.made < until and not search.holds(required):
         low, high = 0, len(pool)
         while high - low > 1 and search.made < until:
             middle = (low + high) // 2
@@ -423,24 +405,3 @@ def _required(keys: list[int], search: _Search, until: int) -> list[int]:
         required.append(pool[high - 1])
         pool = pool[: high - 1]
     return required
-
-
-def _ddmin(keys: list[int], search: _Search) -> list[int]:
-    """A subset that is enough, 1-minimal if the runs allowed suffice (Zeller and Hildebrandt 2002)."""
-    parts = 2
-    while len(keys) >= 2 and not search.spent:
-        size = -(-len(keys) // parts)
-        blocks = [keys[k : k + size] for k in range(0, len(keys), size)]
-        smaller = next((block for block in blocks if search.holds(block)), None)
-        if smaller is not None:
-            keys, parts = smaller, 2
-            continue
-        rests = ([key for key in keys if key not in set(block)] for block in blocks)
-        rest = next((rest for rest in rests if rest and search.holds(rest)), None)
-        if rest is not None:
-            keys, parts = rest, max(parts - 1, 2)
-        elif parts >= len(keys):
-            break
-        else:
-            parts = min(len(keys), 2 * parts)
-    return keys

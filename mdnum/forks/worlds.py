@@ -17,6 +17,11 @@ from mdnum.errors import InputError
 from mdnum.program import Program, Twin
 from mdnum.systems import BallSystem, System
 
+#: What has a dtype of its own, by world.
+ROLES = {
+    "md": ("state", "force", "decision", "accumulate"),
+    "ball": ("state", "arithmetic", "decision", "accumulate"),
+}
 #: Of a system file, tables that do not enter a step.
 _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
@@ -31,7 +36,7 @@ def program_of(system: System | BallSystem, steps: int | None = None) -> Program
         from mdnum.ball.program import BallProgram
         from mdnum.systems.build_ball import problem
 
-        return BallProgram(problem(system.spec, steps, where=system.name), system.name)
+        return BallProgram(problem(system.spec, steps, where=system.name))
     from mdnum.rollout.program import MdProgram
     from mdnum.systems.build import build
 
@@ -53,7 +58,7 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
         from mdnum.systems.load import vary
 
         name = name or ", ".join(values)
-        return replace(system, spec=vary(name, values, system.spec, f"--vary {name}").spec, variants=())
+        return replace(system, spec=vary(name, values, system.spec, f"--vary {name}"), variants={})
     from mdnum.systems import structures, toml
     from mdnum.systems.schema import SystemSpec
 

@@ -4,7 +4,14 @@ A rollout is differentiated at the states and decisions that it recorded; what t
 term of its own. Each way of doing it is a `Method`, each number that can be differentiated a `Loss`.
 """
 
-from mdnum.gradients.api import differentiable, value_and_grad
-from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, method
+from mdnum.gradients.problem import (
+    METHODS,
+    Gradient,
+    Method,
+    Problem,
+    differentiable,
+    method,
+    value_and_grad,
+)
 
 __all__ = ["METHODS", "Gradient", "Method", "Problem", "differentiable", "method", "value_and_grad"]

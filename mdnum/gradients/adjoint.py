@@ -1,8 +1,12 @@
 """The reverse pass of a rollout, stretch by stretch: at the states and decisions that the run recorded.
 
-Inside jax.value_and_grad a compiler makes another forward pass, whose rounding, and after some thousand
-steps whose decisions, are not those of the run that was simulated. Here the run is made first, by the program
-that makes every run, and the reverse pass linearizes at what it recorded.
+Inside jax.value_and_grad a compiler makes another forward pass, with a rounding, and after some thousand
+steps with decisions, of its own. Here the run is made first, by the program that makes every run.
+
+A conservative force is a gradient, so its Jacobian is symmetric and the transpose of the Jacobian times a
+vector is the Jacobian times that vector. Of a pair potential that is a tangent evaluation, pair by pair,
+gathered as the forces are: nothing is scattered. Of any other energy it is one tangent through one gradient
+of the energy. No tape is kept.
 """
 
 from __future__ import annotations
@@ -16,31 +20,191 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
-from mdnum.gradients.forces import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.losses import LossFrame
-from mdnum.gradients.parameters import Cotangents, quantities
+from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
+from mdnum.md.decide import Tables, displacements, halves_of, unpacked
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import ManyBodyForce, PairForce
+from mdnum.md.potentials import CutPotential, of_type
 
-#: Everything that a run is made of.
+#: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
+#: all distances, the forces themselves (for the derivatives by the integrator's numbers).
+MODEL, SCALE, FORCE = "model", "scale", "force"
 ALL = frozenset((MODEL, SCALE, FORCE))
+
+
+class ForceCotangents(NamedTuple):
+    """What comes back through one evaluation of forces.
+
+    Attributes:
+        x: on the positions.
+        model: on the parameters, a pytree of arrays like theirs; zeros where it was not asked for.
+        scale: on a common factor of all distances (the box and everything in it), at 1.
+        force: the forces themselves, energy/length.
+    """
+
+    x: Float[Array, "3 atoms"]
+    model: Any
+    scale: Float[Array, ""]
+    force: Float[Array, "3 atoms"]
+
+
+def pull_back(
+    force: PairForce | ManyBodyForce,
+    x: Float[Array, "3 atoms"],
+    tables: Tables,
+    bits: UInt8[Array, "words atoms"],
+    onto_force: Float[Array, "3 atoms"],
+    onto_energy: Float[Array, ""],
+    onto_virial: Float[Array, ""],
+    wanted: frozenset[str] = frozenset(),
+) -> ForceCotangents:
+    """The transpose of one evaluation of forces, energy and virial at given decisions.
+
+    Args:
+        x: sorted, wrapped positions, length. bits: the decisions that were acted on, packed.
+        onto_force, onto_energy, onto_virial: cotangents of the forces, the potential energy and the virial.
+        wanted: of MODEL, SCALE and FORCE; what is not wanted comes back as zeros.
+
+    Error: a rounding error for each pair, in the dtype of the force; sums slot by slot.
+    """
+    of = _of_pairs if isinstance(force, PairForce) else _of_energy
+    return of(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted)
+
+
+def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted) -> ForceCotangents:
+    dtype = force.policy.dtype("force")
+    cell = force.cell.astype(dtype)
+    components = tuple(x.astype(dtype))
+    w = tuple(onto_force.astype(dtype))
+    energy, virial = onto_energy.astype(dtype), onto_virial.astype(dtype)
+    model, cut = force.model, force.model.cutoff
+    at, back_to_model = jax.vjp(lambda model: model.at_cutoff(), model)
+    types_of = model.pair_types
+    by_parameter = (model.potential, at) if MODEL in wanted else ()
+    nothing = jnp.zeros(x.shape[1], dtype)
+
+    def block(carry, listed):
+        (j, types), told = listed
+        inside = unpacked(told)
+        d = displacements(components, cell, j)
+        dw = tuple(c.at[j].get(mode="promise_in_bounds") - c for c in w)
+        # the argument is masked, not only the result: a padded slot may be at distance zero
+        r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
+        along = jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
+        (_, slope), (_, bend) = jax.jvp(lambda q: model.evaluate(q, types, at), (r2,), (jnp.ones_like(r2),))
+        slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
+        # derivative by r² of what this slot adds to energy and virial
+        shared = energy * (0.5 * slope) - virial * (bend * r2 + slope)
+        pull, twist = slope + slope, 4 * (bend * along - shared)
+        terms = {"x": [pull * dw[c] + twist * d[c] for c in range(3)]}
+        if FORCE in wanted:
+            terms["force"] = [pull * d[c] for c in range(3)]
+        if SCALE in wanted:
+            terms["scale"] = [2 * r2 * (shared - bend * along)]
+        if MODEL in wanted:
+            # each slot has parameters of its own, so that no sum over slots stands inside the loop
+            own = jax.tree.map(
+                lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (model.potential, at)
+            )
+
+            def ended(own, r2=r2):
+                potential, end = own
+                u, s = potential.evaluate(r2)
+                return cut.cut(r2, u, s, end)
+
+            _, back = jax.vjp(ended, own)
+            onto_u = jnp.where(inside, 0.5 * energy, 0)
+            leaves = jax.tree.leaves(back((onto_u, -jnp.where(inside, along + virial * r2, 0)))[0])
+            terms["model"] = [
+                leaf if types is None else jnp.where(types == kind, leaf, 0)
+                for leaf in leaves
+                for kind in range(types_of)
+            ]
+        return {name: _added(carry[name], terms[name]) for name in carry}, None
+
+    start = {"x": (nothing,) * 3}
+    if FORCE in wanted:
+        start["force"] = (nothing,) * 3
+    if SCALE in wanted:
+        start["scale"] = (nothing,)
+    if MODEL in wanted:
+        start["model"] = (nothing,) * (types_of * len(jax.tree.leaves(by_parameter)))
+    sums, _ = lax.scan(block, start, (tables.groups(), halves_of(bits)))
+    zero = jnp.zeros((), dtype)
+    onto_model = jax.tree.map(jnp.zeros_like, model)
+    if MODEL in wanted:
+        flat = jnp.stack([jnp.sum(total) for total in sums["model"]]).reshape(-1, types_of)
+        onto_potential, onto_at = jax.tree.unflatten(jax.tree.structure(by_parameter), list(flat))
+        (onto_model,) = back_to_model(onto_at)
+        direct = jax.tree.map(jnp.add, onto_model.potential, onto_potential)
+        onto_model = CutPotential(direct, cut, onto_model.r_cut, onto_model.r_onset)
+    return ForceCotangents(
+        jnp.stack(sums["x"]).astype(x.dtype),
+        onto_model,
+        jnp.sum(sums["scale"][0]) if SCALE in wanted else zero,
+        jnp.stack(sums["force"]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x),
+    )
+
+
+def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
+    """Sums of four slots each, slot after slot: the compiler vectorizes over atoms, the order is fixed."""
+    out = []
+    for total, term in zip(totals, terms, strict=True):
+        for k in range(term.shape[0]):
+            total = total + term[k]
+        out.append(total)
+    return tuple(out)
+
+
+def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted) -> ForceCotangents:
+    values = quantities(force)
+    neighbor = force.neighbors(lax.stop_gradient(x), tables, bits)
+    matrix = jnp.asarray(force.cell.matrix)
+    w, virial = onto_force.T.astype(jnp.float64), onto_virial.astype(jnp.float64)
+
+    def energy(x, values, scale):
+        other: Any = with_quantities(force, values)
+        return other.potential.energy(x * scale, neighbor, matrix * scale)
+
+    at = (x.T.astype(jnp.float64), values, jnp.ones((), jnp.float64))
+    still = jax.tree.map(jnp.zeros_like, values)
+    if MODEL in wanted:
+        slope = jax.grad(energy, argnums=(0, 1, 2))
+        (by_x, by_model, by_scale), (bend_x, bend_model, bend_scale) = jax.jvp(slope, at, (w, still, virial))
+        model = jax.tree.map(lambda bend, one: onto_energy * one - bend, bend_model, by_model)
+    else:
+        slope = jax.grad(lambda x, scale: energy(x, values, scale), argnums=(0, 1))
+        (by_x, by_scale), (bend_x, bend_scale) = jax.jvp(slope, (at[0], at[2]), (w, virial))
+        model = still
+    # forces on atoms that are measured in units of the box shrink with the square of its scale
+    scale = 2 * jnp.sum(w * by_x) - bend_scale + (onto_energy - virial) * by_scale
+    return ForceCotangents(
+        (onto_energy * by_x - bend_x).T.astype(x.dtype),
+        model,
+        scale if SCALE in wanted else jnp.zeros_like(scale),
+        -by_x.T.astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x),
+    )
 
 
 class AdjointCarry(NamedTuple):
     """What the reverse pass carries from step to step.
 
+    Where it is watched, rows of what it carried: row k belongs to the state (x, half-kicked v) that step
+    first + k begins with, before the crossings that lead there, in the order of the stretch's list; rows
+    beyond the used ones are void, and the origin is left out.
+
     Attributes:
-        x: cotangent of the positions at the step that comes next in time, shape (3, atoms).
-        v: of the half-kicked velocities that lead there, shape (3, atoms).
-        model, integrator: of parameters, so far.
-        scale: of a common factor of all distances, so far.
+        x: cotangent of the positions at the step that comes next in time.
+        v: of the half-kicked velocities that lead there.
+        model, integrator, scale: of parameters and of a common factor of all distances, so far.
         origin: of the frame of step 0 where the loss compares with it, user's order.
-        r_cut: of the cutoffs by the times of flips, so far, shape (types,).
+        r_cut: of the cutoffs by the times of flips, so far.
         frame: of potential energy and virial in the frame that the loss looks at next in time.
     """
 
@@ -54,29 +218,6 @@ class AdjointCarry(NamedTuple):
     frame: tuple[Float[Array, ""], Float[Array, ""]]
 
 
-class Trace(NamedTuple):
-    """What the reverse pass carried at every step of a stretch.
-
-    Row k belongs to the state (x, half-kicked v) that step first + k begins with, before the crossings that
-    lead there; rows beyond the used ones are void.
-
-    Attributes:
-        x, v: cotangents of positions and velocities, in the order of the stretch's list, shape
-            (room, 3, atoms).
-        model, integrator, scale, r_cut: as in `AdjointCarry`, with a leading axis of rows: what the steps
-            from here to the end have added.
-        frame: as in `AdjointCarry`, each of shape (room,).
-    """
-
-    x: Float[Array, "room 3 atoms"]
-    v: Float[Array, "room 3 atoms"]
-    model: Any
-    integrator: Any
-    scale: Float[Array, "room"]
-    r_cut: Float[Array, "room types"]
-    frame: tuple[Float[Array, "room"], Float[Array, "room"]]
-
-
 def reverse(
     tape: RunTape,
     *,
@@ -84,16 +225,14 @@ def reverse(
     saltation: bool = False,
     guard: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[TapeStretch, Trace], None] | None = None,
+    watch: Callable[[TapeStretch, AdjointCarry], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
     """Derivatives of a tape's loss by everything that the run is made of.
 
     Args:
-        tape: the run.
         wanted: what is wanted beyond the start: of MODEL, SCALE and FORCE (the integrator's numbers).
         saltation: whether to add what every flip does through the time at which it happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
-        progress: called with the steps done and the last step.
         watch: called with every stretch, last first, and what was carried at its steps.
 
     Returns:
@@ -102,8 +241,7 @@ def reverse(
     Raises:
         InputError: a many-body potential with its flips.
 
-    Error: of the order of a rounding error times the growth of the adjoint; none of truncation, for the
-    program as it ran.
+    Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
     """
     back = StretchReversal(tape, wanted, guard if saltation else None)
     found: list[Crossings] = []
@@ -119,19 +257,11 @@ def reverse(
 
 
 class StretchReversal:
-    """A reverse pass on its way, from the end of a tape to its start.
-
-    Args:
-        tape: the run.
-        wanted: of MODEL, SCALE and FORCE.
-        guard: radial speed below which a flip adds nothing; None where flips do not count.
+    """A reverse pass on its way, from the end of a tape to its start; arguments as for `reverse`.
 
     Attributes:
-        carry: what is carried, atoms in the user's order.
-        met: the crossings of the stretch that was gone through last; None where flips do not count.
-
-    Raises:
-        InputError: a many-body potential with its flips.
+        carry: what is carried, atoms in the user's order. guard: None where flips do not count.
+        met: the crossings of the stretch that was gone through last.
     """
 
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
@@ -146,17 +276,13 @@ class StretchReversal:
         self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
         self.onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
         nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
-        numbers, _ = eqx.partition(simulation.integrator, _is_number)
+        numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
+        model, integrator = jax.tree.map(jnp.zeros_like, (quantities(force), numbers))
+        scale, zero = jnp.zeros((), force.policy.dtype("force")), jnp.zeros((), jnp.float64)
+        r_cut = jnp.zeros(simulation.pair_types, jnp.float64)
         self.met: Crossings | None = None
         self.carry = AdjointCarry(
-            nothing,
-            nothing,
-            jax.tree.map(jnp.zeros_like, quantities(force)),
-            jax.tree.map(jnp.zeros_like, numbers),
-            jnp.zeros((), force.policy.dtype("force")),
-            (nothing, nothing),
-            jnp.zeros(simulation.pair_types, jnp.float64),
-            (jnp.zeros((), jnp.float64), jnp.zeros((), jnp.float64)),
+            nothing, nothing, model, integrator, scale, (nothing, nothing), r_cut, (zero, zero)
         )
 
     def arguments(self, stretch: TapeStretch, traced: bool) -> tuple[Any, ...]:
@@ -168,25 +294,17 @@ class StretchReversal:
             self.met = crossings(
                 simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, self.guard
             )
+        tape, tables = self.tape, simulation.tables(stretch.table)
+        looking = (tape.loss, tape.origin, tape.around, self.onto_total, tape.pace)
+        crossed = None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms)
         return (
-            self.force,
-            simulation.integrator,
-            simulation.masses[order],
-            simulation.tables(stretch.table),
-            stretch.columns,
-            stretch.bits,
-            stretch.rows,
-            self.tape.seen(stretch),
-            (self.tape.loss, self.tape.origin, self.tape.around, self.onto_total, self.tape.pace),
-            None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms),
-            self.carry,
-            self.wanted,
-            traced,
-        )
+            self.force, simulation.integrator, simulation.masses[order], tables, stretch.columns,
+            stretch.bits, stretch.rows, tape.seen(stretch), looking, crossed, self.carry, self.wanted, traced,
+        )  # fmt: skip
 
     def through(
         self, stretch: TapeStretch, *, traced: bool = False
-    ) -> tuple[Float[np.ndarray, "room most"], Trace | None]:
+    ) -> tuple[Float[np.ndarray, "room most"], AdjointCarry | None]:
         """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
         return np.asarray(weights), trace
@@ -199,10 +317,6 @@ class StretchReversal:
         # distances stretch with the box; the velocities of the start do not
         scale = float(carry.scale) - float(np.sum(v * np.asarray(simulation.velocities).T))
         return Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
-
-
-def _is_number(leaf: Any) -> bool:
-    return eqx.is_inexact_array(leaf)
 
 
 @partial(jax.jit, static_argnames=("wanted", "traced"))
@@ -229,7 +343,7 @@ def transposed(
     dtype = rows[1].dtype
     mass_row = masses.astype(dtype)
     # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
-    numbers, rest = eqx.partition(integrator, _is_number)
+    numbers, rest = eqx.partition(integrator, eqx.is_inexact_array)
 
     def drift(x, v, numbers, scale, step):
         whole = eqx.combine(numbers, rest)
@@ -246,10 +360,8 @@ def transposed(
             )
             frame = frame_of(at, order, around.matrix)
             scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
-            start = LossFrame(
-                origin_step, origin[0] * length.astype(dtype), origin[1] * length.astype(dtype), nan, nan
-            )
-            return loss.observe(scaled, start, here)
+            began = (part * length.astype(dtype) for part in origin)
+            return loss.observe(scaled, LossFrame(origin_step, *began, nan, nan), here)
 
         nan, origin_step = origin.potential, origin.step
         one = jnp.ones((), jnp.float64)
@@ -257,15 +369,9 @@ def transposed(
         return back(onto_total)
 
     def blind(row):
-        return (
-            jnp.zeros_like(row[1]),
-            jnp.zeros_like(row[2]),
-            jnp.zeros_like(row[4]),
-            jnp.zeros_like(row[5]),
-            (jnp.zeros_like(origin.x), jnp.zeros_like(origin.v)),
-            jnp.zeros((), jnp.float64),
-            jnp.zeros((), jnp.float64),
-        )
+        one = jnp.ones((), jnp.float64)
+        seen = (row[1], row[2], row[4], row[5], (origin.x, origin.v), one, one)
+        return jax.tree.map(jnp.zeros_like, seen)
 
     def step(carry: AdjointCarry, given):
         row, told, see, met = given
@@ -303,36 +409,25 @@ def transposed(
             scale = scale + by_scale.astype(scale.dtype)
         if SCALE in wanted:
             scale = scale + made.scale + onto_length.astype(scale.dtype)
+        potential = jnp.where(see, onto_potential.astype(jnp.float64), carry.frame[0])
+        virial = jnp.where(see, onto_virial.astype(jnp.float64), carry.frame[1])
+        started = jax.tree.map(jnp.add, carry.origin, onto_origin)
+        onto_x = onto_x + loss_x + made.x
         after = AdjointCarry(
-            onto_x + loss_x + made.x,
-            onto_v,
-            model,
-            numbers_bar,
-            scale,
-            jax.tree.map(jnp.add, carry.origin, onto_origin),
-            carry.r_cut,
-            (
-                jnp.where(see, onto_potential.astype(jnp.float64), carry.frame[0]),
-                jnp.where(see, onto_virial.astype(jnp.float64), carry.frame[1]),
-            ),
+            onto_x, onto_v, model, numbers_bar, scale, started, carry.r_cut, (potential, virial)
         )
         trace = None
         if traced:
-            trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut, after.frame)
+            trace = after._replace(origin=())
         weights = jnp.zeros(0)
         if met is not None:
             # the forces are there wherever the derivative by scale is wanted
             arriving = v - half * made.force / mass_row
             share = pace.share(number, integrator.timestep)
+            here = (x, arriving, jnp.asarray(force.cell.matrix))
+            sums = (share * after.frame[0], share * after.frame[1])
             push, weights, by_radius, by_scale = onto_crossings(
-                met,
-                after.x,
-                after.v,
-                (x, arriving, jnp.asarray(force.cell.matrix)),
-                (share * after.frame[0], share * after.frame[1]),
-                masses,
-                integrator.timestep,
-                carry.r_cut.shape[0],
+                met, after.x, after.v, here, sums, masses, integrator.timestep, carry.r_cut.shape[0]
             )
             after = after._replace(
                 x=after.x + push,

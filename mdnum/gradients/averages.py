@@ -20,11 +20,11 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from mdnum.gradients import parameters
-from mdnum.gradients.forces import MODEL, SCALE, pull_back
+from mdnum.gradients.adjoint import MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, pairs_only
 from mdnum.gradients.recorded import tape_of
-from mdnum.gradients.tape import KEPT, RunTape, frame_of
+from mdnum.gradients.tape import KEPT, RunTape, frame_of, listed
 from mdnum.md.cell import displacement
 from mdnum.md.cutoffs import Hard
 from mdnum.md.integrators import Langevin
@@ -41,14 +41,11 @@ class Frames:
     """The frames that a loss looks at, each by itself.
 
     Attributes:
-        step: of each, shape (frames,).
-        x: wrapped positions, user's order, length, shape (frames, 3, atoms).
-        term: what each adds to the loss, which is linearized in its sums, shape (frames,).
+        step: of each. x: wrapped positions, user's order, length.
+        term: what each adds to the loss, which is linearized in its sums.
         by_potential, by_virial: derivatives of the loss by the potential energy and the virial of each.
-        energy: potential energy from which the forces of each derive, shape (frames,).
-        kinetic: kinetic energy of each.
-        explicit: derivatives of the loss at fixed positions (in units of the box) and decisions, by name,
-            shape (frames, ...).
+        energy: potential energy from which the forces of each derive. kinetic: kinetic energy of each.
+        explicit: derivatives of the loss at fixed positions (in units of the box) and decisions, by name.
         force_energy: derivatives of `energy` likewise.
     """
 
@@ -86,7 +83,6 @@ def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], N
     Args:
         tape: the run, of a pair potential.
         names: full names of parameters; those that a frame does not know of are left out.
-        progress: called with the steps done and the last step.
 
     Error: a rounding error for each pair.
     """
@@ -97,19 +93,15 @@ def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], N
     assert isinstance(smooth, PairForce)
     found: list[Any] = []
     steps, where = [], []
+    looking = (tape.loss, tape.origin, tape.around, onto_total)
     for stretch in tape.forward():
         seen = np.flatnonzero(tape.seen(stretch))
         if len(seen):
             order = stretch.table.order
             made = _look(
-                (simulation.force, smooth),
-                simulation.tables(stretch.table),
-                stretch.columns,
-                stretch.bits,
-                tape.seen(stretch),
-                (tape.loss, tape.origin, tape.around, onto_total),
-                jnp.asarray(simulation.masses[order]),
-            )
+                (simulation.force, smooth), simulation.tables(stretch.table), stretch.columns, stretch.bits,
+                tape.seen(stretch), looking, jnp.asarray(simulation.masses[order]),
+            )  # fmt: skip
             found.append(jax.tree.map(lambda a, seen=seen: np.asarray(a)[seen], made))
             x = np.empty((len(seen), 3, simulation.atoms))
             x[:, :, order] = stretch.x[seen]
@@ -118,39 +110,18 @@ def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], N
         if progress is not None:
             progress(stretch.first + stretch.rows - 1, tape.steps)
     numbers, explicit, energetic = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
-    term, by_potential, by_virial, energy, kinetic = numbers
     by = [name for name in names if known(name)]
-    return Frames(
-        np.concatenate(steps),
-        np.concatenate(where),
-        term,
-        by_potential,
-        by_virial,
-        energy,
-        kinetic,
-        {name: _by_name(simulation, explicit, name) for name in by},
-        {name: _by_name(simulation, energetic, name) for name in by},
-    )
+    named = ({name: _by_name(simulation, *parts, name) for name in by} for parts in (explicit, energetic))
+    return Frames(np.concatenate(steps), np.concatenate(where), *numbers, *named)
 
 
-def _by_name(simulation: Simulation, parts, name: str) -> Float[np.ndarray, "frames *types"]:
-    model, scale = parts
-    nothing = np.zeros((3, 0))
-    rows = [
-        parameters.gradient(
-            simulation,
-            Cotangents(
-                jax.tree.map(lambda leaf, k=k: leaf[k], model),
-                simulation.integrator,
-                nothing,
-                nothing,
-                float(scale[k]),
-                np.zeros(simulation.pair_types),
-            ),
-            name,
-        )
-        for k in range(len(scale))
-    ]
+def _by_name(simulation: Simulation, model, scale, name: str) -> Float[np.ndarray, "frames *types"]:
+    still, none = np.zeros((3, 0)), np.zeros(simulation.pair_types)
+    rows = []
+    for k in range(len(scale)):
+        own = jax.tree.map(lambda leaf, k=k: leaf[k], model)
+        parts = Cotangents(own, simulation.integrator, still, still, float(scale[k]), none)
+        rows.append(parameters.gradient(simulation, parts, name))
     return np.stack(rows)
 
 
@@ -181,10 +152,8 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
         other = pull_back(smooth, row[1], tables, told, still, one, zero, wanted)
         energy = jnp.sum(smooth(row[1], tables, decisions=False, given=told).energy, dtype=jnp.float64)
         kinetic = 0.5 * jnp.sum(masses * jnp.sum(jnp.square(row[2].astype(jnp.float64)), axis=0))
-        wide = jax.tree.map(
-            lambda leaf: leaf.astype(jnp.float64), ((own.model, own.scale), (other.model, other.scale))
-        )
-        (own_model, own_scale), theirs = wide
+        both = ((own.model, own.scale), (other.model, other.scale))
+        (own_model, own_scale), theirs = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), both)
         return (value, by_potential, by_virial, energy, kinetic), (own_model, own_scale + by_length), theirs
 
     def step(_, given):
@@ -234,18 +203,14 @@ def distances(
     """Distances of the pairs within `reach` of their cutoff, less the cutoff, by pair type.
 
     Args:
-        simulation: the system as objects.
         x: wrapped positions.
         reach: length.
     """
     search = VerletList(BUILDERS["host"], RebuildRule(reach), simulation.r_cut)
     table = search.build(np.ascontiguousarray(x.T), simulation.cell)
-    slots, columns = np.nonzero(table.index < x.shape[1])
-    i, j = table.order[columns], table.order[table.index[slots, columns]]
-    once = i < j
-    i, j = i[once], j[once]
+    first, second, kinds = listed(simulation, table)
+    i, j = table.order[first], table.order[second]
     r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x.T[i], x.T[j])))
-    kinds = simulation.type_of(i, j)
     beyond = [r[kinds == kind] - radius for kind, radius in enumerate(simulation.decider.r_cut)]
     return [one[np.abs(one) < reach] for one in beyond]
 
@@ -264,11 +229,7 @@ def density(
     that differs from no narrower one by more than twice the standard error of the difference.
 
     Args:
-        simulation: the system as objects.
-        seen: the frames.
-        weights: of each frame and pair type.
-        reach: the largest width, length.
-        progress: called with the frames done and their number.
+        weights: of each frame and pair type. reach: the largest width, length.
 
     Source: O. V. Lepski, Theory Probab. Appl. 35, 454 (1990), for the choice.
     """
@@ -289,13 +250,13 @@ def density(
     flat = (4 * found[1:] - found[:-1]) / 3
     flat = (16 * flat[1:] - flat[:-1]) / 15
     by_frame = flat.sum(axis=2)
-    best = len(flat) - 1
-    for k in range(best):
+
+    def alike(k: int) -> bool:
         # the noise that frames share does not tell one width from another
         differences = by_frame[k + 1 :] - by_frame[k]
-        if all(abs(one.sum()) <= 2 * rows * standard_error(one) for one in differences):
-            best = k
-            break
+        return all(abs(one.sum()) <= 2 * rows * standard_error(one) for one in differences)
+
+    best = next(k for k in range(len(flat)) if alike(k))
     bias = np.abs((flat[min(best + 1, len(flat) - 1)] - flat[best]).sum(axis=0))
     noise = np.array([rows * standard_error(column) for column in flat[best].T])
     return Density(flat[best], float(widths[best]), np.hypot(noise, bias), table)
@@ -382,8 +343,7 @@ class Reweighting(Method):
     the derivative of the energy, over kT.
 
     Attributes:
-        at_states: the explicit part.
-        budget: bytes of the recorded run that are kept in memory.
+        at_states: the explicit part. budget: bytes of the recorded run that are kept in memory.
 
     Error: statistical; a standard error from blocks is in the details. With a few correlated frames it is
         large, and one over the steps of the run at best.
@@ -415,17 +375,13 @@ class Reweighting(Method):
         simulation, tape = problem.simulation, tape_of(problem, False, self.budget, progress)
         seen = frames(tape, names, in_phase(progress, "frames"))
         inside = [name for name in names if known(name)]
-        explicit, details = self.at_states.terms(
-            simulation, seen, inside, in_phase(progress, "pairs at the cutoff")
-        )
+        edge = in_phase(progress, "pairs at the cutoff")
+        explicit, details = self.at_states.terms(simulation, seen, inside, edge)
         gradient: dict[str, np.ndarray] = {}
         details |= {
-            "frames": len(seen),
-            "standard error of the value": len(seen) * standard_error(seen.term),
-            "explicit": {},
-            "response": {},
-            "relative change for half the size": {},
-        }
+            "frames": len(seen), "standard error of the value": len(seen) * standard_error(seen.term),
+            "explicit": {}, "response": {}, "relative change for half the size": {},
+        }  # fmt: skip
         for name in names:
             score = _score(simulation, seen, name)
             centered = (seen.term - seen.term.mean()).reshape(-1, *[1] * (score.ndim - 1))

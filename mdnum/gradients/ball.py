@@ -20,9 +20,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from mdnum.ball.contacts import Projection
 from mdnum.ball.problem import BallLoss, BallProblem, loss_at
 from mdnum.ball.rollout import BallRun
+from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.problem import Gradient, Kind
 from mdnum.registry import Registry
@@ -131,16 +131,14 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Whether a scalar loss depends on its parameters, in the branches and iterations that ran.
 
-    A tangent that is no number stays none through everything that carries a derivative, whatever it is
-    multiplied by, and goes nowhere else.
+    A tangent that is NaN stays NaN through everything that carries a derivative, whatever it is multiplied
+    by, and goes nowhere else.
 
     Args:
-        function: from a dictionary of parameters, and the rest, to a scalar loss; may loop and branch. It is
-            compiled once, as long as it is the same object (or an equal `eqx.Module`).
-        values: the parameters, floating point, of any shape.
-        names: those asked about, all by default.
-        rest: further arguments, pytrees of arrays. What must not become a constant of the compiled program
-            (the zero of a fence) is passed here and not closed over.
+        function: from a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
+            it is the same object (or an equal `eqx.Module`).
+        values: the parameters, floating point, of any shape. names: those asked about, all by default.
+        rest: further arguments. What must not become a constant of the compiled program is passed here.
 
     Error: a slope that is infinite where it is multiplied by the tangent 0 of another element counts as used.
     """
@@ -260,9 +258,7 @@ class ThroughIterations(BallMethod):
     """The derivative of the operations that ran, iteration by iteration.
 
     Attributes:
-        loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
-            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.scaling`); a power of
-            two.
+        loss_scale: the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two.
     """
 
     loss_scale: float = 1.0
@@ -337,14 +333,12 @@ def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
 class RandomizedSmoothing(BallMethod):
     """The derivative of E[loss(parameters + width * noise)], estimated from values alone.
 
-    It needs no derivative of the program, sees through jumps (of iteration counts, of contacts), and is that
-    of a smoother loss; the same seed gives the same bits. Each sample is used with its mirror image, which
-    removes the value of the loss from the variance.
+    It sees through jumps (of iteration counts, of contacts), and is that of a smoother loss; the same seed
+    gives the same bits. Each sample is used with its mirror image, which removes the value from the variance.
 
     Attributes:
         width: standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0).
-        samples: pairs of mirrored samples.
-        seed: of the noise.
+        samples: pairs of mirrored samples. seed: of the noise.
     """
 
     width: float = 1e-2

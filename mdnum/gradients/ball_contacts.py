@@ -13,10 +13,18 @@ import numpy as np
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float
 
-from mdnum.ball.contacts import Motion, Moved, Penalty, Projection
-from mdnum.ball.integrators import BallVerlet, EventLocated, Push
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import (
+    BallDecisions,
+    BallRecord,
+    BallState,
+    BallVerlet,
+    EventLocated,
+    Motion,
+    Moved,
+    Penalty,
+    Projection,
+)
 from mdnum.ball.stopping import FixedCount
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
@@ -50,11 +58,9 @@ def solve(
 
     Args:
         matvec: A, symmetric and positive definite.
-        right: right-hand side.
         tolerance: of the residual, relative to the right-hand side.
         regularization: added to the diagonal of A; moves the answer by about regularization / smallest
             eigenvalue, relative.
-        max_iter: the cap.
 
     Error: at most tolerance times the condition number, relative.
     """
@@ -99,8 +105,7 @@ class FixedPointRule(eqx.Module):
 
     Attributes:
         tolerance, regularization, max_iter: of the linear solve.
-        at_iterate: evaluate at the height where the iteration stopped instead, which is no fixed point: then
-            the tolerance is back, as p / k.
+        at_iterate: evaluate at the height where the iteration stopped instead, which is no fixed point.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-12)
@@ -151,9 +156,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """The derivative of the projection's fixed point, by the implicit function theorem.
 
-    The loss is that of the iterations that ran; its derivative is that of where they were heading. For the
-    projection of a ball the fixed point is the floor, whatever the gain: the derivative by k is 0, and what
-    the unrolled one gives instead is an artefact of the tolerance.
+    The loss is that of the iterations that ran; its derivative is that of where they were heading: the floor,
+    whatever the gain. What the unrolled one gives by k is an artefact of the tolerance.
 
     Attributes:
         tolerance, regularization, max_iter: of the linear solve.
@@ -222,8 +226,7 @@ class SoftImpact(eqx.Module):
     Attributes:
         restitution: speed after over speed before, in the limit of small widths.
         k: stiffness per mass on the way in, 1/s².
-        eps: width in height over which the spring sets in, m.
-        slow: width in velocity over which the way in passes into the way out, m/s.
+        eps: width in height over which the spring sets in, m. slow: in velocity, of the passage, m/s.
 
     Source: the latching spring of Walton and Braun (1986), smoothed.
     """
@@ -245,10 +248,8 @@ class SoftImpact(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
 
-        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
-        made = motion.integrator.push(push, motion.y, motion.v, motion.carried, motion.rounding)
-        left = jnp.maximum(-made.y, 0)
-        return Moved(made.y, made.v, made.a, BallRecord(made.height, made.contact, left, made.solve))
+        made = motion.integrator.push(pull, motion)
+        return made._replace(record=made.record._replace(left=jnp.maximum(-made.y, 0)))
 
 
 @dataclass(frozen=True)
@@ -345,11 +346,10 @@ class ThroughContacts(BallMethod):
     """The derivative of the ball's motion, contacts included, rather than of the steps that imitate it.
 
     A step decides about contact at its end, so its derivative does not know that a ball which starts higher
-    arrives later: for an impact reset at the end of the step the derivative by y0 is 0 however small the
-    step. Here a tangent is carried along with the rollout and multiplied by the saltation matrix at every
-    contact. Where the impact is located inside the step the program's own derivative is already this one.
-    A projection is read as the impact that it stands for. The force of a spring without a damper does not
-    jump, so nothing is added: of a spring this is the unrolled derivative, and says so.
+    arrives later. Here a tangent is carried along with the rollout and multiplied by the saltation matrix at
+    every contact. Where the impact is located inside the step the program's own derivative is already this
+    one. A projection is read as the impact that it stands for. The force of a spring without a damper does
+    not jump: of a spring this is the unrolled derivative, and says so.
     """
 
     name = "event-aware"

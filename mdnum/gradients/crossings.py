@@ -1,12 +1,10 @@
 """What a flip does to a gradient: the time at which a pair crosses its cutoff moves with everything else.
 
 Where the force jumps, a perturbed pair feels it earlier or later, and its momentum is another one ever
-after. Differentiating the steps of a program never sees that, because the steps do not move with the
-crossing; the error does not shrink with the time step. The term is the saltation term of mdnum.numerics, with
-the cutoff's sphere as the threshold, written for the reverse pass.
-
-A loss that sees the potential energy or the virial jumps with them too, in the frames that it looks at: where
-they follow one another at equal times, a later crossing moves the jump across a share of them.
+after. Differentiating the steps of a program never sees that; the error does not shrink with the time step.
+The term is the saltation term of mdnum.numerics, with the cutoff's sphere as the threshold, written for the
+reverse pass. A loss that sees the potential energy or the virial jumps with them too: where its frames follow
+one another at equal times, a later crossing moves the jump across a share of them.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -31,11 +29,9 @@ class Met(NamedTuple):
     """The crossings of some rows on the device, padded to one length.
 
     Attributes:
-        i, j: sorted atoms; beyond the last one where there is no crossing, shape (rows, most).
-        normal: from i to j, shape (rows, 3, most).
-        push: signed force jump over radial speed, energy/length per (length/time); 0 where it is left out.
+        i, j: sorted atoms; beyond the last one where there is no crossing. normal, images: as in `Crossings`.
+        push: signed force jump over radial speed, energy/length per (length/time).
         kind: pair type; -1 - kind where it is left out.
-        images: lattice vectors from the nearest image of atom j to its wrapped position, (rows, 3, most).
         potential, virial: their jumps over the radial speed, energy per (length/time).
     """
 
@@ -54,14 +50,13 @@ class Crossings:
     """The flips of one stretch, as events with a time.
 
     Attributes:
-        ledger: the flips.
+        ledger: the flips. kind: pair type.
         row: row of each in its stretch. i, j: its atoms in the order of the stretch's list.
-        normal: unit vector from i to j at the crossing, shape (crossings, 3).
+        normal: unit vector from i to j at the crossing.
         speed: radial speed there, length per internal time: negative where the pair enters.
         force: radial force that the flip adds, energy/length.
         energy, virial: what the flip adds to the potential energy and to the virial, energy.
-        kind: pair type.
-        images: lattice vectors from the nearest image of atom j to its wrapped position, (crossings, 3).
+        images: lattice vectors from the nearest image of atom j to its wrapped position.
         grazing: slower than the guard: left out.
         weight: derivative of the loss by the cutoff of this one crossing; NaN until the reverse pass has
             been there. For one left out, what it would have been.
@@ -107,21 +102,19 @@ class Crossings:
         order, row, place = self._places(room)
         # a power of two, so that not every stretch is compiled for
         most = 1 << max(3, int(place.max(initial=0)).bit_length())
-        i, j = np.full((room, most), atoms), np.full((room, most), atoms)
-        normal, push = np.zeros((room, 3, most)), np.zeros((room, most))
-        potential, virial = np.zeros((room, most)), np.zeros((room, most))
-        images = np.zeros((room, 3, most), np.int64)
-        kind = np.zeros((room, most), np.int64)
-        i[row, place], j[row, place] = self.i[order], self.j[order]
-        normal[row, :, place] = self.normal[order]
+
+        def padded(values: np.ndarray, nothing: int = 0) -> Array:
+            out = np.full((room, *values.shape[1:], most), nothing, values.dtype)
+            out[(row, slice(None), place) if values.ndim == 2 else (row, place)] = values[order]
+            return jnp.asarray(out)
+
         # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
-        push[row, place] = self.kick[order]
-        potential[row, place] = (self.energy / self.speed)[order]
-        virial[row, place] = (self.virial / self.speed)[order]
-        kind[row, place] = np.where(self.grazing, -1 - self.kind, self.kind)[order]
-        images[row, :, place] = self.images[order]
-        parts = (i, j, normal, push, kind, images, potential, virial)
-        return Met(*(jnp.asarray(part) for part in parts))
+        kind = np.where(self.grazing, -1 - self.kind, self.kind)
+        return Met(
+            padded(self.i, atoms), padded(self.j, atoms), padded(self.normal), padded(self.kick),
+            padded(kind), padded(self.images), padded(self.energy / self.speed),
+            padded(self.virial / self.speed),
+        )  # fmt: skip
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
         """Values of padded rows, in the order of the crossings."""
@@ -154,11 +147,8 @@ def onto_crossings(
         met: the crossings between the step before and this one.
         onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
         here: these wrapped positions and velocities themselves, and the lattice vectors.
-        onto_sums: cotangents of the potential energy and of the virial per time, as frames at equal times see
-            them.
-        masses: shape (atoms,).
-        timestep: internal time.
-        types: number of pair types.
+        onto_sums: cotangents of potential energy and virial per time, as frames at equal times see them.
+        timestep: internal time. types: number of pair types.
 
     Returns:
         what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
@@ -207,9 +197,7 @@ def push_through(
     Args:
         met: the crossings between the step before and this one.
         x, v: tangents of this step's wrapped positions and of the velocities that lead there.
-        masses: shape (atoms,).
-        timestep: internal time.
-        r_cut, matrix: tangents of the cutoffs and of the lattice vectors.
+        timestep: internal time. r_cut, matrix: tangents of the cutoffs and of the lattice vectors.
 
     Returns:
         tangents of the distances at the crossings, what is added to x and v, and the times by which the
@@ -239,10 +227,7 @@ def crossings(
     """The flips of a stretch as events: their normals and radial speeds between two steps.
 
     Args:
-        simulation: the system as objects.
-        ledger: its flips.
-        first: step of the first row.
-        order: sorted atom k is atom order[k].
+        ledger: its flips. first: step of the first row. order: sorted atom k is atom order[k].
         x: wrapped positions of the stretch. x_before: of the step before it.
         guard: radial speed, length per internal time, below which a crossing is left out.
     """
@@ -267,18 +252,6 @@ def crossings(
     safe = np.where(speed == 0, np.inf, speed)
     force = np.asarray(ledger.extra["force_jump"], np.float64)
     kind = np.asarray(simulation.type_of(low, high), np.int64)
-    return Crossings(
-        ledger,
-        row,
-        i,
-        j,
-        normal,
-        safe,
-        force,
-        np.asarray(ledger.jump, np.float64),
-        force * np.asarray(simulation.decider.r_cut)[kind],
-        kind,
-        images,
-        grazing,
-        np.full(len(row), np.nan),
-    )
+    energy, virial = np.asarray(ledger.jump, np.float64), force * np.asarray(simulation.decider.r_cut)[kind]
+    unknown = np.full(len(row), np.nan)
+    return Crossings(ledger, row, i, j, normal, safe, force, energy, virial, kind, images, grazing, unknown)

@@ -73,15 +73,19 @@ class Loss(eqx.Module):
     name: ClassVar[str]
     label: ClassVar[str] = ""
     unit: ClassVar[str] = ""
+    of_single_frames: ClassVar[bool] = False
     every: int = eqx.field(static=True, default=1)
     first: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
         if self.every < 1 or self.first < 0:
-            raise InputError(
-                f"every = {self.every}, first = {self.first}; expected at least 1 and at least 0",
-                where=f"loss {self.name}",
+            raise self.wrong(
+                f"every = {self.every}, first = {self.first}; expected at least 1 and at least 0"
             )
+
+    def wrong(self, seen: str, remedy: str | None = None) -> InputError:
+        """The error for options that make no sense."""
+        return InputError(seen, remedy=remedy, where=f"loss {self.name}")
 
     @classmethod
     def named(cls, options: dict[str, Any], simulation: Simulation, steps: int) -> Loss:
@@ -104,10 +108,6 @@ class Loss(eqx.Module):
         """Why it has no meaning in these surroundings; None where it has."""
         return None
 
-    @property
-    def of_single_frames(self) -> bool:
-        return False
-
 
 class _OfLast(Loss):
     """Of the last step alone."""
@@ -117,14 +117,6 @@ class _OfLast(Loss):
 
     def value(self, total, frames):
         return total
-
-
-class _OfFrames(Loss):
-    """A mean of what each frame shows by itself."""
-
-    @property
-    def of_single_frames(self) -> bool:
-        return True
 
 
 class Custom(Loss):
@@ -147,16 +139,10 @@ class Custom(Loss):
         return self.see(frame, origin, around)
 
     def value(self, total, frames):
-        value = self.conclude(total, frames)
-        if jax.tree.structure(value) != jax.tree.structure(0.0) or jnp.shape(value) != ():
-            raise InputError(
-                f"the loss has shape {jnp.shape(value)}; expected a scalar",
-                remedy="Reduce it, with a sum or a mean",
-            )
-        return jnp.asarray(value)
+        return self.conclude(total, frames)
 
     @property
-    def of_single_frames(self) -> bool:
+    def of_single_frames(self) -> bool:  # type: ignore[override]
         return self.single
 
 
@@ -194,28 +180,31 @@ class VelocityAutocorrelation(_OfLast):
         return _correlation(frame, origin)
 
 
-class MeanPotential(_OfFrames):
+class MeanPotential(Loss):
     """Potential energy of an atom, averaged over frames."""
 
     name, label, unit = "potential", "potential energy of an atom, averaged over steps", "{energy}"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return frame.potential / frame.x.shape[1]
 
 
-class MeanTemperature(_OfFrames):
+class MeanTemperature(Loss):
     """Kinetic temperature 2 K / (3 N kB), averaged over frames, K (or the units' temperature)."""
 
     name, label, unit = "temperature", "kinetic temperature, averaged over steps", "{temperature}"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return 2 * _kinetic(frame, around) / (3 * frame.x.shape[1] * around.kB)
 
 
-class MeanPressure(_OfFrames):
+class MeanPressure(Loss):
     """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
 
     name, label, unit = "pressure", "pressure, averaged over steps", "{energy}/{length}³"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
@@ -250,11 +239,8 @@ class EinsteinDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.first + self.every:
-            raise InputError(
-                f"a slope needs two frames, and up to step {last} there is one at most",
-                remedy="Run longer, or look earlier or more often",
-                where=f"loss {self.name}",
-            )
+            seen = f"a slope needs two frames, and up to step {last} there is one at most"
+            raise self.wrong(seen, "Run longer, or look earlier or more often")
         return super().looks_at(steps, last)
 
 
@@ -277,11 +263,8 @@ class GreenKuboDiffusion(Loss):
 
     def __check_init__(self):
         if self.first or self.until < self.every or self.until % self.every:
-            raise InputError(
-                f"first = {self.first}, every = {self.every}, until = {self.until}; expected 0, and a "
-                "positive multiple of every",
-                where=f"loss {self.name}",
-            )
+            seen = f"first = {self.first}, every = {self.every}, until = {self.until}"
+            raise self.wrong(f"{seen}; expected 0, and a positive multiple of every")
 
     @classmethod
     def named(cls, options, simulation, steps):
@@ -290,11 +273,8 @@ class GreenKuboDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.until:
-            raise InputError(
-                f"the integral goes up to step {self.until}, the run to step {last}",
-                remedy="Run longer, or integrate less far",
-                where=f"loss {self.name}",
-            )
+            seen = f"the integral goes up to step {self.until}, the run to step {last}"
+            raise self.wrong(seen, "Run longer, or integrate less far")
         return super().looks_at(steps, last) & (steps <= self.until)
 
     def observe(self, frame, origin, around):
@@ -307,16 +287,15 @@ class GreenKuboDiffusion(Loss):
         return total
 
 
-class RadialDistribution(_OfFrames):
+class RadialDistribution(Loss):
     """A number made of g(r), the density of pairs against that of an ideal gas, averaged over frames.
 
-    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: no
-    pair is lost, and g(r) has two continuous derivatives by every position. All pairs are examined, row by
-    row, so that a frame costs of the order of atoms² operations and of atoms memory.
+    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: g(r) has
+    two continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
+    memory.
 
     Attributes:
-        r_max: right edge of the last bin, length.
-        bins: number of bins of equal width, from 0.
+        r_max: right edge of the last bin, length. bins: of equal width, from 0.
         target: the loss is the mean squared difference from this, shape (bins,), or from the same in all.
         weights: the loss is the sum of g(r) with these weights instead, shape (bins,).
 
@@ -324,6 +303,7 @@ class RadialDistribution(_OfFrames):
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
+    of_single_frames = True
     r_max: float = eqx.field(static=True, kw_only=True)
     bins: int = eqx.field(static=True, kw_only=True, default=60)
     target: Float[Array, "*bins"] = eqx.field(kw_only=True, default_factory=lambda: jnp.ones((), jnp.float64))
@@ -331,15 +311,10 @@ class RadialDistribution(_OfFrames):
 
     def __check_init__(self):
         if not self.r_max > 0 or self.bins < 4:
-            raise InputError(
-                f"r_max = {self.r_max:g}, bins = {self.bins}; expected above 0, and at least 4",
-                where=f"loss {self.name}",
-            )
+            raise self.wrong(f"r_max = {self.r_max:g}, bins = {self.bins}; expected above 0, and at least 4")
         for name, given in (("target", self.target), ("weights", self.weights)):
             if given is not None and jnp.shape(given) not in ((), (self.bins,)):
-                raise InputError(
-                    f"{name} has shape {jnp.shape(given)}; expected ({self.bins},)", where=f"loss {self.name}"
-                )
+                raise self.wrong(f"{name} has shape {jnp.shape(given)}; expected ({self.bins},)")
 
     @classmethod
     def named(cls, options, simulation, steps):
@@ -367,10 +342,8 @@ class RadialDistribution(_OfFrames):
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
         reach = self.r_max + 2 * self.width
         if reach > half:
-            return (
-                f"its last bin reaches to {reach:.4g}, beyond half the smallest box width {half:.4g}: make "
-                "r_max smaller"
-            )
+            seen = f"its last bin reaches to {reach:.4g}, beyond half the smallest box width {half:.4g}"
+            return f"{seen}: make r_max smaller"
         return None
 
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext):
@@ -447,9 +420,7 @@ def parse(text: str, simulation: Simulation, steps: int) -> Loss:
     """The loss that a text names.
 
     Args:
-        text: a name of `LOSSES`, with options behind a colon where others than the defaults are meant:
-            "potential:every=10,first=500".
-        simulation, steps: what it is a loss of.
+        text: a name of `LOSSES`, with options behind a colon: "potential:every=10,first=500".
 
     Raises:
         InputError: no such loss, or it has no such option.

@@ -6,6 +6,8 @@ the derivatives by all that a rollout is made of, and what of a rollout moves wi
 
 from __future__ import annotations
 
+import operator
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -125,7 +127,7 @@ def _with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(ABC):
     """One quantity of a simulation; its value is a scalar, or has an entry for each pair type, atom or so."""
 
     simulation: Simulation
@@ -136,21 +138,21 @@ class Parameter:
         """The name behind its table."""
         return self.name.partition(".")[2]
 
+    @abstractmethod
     def value(self) -> Float[np.ndarray, "..."]:
         """In units of the system file, but velocities are length per internal time."""
-        raise NotImplementedError
 
+    @abstractmethod
     def changed(self, new: np.ndarray) -> Simulation:
         """The simulation with another value."""
-        raise NotImplementedError
 
+    @abstractmethod
     def gradient(self, parts: Cotangents) -> Float[np.ndarray, "..."]:
         """The derivative by it, of the shape of the value."""
-        raise NotImplementedError
 
+    @abstractmethod
     def moved(self, still: Direction, index: tuple[int, ...]) -> Direction:
         """What moves with one entry, per unit of the value, where nothing else does."""
-        raise NotImplementedError
 
 
 class _PairQuantity(Parameter):
@@ -232,35 +234,30 @@ class _Constant(Parameter):
 
 
 class _Number(Parameter):
-    """A time of the integrator."""
+    """A time of the integrator; `inside` and `outside` turn its unit of time into that of files and back."""
 
-    def inside(self, number):
-        """In the integrator's unit of time."""
-        return number * self.simulation.units.time_factor
+    inside, outside = staticmethod(operator.mul), staticmethod(operator.truediv)
 
     def value(self):
         number = float(getattr(self.simulation.integrator, self.key))
-        return np.asarray(number / self.simulation.units.time_factor)
+        return np.asarray(self.outside(number, self.simulation.units.time_factor))
 
     def changed(self, new):
-        return _integrated(self.simulation, self.key, self.inside(new))
+        return _integrated(self.simulation, self.key, self.inside(new, self.simulation.units.time_factor))
 
     def gradient(self, parts):
-        return np.asarray(self.inside(float(getattr(parts.integrator, self.key))))
+        number = float(getattr(parts.integrator, self.key))
+        return np.asarray(self.inside(number, self.simulation.units.time_factor))
 
     def moved(self, still, index):
-        return still._replace(integrator=_moved(still.integrator, self.key, self.inside(1.0)))
+        by = self.inside(1.0, self.simulation.units.time_factor)
+        return still._replace(integrator=_moved(still.integrator, self.key, by))
 
 
 class _Rate(_Number):
     """One over a time."""
 
-    def inside(self, number):
-        return number / self.simulation.units.time_factor
-
-    def value(self):
-        number = float(getattr(self.simulation.integrator, self.key))
-        return np.asarray(number * self.simulation.units.time_factor)
+    inside, outside = staticmethod(operator.truediv), staticmethod(operator.mul)
 
 
 class _Temperature(Parameter):
@@ -277,11 +274,8 @@ class _Temperature(Parameter):
             )
         dynamics = simulation.system.spec.dynamics.model_copy(update={"temperature": float(new)})
         spec = simulation.system.spec.model_copy(update={"dynamics": dynamics})
-        simulation = replace(
-            simulation,
-            system=replace(simulation.system, spec=spec),
-            velocities=simulation.velocities * np.sqrt(float(new) / float(old)),
-        )
+        v = simulation.velocities * np.sqrt(float(new) / float(old))
+        simulation = replace(simulation, system=replace(simulation.system, spec=spec), velocities=v)
         if isinstance(simulation.integrator, Langevin):
             simulation = _integrated(simulation, "kT", simulation.units.k_B * new)
         return simulation
@@ -432,8 +426,7 @@ class ParameterEntry:
     """One number among the parameters.
 
     Attributes:
-        name: full name of the parameter.
-        index: which of its entries; empty for a scalar.
+        name: full name of the parameter. index: which of its entries; empty for a scalar.
     """
 
     name: str

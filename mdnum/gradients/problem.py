@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from mdnum.errors import InputError
@@ -23,6 +26,8 @@ Progress = Callable[[int, int, str], None]
 #: What a method differentiates: the steps with decisions held fixed, the flow with the times of its flips,
 #: values between shifted runs, an average over runs or states, another program.
 Kind = Literal["steps", "flow", "values", "average", "other program"]
+#: Parameters by name, each of the shape of its value in the simulation.
+Values = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -52,12 +57,11 @@ class Problem:
         if why is not None:
             raise InputError(f"the loss {self.loss.name} has no meaning here: {why}")
         # a loss that is no real number is refused before anything is run
-        dtype = self.simulation.policy.dtype("state")
-        vector = jax.ShapeDtypeStruct((3, self.simulation.atoms), dtype)
+        vector = jax.ShapeDtypeStruct((3, self.simulation.atoms), self.simulation.policy.dtype("state"))
         number = jax.ShapeDtypeStruct((), np.float64)
-        shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        frame: Any = LossFrame(jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
         made = jax.eval_shape(
-            lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), LossFrame(*shapes)
+            lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), frame
         )
         if jax.tree.structure(made) != jax.tree.structure(0.0) or made.shape != ():
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
@@ -68,11 +72,11 @@ class Problem:
                 remedy="A count or a complex number has no gradient: make a float of it that varies smoothly",
             )
 
-    def at(self, values: Mapping[str, Any]) -> Problem:
+    def at(self, values: Values) -> Problem:
         """The same loss of a rollout with other parameters."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
-    def value(self, values: Mapping[str, Any] | None = None) -> float:
+    def value(self, values: Values | None = None) -> float:
         """The loss, of the run that the rollout makes."""
         made = self.at(values or {})
         return RunTape(made.simulation, made.loss, made.steps, budget=0).value
@@ -88,14 +92,12 @@ class Gradient:
     """A derivative of a loss, and which derivative it is.
 
     Attributes:
-        method: name of the method.
-        description: which derivative this is, one sentence.
+        method: name of the method. description: which derivative this is, one sentence.
         value: the loss of the program that was differentiated.
         gradient: derivative by full name of the parameter, of the shape of its value.
-        notes: what a reader must know about single parameters, by name: no dependence, a missing term.
-        details: plain values that belong to the method: counts, errors, tables.
-        kind: what was differentiated.
-        depends: whether the run used each parameter on the way to the loss, where that is known.
+        notes: what must be known about a parameter, by name: no dependence, a missing term.
+        details: plain values of the method: counts, errors, tables.
+        kind: what was differentiated. depends: whether the run used each parameter, where that is known.
     """
 
     method: str
@@ -160,8 +162,8 @@ for _name, _class in {
     "reversible": "recorded:Reversible", "event-aware": "recorded:EventAware",
     "finite-differences": "differences:FiniteDifferences",
     "shadow-differences": "differences:ShadowDifferences",
-    "smoothed-differences": "ensemble:SmoothedDifferences", "surrogate": "recorded:Surrogate",
-    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting",
+    "smoothed-differences": "differences:SmoothedDifferences", "surrogate": "recorded:Surrogate",
+    "ensemble": "differences:Ensemble", "reweighting": "averages:Reweighting",
     "boundary": "averages:BoundaryTerm",
 }.items():  # fmt: skip
     METHODS.add(_name, f"mdnum.gradients.{_class}")
@@ -186,15 +188,14 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
         if np.any(np.asarray(value)):
             if missing:
                 notes[name] = "without what the flips add: the force jumps at the cutoff; event-aware adds it"
-        elif name == "cutoff.radius" and missing:
-            notes[name] = (
-                "exactly 0 because it only decides which pairs interact, and decisions are not "
-                "differentiated; event-aware adds what they do"
+            continue
+        why = "in this run: no step on the way to the loss depends on it, or what does cancels"
+        if name == "cutoff.radius" and missing:
+            why = (
+                "because it only decides which pairs interact, and decisions are not differentiated; "
+                "event-aware adds what they do"
             )
-        else:
-            notes[name] = (
-                "exactly 0 in this run: no step on the way to the loss depends on it, or what does cancels"
-            )
+        notes[name] = f"exactly 0 {why}"
     return notes
 
 
@@ -224,3 +225,119 @@ def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)
+
+
+# --- the shape that JAX gives to gradients, for training loops ----------------------------------------
+# The run is made on the host, list by list; a transformation that would trace it as one program cannot.
+
+
+def value_and_grad(
+    problem: Problem, names: Sequence[str], method: Method | str = "event-aware", *, has_aux: bool = False
+) -> Callable[[Values], tuple[Any, dict[str, np.ndarray]]]:
+    """A function that gives the loss and its gradient, as `jax.value_and_grad` does.
+
+    Args:
+        names: parameters to differentiate by, full or short names. method: a method, or its name.
+        has_aux: whether to return the whole `Gradient` too, as ((value, gradient), gradient by name).
+
+    Returns:
+        values by name (any of the names; the others stay as the system file has them) to (value, gradient by
+        name), spelled as they were asked for.
+
+    Raises:
+        InputError: no such parameter or method, or it does not apply; the loss is not a scalar.
+
+    Warns:
+        UserWarning: a derivative that is exactly zero, with the reason.
+    """
+    chosen, full = _chosen(problem, names, method)
+    asked = {parameters.resolve(problem.simulation, [name])[0]: name for name in reversed(names)}
+
+    def function(values: Values | None = None):
+        found = _differentiated(chosen, problem.at(_in_full(problem, values or {}, full)), full)
+        gradient = {asked[name]: found.gradient[name] for name in full}
+        return ((found.value, found) if has_aux else found.value), gradient
+
+    return function
+
+
+def differentiable(
+    problem: Problem,
+    names: Sequence[str],
+    method: Method | str = "event-aware",
+    watch: Callable[[Gradient], None] | None = None,
+) -> Callable[[Values], jax.Array]:
+    """The loss as a function that JAX can differentiate in reverse mode.
+
+    Parameters may be any pytree: put a function of your own before it, which makes the named values of it,
+    and `jax.grad` goes through both.
+
+    Args:
+        problem, names, method: as for `value_and_grad`, which see for what is raised and warned of.
+        watch: called with the whole gradient each time that one is worked out.
+
+    Returns:
+        values by name to the loss, a float64 scalar. It runs outside of `jit` and `vmap`.
+    """
+    chosen, full = _chosen(problem, names, method)
+
+    def at(values: Values) -> Problem:
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+            raise InputError(
+                "a rollout was called inside jit or vmap; its lists are made on the host",
+                remedy="Call it, and jax.grad of it, outside of jit and vmap",
+            )
+        return problem.at(_in_full(problem, values, full))
+
+    @jax.custom_vjp
+    def loss(values: Values) -> jax.Array:
+        return jnp.asarray(at(values).value(), jnp.float64)
+
+    def forward(values: Values):
+        found = _differentiated(chosen, at(values), full)
+        if watch is not None:
+            watch(found)
+        by_name = {}
+        for name, value in values.items():
+            derivative = found.gradient[parameters.resolve(problem.simulation, [name])[0]]
+            by_name[name] = jnp.asarray(derivative).astype(jnp.result_type(value))
+        return jnp.asarray(found.value, jnp.float64), by_name
+
+    def backward(gradient, onto):
+        return (jax.tree.map(lambda one: onto.astype(one.dtype) * one, gradient),)
+
+    loss.defvjp(forward, backward)
+    return loss
+
+
+def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple[Method, tuple[str, ...]]:
+    chosen = method(word) if isinstance(word, str) else word
+    return chosen, chosen.check(problem, names)
+
+
+def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
+    """The gradient, with a warning of a derivative that is exactly zero: a training loop reads no notes."""
+    found = chosen(problem, names)
+    for name, value in found.gradient.items():
+        if not np.any(np.asarray(value)):
+            note = found.notes.get(name, "exactly 0 in this run")
+            warnings.warn(f"{found.method} by {name}: {note}", UserWarning, stacklevel=3)
+    return found
+
+
+def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
+    """Values by full name.
+
+    Raises:
+        InputError: a name that is not differentiated by.
+    """
+    out = {}
+    for word, value in values.items():
+        (name,) = parameters.resolve(problem.simulation, [word])
+        if name not in full:
+            raise InputError(
+                f"a value for {word}, which the gradient was not asked for",
+                remedy=f"Name it among the parameters; they are {', '.join(full)}",
+            )
+        out[name] = np.asarray(value, np.float64)
+    return out

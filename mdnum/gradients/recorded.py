@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import Trace, reverse
+from mdnum.gradients.adjoint import FORCE, MODEL, SCALE, AdjointCarry, reverse
 from mdnum.gradients.crossings import Crossings
-from mdnum.gradients.forces import FORCE, MODEL, SCALE
 from mdnum.gradients.parameters import Cotangents, columns_of, gathered
 from mdnum.gradients.problem import (
     Gradient,
@@ -46,7 +45,7 @@ _SINGLE_FRAMES = (
 #: Crossings of the largest weight that are named in the details.
 _NAMED = 10
 #: Called with every stretch of the reverse pass, last first, and what was carried at its steps.
-Watch = Callable[[TapeStretch, Trace], None]
+Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 
 @dataclass(frozen=True)
@@ -81,19 +80,15 @@ def passed(
     """Run a problem and its reverse pass, which several instruments may watch.
 
     Args:
-        problem: the loss of a rollout.
-        names: full names of the parameters.
-        saltation: whether flips count.
-        guard: as a share of the rms radial speed of a pair.
-        budget: bytes of the recorded run that are kept.
-        watches: see `Watch`.
+        names: full names of the parameters. saltation: whether flips count.
+        guard: as a share of the rms radial speed of a pair. budget: bytes of the recorded run that are kept.
         tape: the run, where it has been made (with flips, if saltation is asked for).
 
     Raises:
         InputError: saltation without a pair potential. NumericalError: the run blew up.
     """
 
-    def watch(stretch: TapeStretch, trace: Trace) -> None:
+    def watch(stretch: TapeStretch, trace: AdjointCarry) -> None:
         for one in watches:
             one(stretch, trace)
 
@@ -101,13 +96,9 @@ def passed(
         tape = tape_of(problem, saltation, budget, progress)
     speed = guard * radial_speed(problem.simulation)
     parts, crossings = reverse(
-        tape,
-        wanted=wanted(names),
-        saltation=saltation,
-        guard=speed,
-        progress=in_phase(progress, "reverse pass"),
-        watch=watch if watches else None,
-    )
+        tape, wanted=wanted(names), saltation=saltation, guard=speed,
+        progress=in_phase(progress, "reverse pass"), watch=watch if watches else None,
+    )  # fmt: skip
     gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
     return ReversePass(tape, parts, gradient, crossings, speed)
 
@@ -218,17 +209,16 @@ class Forward(Method):
         simulation = problem.simulation
         tape = tape_of(problem, self.saltation, self.budget, progress)
         guard, saltation = self.guard * radial_speed(simulation), self.saltation
-        total, crossed, grazing = None, 0, 0
         phase = in_phase(progress, "tangents")
+        total, met = None, []
         for part in tangents(tape, names, saltation=saltation, guard=guard, progress=phase):
             total = part.total
-            if part.crossings is not None:
-                crossed += len(part.crossings)
-                grazing += int(part.crossings.grazing.sum())
+            met.append(part.crossings)
         gradient = gathered(simulation, names, by_column(tape, total))
         details: dict[str, Any] = {"tangents": len(columns_of(simulation, names))}
         if saltation:
-            details |= {"guard": guard, "crossings": crossed, "grazing": grazing}
+            grazing = sum(int(one.grazing.sum()) for one in met)
+            details |= {"guard": guard, "crossings": sum(map(len, met)), "grazing": grazing}
         notes = independent(problem, gradient, saltation=saltation)
         found = self.result(tape.value, gradient, notes, details)
         if saltation:
@@ -263,12 +253,11 @@ class Reversible(Method):
         made = passed(problem, names, saltation=False, tape=tape, progress=progress)
         assert simulation.lattice is not None
         details = {
-            "stretches": tape.stretches,
+            "stretches": tape.stretches, "returned to the start": True,
             "lattice": simulation.lattice.to_dict(float(simulation.integrator.timestep)),
-            "returned to the start": True,
             "bytes that grow with the run": tape.nbytes,
             "bits forgotten by friction a step": forgotten_bits(simulation.integrator),
-        }
+        }  # fmt: skip
         notes = independent(problem, made.gradient, saltation=False)
         return self.result(tape.value, made.gradient, notes, details)
 
@@ -314,30 +303,26 @@ class Surrogate(Method):
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
     """Counts of the crossings, and those that weigh most."""
-    total = sum(len(one) for one in crossings)
-    grazing = sum(int(one.grazing.sum()) for one in crossings)
-    left_out = sum(
-        float(np.sum(np.abs(one.weight[one.grazing & np.isfinite(one.weight)]))) for one in crossings
-    )
-    applied = sum(float(np.sum(np.abs(one.weight[~one.grazing]))) for one in crossings)
+    speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
+    step, subject, entered = (joined(crossings, name, ledger=True) for name in ("step", "subject", "entered"))
     rows = [
         {
-            "step": int(one.ledger.step[k]),
-            "i": int(one.ledger.subject[k, 0]),
-            "j": int(one.ledger.subject[k, 1]),
-            "entered": bool(one.ledger.entered[k]),
-            "radial_speed": float(one.speed[k]),
-            "weight": float(one.weight[k]),
-            "grazing": bool(one.grazing[k]),
+            "step": int(step[k]), "i": int(subject[k, 0]), "j": int(subject[k, 1]),
+            "entered": bool(entered[k]), "radial_speed": float(speed[k]), "weight": float(weight[k]),
+            "grazing": bool(grazing[k]),
         }
-        for one in crossings
-        for k in np.argsort(-np.abs(one.weight))[:_NAMED]
-    ]
-    rows.sort(key=lambda row: -abs(row["weight"]))
+        for k in np.argsort(-np.abs(weight), kind="stable")[:_NAMED]
+    ]  # fmt: skip
     return {
-        "crossings": total, "grazing": grazing, "weight applied": applied, "weight left out": left_out,
-        "heaviest": rows[:_NAMED],
+        "crossings": len(weight), "grazing": int(grazing.sum()),
+        "weight applied": float(np.sum(np.abs(weight[~grazing]))),
+        "weight left out": float(np.nansum(np.abs(weight[grazing]))), "heaviest": rows,
     }  # fmt: skip
+
+
+def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
+    """A column of the crossings of several stretches, or of their ledgers."""
+    return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 
 def radial_speed(simulation: Simulation) -> float:

@@ -1,7 +1,7 @@
 """The forward pass of derivatives: tangents of a few parameters along the run that was recorded.
 
-A tangent is pushed through each step at the recorded state and decisions, so the program that is linearized
-is the one that ran. It needs no memory beyond the run's, and costs a force evaluation for each parameter.
+A tangent is pushed through each step at the recorded state and decisions. It needs no memory beyond the
+run's, and costs a force evaluation for each parameter.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ class TangentCarry(NamedTuple):
     """Tangents between two steps, user's order, one for each column.
 
     Attributes:
-        x: of the positions as if the box had no faces, at the step that comes next, (columns, 3, atoms).
-        v: of the half-kicked velocities that lead there, same shape.
-        total: of the sums of the loss.
+        x: of the positions as if the box had no faces, at the step that comes next.
+        v: of the half-kicked velocities that lead there. total: of the sums of the loss.
         waiting: of potential energy and virial, by flips since the last frame that the loss looked at.
     """
 
@@ -56,13 +55,11 @@ class StretchTangents:
     """Tangents along one stretch of a run.
 
     Attributes:
-        stretch: the steps.
-        columns: the numbers by which it is differentiated.
+        stretch: the steps. columns: the numbers by which it is differentiated.
         x, v: tangents of the positions (as if the box had no faces) and of the full-step velocities in the
-            order of the stretch's list, shape (rows, columns, 3, atoms); None where they were not asked for.
+            order of the stretch's list; None where they were not asked for.
         crossings: its flips as events; None for a tape without flips.
-        dr: tangent of the distance of each crossing's pair at the crossing, (crossings, columns).
-        dr_cut: of its cutoff, same shape.
+        dr: tangent of the distance of each crossing's pair at the crossing. dr_cut: of its cutoff.
         total: of the sums of the loss up to here.
     """
 
@@ -87,17 +84,14 @@ def tangents(
 ) -> Iterator[StretchTangents]:
     """Tangents by named parameters along a recorded run, stretch by stretch, first one first.
 
-    With the weights of a reverse pass (derivatives of the loss by the cutoff of each crossing) the sum of
-    weight times (dr_cut - dr) over crossings is what the flips add to the derivative by each column: with
-    tangents that do not jump, event-aware weights give event-aware minus symmetric.
+    With the weights of a reverse pass the sum of weight times (dr_cut - dr) over crossings is what the flips
+    add to the derivative by each column, of tangents that do not jump and event-aware weights.
 
     Args:
-        tape: the run; made with flips where crossings are wanted.
-        names: full names of parameters.
+        tape: the run; made with flips where crossings are wanted. names: full names of parameters.
         saltation: whether the tangents jump at every crossing that does not graze.
         guard: radial speed, length per internal time, below which a crossing grazes.
         states: whether to hand out the tangents of every step.
-        progress: called with the steps done and the last step.
 
     Raises:
         InputError: saltation with a tape without flips.
@@ -108,7 +102,8 @@ def tangents(
     force = simulation.force
     columns = columns_of(simulation, names)
     along = directions(simulation, columns)
-    carry = TangentCarry(along.x, along.v, _empty(tape.total, len(columns)), jnp.zeros((len(columns), 2)))
+    total = jax.tree.map(lambda one: jnp.zeros((len(columns), *one.shape), one.dtype), tape.total)
+    carry = TangentCarry(along.x, along.v, total, jnp.zeros((len(columns), 2)))
     for stretch in tape.forward():
         order = stretch.table.order
         met = None
@@ -118,22 +113,14 @@ def tangents(
             )
         elif saltation:
             raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
+        crossed = None if met is None else met.on_device(len(stretch.x), simulation.atoms)
         carry, (by_row, dr) = _stretch(
-            force,
-            simulation.integrator,
-            jnp.asarray(simulation.masses[order]),
-            simulation.tables(stretch.table),
-            stretch.columns,
-            stretch.bits,
-            stretch.rows,
-            tape.seen(stretch),
-            (tape.loss, tape.origin, tape.around, tape.pace),
-            None if met is None else met.on_device(len(stretch.x), simulation.atoms),
-            carry._replace(x=carry.x[..., order], v=carry.v[..., order]),
-            along,
-            jnp.asarray(float(saltation)),
-            states,
-        )
+            force, simulation.integrator, jnp.asarray(simulation.masses[order]),
+            simulation.tables(stretch.table), stretch.columns, stretch.bits, stretch.rows,
+            tape.seen(stretch), (tape.loss, tape.origin, tape.around, tape.pace), crossed,
+            carry._replace(x=carry.x[..., order], v=carry.v[..., order]), along,
+            jnp.asarray(float(saltation)), states,
+        )  # fmt: skip
         carry = carry._replace(x=unsorted(carry.x, order), v=unsorted(carry.v, order))
         x, v = (np.asarray(part)[: stretch.rows] for part in by_row) if states else (None, None)
         moved = None if met is None else met.gathered(np.moveaxis(np.asarray(dr), 1, 2))
@@ -150,10 +137,6 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
 
     return np.asarray(jax.vmap(one)(total), np.float64)
-
-
-def _empty(total: Any, columns: int) -> Any:
-    return jax.tree.map(lambda one: jnp.zeros((columns, *one.shape), one.dtype), total)
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
@@ -195,11 +178,8 @@ def _stretch(
     def evaluate(told):
         def forces(x, values, matrix):
             made = _evaluate(force, x, tables, told, values, matrix)
-            return (
-                made.force.astype(dtype) / mass_row,
-                jnp.sum(made.energy, dtype=jnp.float64),
-                made.virial,
-            )
+            energy = jnp.sum(made.energy, dtype=jnp.float64)
+            return made.force.astype(dtype) / mass_row, energy, made.virial
 
         return forces
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from mdnum.errors import NumericalError
 from mdnum.gradients.losses import Loss, LossContext, LossFrame
@@ -44,11 +44,8 @@ class TapeStretch:
     Attributes:
         first, rows: its first step and the number of rows in use; those beyond are void.
         x, v: wrapped positions and velocities. images: lattice vectors taken off so far.
-        bits: decisions. before: decisions of this list at the step before.
-        x_before: positions of the step before.
-        potential, virial: by row.
-        table: the list.
-        ledger: its flips; None where they were not asked for.
+        bits: decisions. x_before: positions of the step before.
+        potential, virial: by row. table: the list. ledger: its flips; None where they were not asked for.
     """
 
     first: int
@@ -57,7 +54,6 @@ class TapeStretch:
     v: Float[np.ndarray, "room 3 atoms"]
     images: Int[np.ndarray, "room 3 atoms"]
     bits: np.ndarray
-    before: np.ndarray
     x_before: Float[np.ndarray, "3 atoms"]
     potential: Float[np.ndarray, "room"]
     virial: Float[np.ndarray, "room"]
@@ -67,7 +63,7 @@ class TapeStretch:
     @property
     def nbytes(self) -> int:
         """Memory that it takes."""
-        kept = (self.x, self.v, self.images, self.bits, self.before, self.x_before, self.table.index)
+        kept = (self.x, self.v, self.images, self.bits, self.x_before, self.table.index)
         return sum(array.nbytes for array in kept)
 
     @property
@@ -81,33 +77,22 @@ class TapeStretch:
         return (self.steps, self.x, self.v, self.images, self.potential, self.virial)
 
 
+#: Columns of a record that a tape keeps.
+_COLUMNS = ("x", "v", "images", "bits", "potential", "virial")
+
+
 def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> TapeStretch:
     """A copy of what a segment recorded from a start; the segment's own record is used again."""
-    record, order = segment.record, segment.table.order
-    assert segment.before is not None
+    record, rows = segment.record, segment.rows
     # the record has room for the longest stretch; powers of two, so that not every length is compiled for
-    room = min(len(record.x), max(_LEAST_ROOM, 1 << (segment.rows - 1).bit_length()))
-
-    def kept(name: str) -> np.ndarray:
+    room = min(len(record.x), max(_LEAST_ROOM, 1 << (rows - 1).bit_length()))
+    kept = {}
+    for name in _COLUMNS:
         whole = np.asarray(getattr(record, name))
-        copy = np.zeros((room, *whole.shape[1:]), whole.dtype)
-        copy[: segment.rows] = whole[: segment.rows]
-        return copy
-
-    return TapeStretch(
-        segment.first,
-        segment.rows,
-        kept("x"),
-        kept("v"),
-        kept("images"),
-        kept("bits"),
-        np.array(segment.before),
-        np.asarray(start.state.x_before)[:, order],
-        kept("potential"),
-        kept("virial"),
-        segment.table,
-        ledger,
-    )
+        kept[name] = np.zeros((room, *whole.shape[1:]), whole.dtype)
+        kept[name][:rows] = whole[:rows]
+    x_before = np.asarray(start.state.x_before)[:, segment.table.order]
+    return TapeStretch(segment.first, rows, **kept, x_before=x_before, table=segment.table, ledger=ledger)
 
 
 class Pace(NamedTuple):
@@ -141,13 +126,9 @@ class RunTape:
     """A run that has been made, and its loss.
 
     Args:
-        simulation: the system as objects.
-        loss: what is evaluated along the way.
-        steps: last step.
-        flips: whether to write the ledger too.
+        steps: last step. flips: whether to write the ledger too.
         budget: bytes of recorded stretches that are kept; the rest is run again when it is asked for.
         each: called with every stretch when it has been made.
-        progress: called with the step reached and the last step.
 
     Raises:
         NumericalError: the run blew up.
@@ -170,12 +151,11 @@ class RunTape:
         self.around = surroundings(simulation)
         self.pace = pace_of(loss, steps)
         self.origin = frame_of_start(self.start, simulation)
-        self.total: Any = None
+        self.total: Any = no_sums(loss, self.origin, self.around)
         self.frames = self.held = 0
         self._recorder = PairRecorder(simulation) if flips else None
-        self._starts: list[Start] = []
-        self._ledgers: list[Ledger | None] = []
-        self._kept: dict[int, TapeStretch] = {}
+        # stretches that are kept; of others what it takes to run them again
+        self._made: list[TapeStretch | tuple[Start, Ledger | None]] = []
         self._engine = Engine(simulation, steps, start=self.start)
         self._begin()
         for segment in self._engine.segments():
@@ -200,21 +180,20 @@ class RunTape:
                 f"was built, and the skin is {skin:.3g}",
                 remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
             )
-        self._starts.append(self._next)
-        self._ledgers.append(None if self._recorder is None else self._recorder.flips(segment))
-        stretch = stretch_of(segment, self._next, self._ledgers[-1])
+        ledger = None if self._recorder is None else self._recorder.flips(segment)
+        stretch = stretch_of(segment, self._next, ledger)
         self._observe(stretch)
         if self._each is not None:
             self._each(stretch)
-        if self.held + stretch.nbytes <= self.budget:
-            self._kept[len(self._starts) - 1] = stretch
-            self.held += stretch.nbytes
+        kept = self.held + stretch.nbytes <= self.budget
+        self._made.append(stretch if kept else (self._next, ledger))
+        self.held += stretch.nbytes if kept else 0
         self._next = resume_point(segment)
 
     @property
     def replayed(self) -> int:
         """Stretches that are run again in a reverse pass."""
-        return len(self._starts) - len(self._kept)
+        return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> bool:
@@ -231,21 +210,18 @@ class RunTape:
         return any(float(slope) != 0 for slope in jax.grad(at, argnums=(0, 1))(one, one))
 
     def __len__(self) -> int:
-        return len(self._starts)
+        return len(self._made)
 
-    def __getitem__(self, k: int) -> TapeStretch:
-        if k in self._kept:
-            return self._kept[k]
-        start = self._starts[k]
-        return stretch_of(self._engine.again(start), start, self._ledgers[k])
+    def _whole(self, one: TapeStretch | tuple[Start, Ledger | None]) -> TapeStretch:
+        return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one
 
     def backward(self) -> Iterator[TapeStretch]:
         """The stretches, last first."""
-        return (self[k] for k in reversed(range(len(self._starts))))
+        return map(self._whole, reversed(self._made))
 
     def forward(self) -> Iterator[TapeStretch]:
         """The stretches, first one first."""
-        return (self[k] for k in range(len(self._starts)))
+        return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
         """Rows that the loss looks at."""
@@ -255,9 +231,6 @@ class RunTape:
     def _observe(self, stretch: TapeStretch) -> None:
         seen = self.seen(stretch)
         self.frames += int(seen.sum())
-        if self.total is None:
-            shapes = jax.eval_shape(self.loss.observe, self.origin, self.origin, self.around)
-            self.total = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         if seen.any():
             self.total = _summed(
                 self.loss, self.total, stretch.columns, stretch.rows, seen, self.origin, self.around,
@@ -274,9 +247,6 @@ class ReversibleTape(RunTape):
     Attributes:
         baths: what a thermostat's friction forgot, by step: the one thing that grows with the run.
         stretches: of the way back, so far.
-
-    Args:
-        simulation, loss, steps, progress: as for `Tape`.
     """
 
     def _begin(self) -> None:
@@ -288,11 +258,11 @@ class ReversibleTape(RunTape):
 
     def _add(self, segment: Segment) -> None:
         steps = np.arange(segment.first, segment.last + 1)
-        if self.total is None or self.loss.looks_at(steps, self.steps).any():
+        if self.loss.looks_at(steps, self.steps).any():
             self._observe(stretch_of(segment, self.start))
         x, v, images = (segment.rows_of(name) for name in ("x", "v", "images"))
         for row in np.flatnonzero(steps % self._every == 0):
-            self._prints[int(steps[row])] = fingerprint(x[row], v[row], images[row], segment.table.order)
+            self._prints[int(steps[row])] = fingerprint(segment.table.order, x[row], v[row], images[row])
         state, scheme = segment.state, self.simulation.propagator
         if isinstance(scheme, LatticeLangevin) and int(state.step) % int(scheme.period) == 0:
             self.baths[int(state.step)] = np.array(state.bath)
@@ -318,7 +288,8 @@ class ReversibleTape(RunTape):
         for made in way.stretches():
             self._compare(made)
             self.stretches += 1
-            yield self._stretch(made)
+            columns = {name: np.asarray(getattr(made.record, name)) for name in _COLUMNS}
+            yield TapeStretch(made.first, made.rows, **columns, x_before=made.x_before, table=made.table)
         # the first state, every bit of it
         for name in ("x", "v", "images"):
             a, b = (np.asarray(getattr(state, name)) for state in (self.start.state, way.back))
@@ -331,7 +302,7 @@ class ReversibleTape(RunTape):
             step, record = made.first + row, made.record
             if step % self._every:
                 continue
-            here = fingerprint(record.x[row], record.v[row], record.images[row], made.table.order)
+            here = fingerprint(made.table.order, record.x[row], record.v[row], record.images[row])
             if here != self._prints[step]:
                 self._astray(step, min(step + self._every, self.steps))
 
@@ -343,21 +314,11 @@ class ReversibleTape(RunTape):
             where=self.simulation.system.name,
         )
 
-    def _stretch(self, made: Stretched) -> TapeStretch:
-        record = made.record
-        x, v, images, bits, potential, virial = (
-            np.asarray(getattr(record, name)) for name in ("x", "v", "images", "bits", "potential", "virial")
-        )
-        before = np.zeros_like(bits[0])
-        return TapeStretch(
-            made.first, made.rows, x, v, images, bits, before, made.x_before, potential, virial, made.table
-        )
 
-
-def fingerprint(x, v, images, order) -> bytes:
+def fingerprint(order, *parts) -> bytes:
     """A digest of a state, in the user's order of atoms; a zero has no sign."""
     digest = hashlib.blake2b(digest_size=8)
-    for part in map(np.asarray, (x, v, images)):
+    for part in map(np.asarray, parts):
         out = np.empty_like(part)
         out[:, order] = part
         digest.update((out + out.dtype.type(0)).tobytes())
@@ -389,9 +350,19 @@ def over_rows(
     return lax.fori_loop(0, used, body, (carry, outputs))
 
 
-def unsorted(a: Float[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Float[Array, "*rest atoms"]:
+def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
     """An array over the atoms of a list, in the user's order."""
     return jnp.zeros_like(a).at[..., order].set(a)
+
+
+def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pairs of a list, each once: first and second atom in the list's order, and pair type."""
+    slots, first = np.nonzero(table.index < len(table.order))
+    second = table.index[slots, first]
+    once = table.order[first] < table.order[second]
+    first, second = first[once], second[once]
+    kind = simulation.type_of(table.order[first], table.order[second])
+    return first, second, np.asarray(kind, np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
@@ -424,6 +395,12 @@ def surroundings(simulation: Simulation) -> LossContext:
         simulation.integrator.timestep, simulation.units.time_factor,
     )  # fmt: skip
     return LossContext(*(jnp.asarray(part, jnp.float64) for part in parts))
+
+
+def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
+    """The sums of a loss before it has seen anything."""
+    shapes = jax.eval_shape(loss.observe, origin, origin, around)
+    return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:

@@ -2,8 +2,8 @@
 
 A chunk is a fixed number of steps with one list, as a scan, so that reverse mode has a bound on what it
 keeps. What ends a list's life in a rollout ends the chunk early here: the rest of its steps do nothing. The
-host makes the next list at the positions that this program has reached. States between chunks are kept while
-memory lasts; where it does not, what lies between is run again from the binomial places for them.
+host makes the next list at the positions that this program has reached. States between chunks are kept, every
+second of them where there are too many, and what lies between is run again.
 
 Decisions are made by the program that is differentiated. Reverse mode needs another forward pass than a run
 does, and a compiler is free to round it otherwise; where it does, the gradient belongs to a trajectory that
@@ -12,12 +12,9 @@ nobody simulated, so every step's state and decisions are compared with those of
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import comb
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,26 +22,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt8, UInt64
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import LossContext, LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import RunTape, surroundings
+from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.engine import first_state
+from mdnum.rollout.flips import fingerprint_of_bits
 
 #: Steps of a chunk, at most.
 CHUNK = 16
 #: Bytes that the reverse function of a chunk may keep by a rough count, and what it keeps for each slot of a
 #: list and step by that count.
 _CHUNK_BYTES, _PER_SLOT = 2**28, 256
-#: Share of the free memory that may be planned with.
-_SHARE = 0.5
-_UNSIGNED = {8: jnp.uint64, 4: jnp.uint32, 2: jnp.uint16}
 
 
 class Inputs(NamedTuple):
@@ -64,11 +59,8 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """What one step hands to the next and a derivative goes through, user's order.
-
-    Attributes:
-        x: wrapped positions. v: half-kicked velocities. total: sums of the loss.
-    """
+    """What one step hands to the next and a derivative goes through, user's order: wrapped positions,
+    half-kicked velocities, sums of the loss."""
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
@@ -76,12 +68,10 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """What does not change along a run and is not differentiated.
+    """What does not change along a run and is not differentiated; quantities are those of the inputs.
 
     Attributes:
-        force, integrator: of the rollout; their quantities are replaced by those of the inputs.
-        masses: user's order. half_skin: length. loss, around: the loss and its surroundings.
-        images: lattice vectors taken off the positions of step 0.
+        images: lattice vectors taken off the positions of step 0. The rest as in a rollout.
     """
 
     force: Any
@@ -94,36 +84,30 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a chunk begins, as far as that has no derivative.
+    """Where the program can be continued, as far as that has no derivative, user's order.
 
     Attributes:
-        step: the step whose forces come next.
-        images: lattice vectors taken off so far, user's order.
-        home: wrapped positions at which the list was built, user's order. built: at which step.
-        limit: steps that may be done. seen: which of the chunk's steps the loss looks at.
+        step: the step whose forces come next. images: lattice vectors taken off so far.
+        home: wrapped positions at which the list was built. built: at which step.
     """
 
     step: Int[Array, ""]
     images: Int[Array, "3 atoms"]
     home: Float[Array, "3 atoms"]
     built: Int[Array, ""]
-    limit: Int[Array, ""]
-    seen: Bool[Array, "chunk"]
 
 
 class ChunkRecord(NamedTuple):
     """What a chunk leaves beside its end.
 
     Attributes:
-        rows: steps done. due: whether the list is used up. finite: whether all numbers were.
-        images: lattice vectors taken off at the end, user's order.
+        place: where it ended. rows: steps done. finite: whether all numbers were.
         x, v, bits: of each step, in the list's order, as a rollout records them.
     """
 
+    place: Place
     rows: Int[Array, ""]
-    due: Bool[Array, ""]
     finite: Bool[Array, ""]
-    images: Int[Array, "3 atoms"]
     x: Float[Array, "chunk 3 atoms"]
     v: Float[Array, "chunk 3 atoms"]
     bits: UInt8[Array, "chunk words atoms"]
@@ -135,18 +119,21 @@ def chunk(
     between: StepEnds,
     fixed: RunConstants,
     place: Place,
+    limit: Int[Array, ""],
+    seen: Bool[Array, "chunk"],
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
     """Some steps with one list; differentiable by its first two arguments.
 
     Args:
+        limit: steps that may be done. seen: which of the chunk's steps the loss looks at.
         rule: every, delay and check of the rebuild rule.
     """
     every, delay, check = rule
-    order = tables.order
+    order, scale = tables.order, inputs.scale
     dtype = between.x.dtype
-    matrix = jnp.asarray(fixed.force.cell.matrix) * inputs.scale
+    matrix = jnp.asarray(fixed.force.cell.matrix) * scale
     force = with_quantities(fixed.force, inputs.model)
     force = replace(force, cell=replace(force.cell, matrix=matrix))
     integrator = eqx.combine(inputs.numbers, eqx.filter(fixed.integrator, eqx.is_inexact_array, inverse=True))
@@ -155,22 +142,14 @@ def chunk(
     mass_row = masses.astype(dtype)
     half = (0.5 * integrator.timestep).astype(dtype)
     home = place.home[:, order]
-    scale = inputs.scale
     around = fixed.around._replace(
         matrix=fixed.around.matrix * scale,
         volume=fixed.around.volume * scale**3,
         timestep=integrator.timestep,
     )
-    origin = LossFrame(
-        jnp.zeros((), jnp.int64),
-        inputs.x * scale.astype(dtype) + (matrix.T @ fixed.images.astype(matrix.dtype)).astype(dtype),
-        inputs.v,
-        jnp.full((), jnp.nan),
-        jnp.full((), jnp.nan),
-    )
-
-    def unsorted(a):
-        return jnp.zeros_like(a).at[:, order].set(a)
+    whole = inputs.x * scale.astype(dtype) + (matrix.T @ fixed.images.astype(matrix.dtype)).astype(dtype)
+    nan = jnp.full((), jnp.nan)
+    origin = LossFrame(jnp.zeros((), jnp.int64), whole, inputs.v, nan, nan)
 
     def used_up(x, step):
         d = lax.stop_gradient(cell).minimum_image(*(lax.stop_gradient(x) - home))
@@ -179,10 +158,9 @@ def chunk(
         allowed = (age >= delay) & (age % every == 0)
         return allowed & (largest > fixed.half_skin) if check else allowed
 
-    def observe(total, step, x, v, images, potential, virial):
-        whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(dtype)
-        frame = LossFrame(step, unsorted(whole), unsorted(v), potential, virial)
-        return jax.tree.map(jnp.add, total, fixed.loss.observe(frame, origin, around))
+    def observe(total, row):
+        seen = fixed.loss.observe(frame_of(row, order, matrix), origin, around)
+        return jax.tree.map(jnp.add, total, seen)
 
     def act(carry, see):
         step, x, v, images, total, _, finite, rows = carry
@@ -192,7 +170,7 @@ def chunk(
         v = v + second * acceleration
         potential = jnp.sum(made.energy, dtype=jnp.float64)
         total = lax.cond(
-            see, observe, lambda total, *_: total, total, step, x, v, images, potential, made.virial
+            see, observe, lambda total, _: total, total, (step, x, v, images, potential, made.virial)
         )
         assert made.decisions is not None
         row = (x, v, made.decisions.bits)
@@ -212,32 +190,21 @@ def chunk(
 
     def one(carry, see):
         *_, due, finite, rows = carry
-        return lax.cond(~due & finite & (rows < place.limit), act, skip, carry, see)
+        return lax.cond(~due & finite & (rows < limit), act, skip, carry, see)
 
-    start = (
-        place.step,
-        between.x[:, order],
-        between.v[:, order],
-        place.images[:, order],
-        between.total,
-        jnp.zeros((), bool),
-        jnp.ones((), bool),
-        jnp.zeros((), jnp.int64),
-    )
-    (_, x, v, images, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, place.seen)
-    record = ChunkRecord(rows, due, finite, unsorted(images), xs, vs, bits)
-    return StepEnds(unsorted(x), unsorted(v), total), lax.stop_gradient(record)
+    start = (place.step, between.x[:, order], between.v[:, order], place.images[:, order], between.total)
+    start += (jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
+    (step, x, v, images, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, seen)
+    x, v, images = (unsorted(part, order) for part in (x, v, images))
+    new = Place(step, images, jnp.where(due, x, place.home), jnp.where(due, step, place.built))
+    record = ChunkRecord(new, rows, finite, xs, vs, bits)
+    return StepEnds(x, v, total), lax.stop_gradient(record)
 
 
 @partial(jax.jit, static_argnames=("rule",))
-def keep(inputs, between, fixed, place, tables, rule):
+def keep(inputs, between, *rest, rule):
     """A chunk, its reverse function with everything that it keeps, and its record."""
-    return jax.vjp(
-        lambda inputs, between: chunk(inputs, between, fixed, place, tables, rule),
-        inputs,
-        between,
-        has_aux=True,
-    )
+    return jax.vjp(lambda *given: chunk(*given, *rest, rule), inputs, between, has_aux=True)
 
 
 @jax.jit
@@ -248,71 +215,54 @@ def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, I
 
 
 class Snapshot(NamedTuple):
-    """Where the program can be continued.
-
-    Attributes:
-        between: what has a derivative.
-        step, built: next step, and step at which its list was built.
-        images: user's order. home: wrapped positions at which the list was built.
-        slots: capacity of the list; 0 lets the density decide.
-    """
+    """A state between two chunks; `slots` is the capacity of its list, 0 lets the density decide."""
 
     between: StepEnds
-    step: int
-    built: int
-    images: Int[Array, "3 atoms"]
-    home: Float[Array, "3 atoms"]
+    place: Place
     slots: int
 
 
 class ChunkedProgram:
-    """The program of a problem, chunk by chunk.
+    """The program of a problem, chunk by chunk."""
 
-    Args:
-        problem: the loss of a rollout.
-        chunk: steps of a chunk; None: the number that does not keep too much.
-    """
-
-    def __init__(self, problem: Problem, chunk: int | None = None):
+    def __init__(self, problem: Problem):
         simulation = problem.simulation
         self.problem, self.simulation = problem, simulation
-        state = first_state(simulation).state
-        rule = simulation.rule
+        state, rule = first_state(simulation).state, simulation.rule
         self.rule = (rule.every, rule.delay, rule.check)
         self.fixed = RunConstants(
-            simulation.force,
-            simulation.integrator,
-            jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2, jnp.float64),
-            problem.loss,
-            surroundings(simulation),
-            state.images,
-        )
+            simulation.force, simulation.integrator, jnp.asarray(simulation.masses),
+            jnp.asarray(rule.skin / 2, jnp.float64), problem.loss, surroundings(simulation), state.images,
+        )  # fmt: skip
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
         self.inputs = Inputs(quantities(simulation.force), numbers, state.x, state.v, jnp.ones(()))
         origin = LossFrame(state.step, state.x, state.v, jnp.zeros(()), jnp.zeros(()))
-        shapes = jax.eval_shape(problem.loss.observe, origin, origin, self.fixed.around)
-        total = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         # the sums are kept as numbers; what the loss makes of them comes last
+        total = no_sums(problem.loss, origin, self.fixed.around)
         between = StepEnds(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total)
-        self.start = Snapshot(between, 0, 0, state.images, between.x, 0)
+        zero = jnp.zeros((), jnp.int64)
+        self.start = Snapshot(between, Place(zero, state.images, between.x, zero), 0)
         self._verlet = simulation.verlet_list()
-        # snapshots of one list share the array of the positions at which it was built
-        self._used: tuple[Any, int, tuple[PairTable, Tables]] | None = None
-        if chunk is None:
-            slots = self.list_of(self.start)[0].slots
-            # other potentials may have a term for every two neighbors of an atom
-            row = slots * (1 if simulation.pairwise else slots) * simulation.atoms * _PER_SLOT
-            # a power of two: each length is compiled for
-            chunk = min(CHUNK, 1 << max(0, (_CHUNK_BYTES // row).bit_length() - 1))
-        self.chunk = chunk
+        # the list in use, by the step at which it was built and its capacity
+        self._used: tuple[tuple[int, int], tuple[PairTable, Tables]] | None = None
+        slots = self.list_of(self.start)[0].slots
+        # other potentials may have a term for every two neighbors of an atom
+        row = slots * (1 if simulation.pairwise else slots) * simulation.atoms * _PER_SLOT
+        # a power of two: each length is compiled for
+        self.chunk = min(CHUNK, 1 << max(0, (_CHUNK_BYTES // row).bit_length() - 1))
         looked = problem.loss.looks_at(np.arange(problem.steps + 1), problem.steps)
-        self._seen = np.concatenate([looked, np.zeros(chunk, bool)])
+        self._seen = np.concatenate([looked, np.zeros(self.chunk, bool)])
         self.frames = int(looked.sum())
 
     def forward(self, at: Snapshot, rows: int | None = None) -> Snapshot:
         """One chunk on, without a derivative; of at most `rows` steps."""
-        return self._after(at, *chunk(*self._arguments(at, rows), rule=self.rule))
+        between, record = chunk(*self._arguments(at, rows), rule=self.rule)
+        if not bool(record.finite):
+            raise NumericalError(
+                f"the program that is differentiated blew up at step {int(record.place.step) - 1}",
+                remedy="Use a smaller time step, or a start without overlapping atoms",
+            )
+        return Snapshot(between, record.place, self.list_of(at)[0].slots)
 
     def keep(self, at: Snapshot, rows: int) -> tuple[ChunkRecord, Any]:
         """One chunk's record and its reverse function."""
@@ -321,48 +271,28 @@ class ChunkedProgram:
 
     def list_of(self, at: Snapshot) -> tuple[PairTable, Tables]:
         """The list that is in use at a snapshot."""
-        if self._used is None or self._used[0] is not at.home or self._used[1] != at.slots:
+        key = (int(at.place.built), at.slots)
+        if self._used is None or self._used[0] != key:
             self._verlet.slots = at.slots
-            table = self._verlet.build(np.asarray(at.home, np.float64).T.copy(), self.simulation.cell)
-            self._used = (at.home, at.slots, (table, self.simulation.tables(table)))
-        return self._used[2]
-
-    def value(self, total) -> Array:
-        """The loss, from its sums."""
-        return self.problem.loss.value(total, self.frames)
+            home = np.asarray(at.place.home, np.float64).T.copy()
+            table = self._verlet.build(home, self.simulation.cell)
+            self._used = (key, (table, self.simulation.tables(table)))
+        return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
         """Derivatives by what a rollout is made of, from those of the inputs and of the first positions."""
         x = np.asarray(inputs.x + start.x, np.float64)
         v = np.asarray(inputs.v + start.v, np.float64)
-        scale = float(inputs.scale) + float(
-            np.sum(np.asarray(start.x, np.float64) * np.asarray(self.inputs.x))
-        )
-        none = np.zeros(self.simulation.pair_types)
+        stretched = float(np.sum(np.asarray(start.x, np.float64) * np.asarray(self.inputs.x)))
+        scale, none = float(inputs.scale) + stretched, np.zeros(self.simulation.pair_types)
         return Cotangents(inputs.model, inputs.numbers, x, v, scale, none)
 
     def _arguments(self, at: Snapshot, rows: int | None) -> tuple[Any, ...]:
-        _, tables = self.list_of(at)
-        limit = min(self.chunk, self.problem.steps + 1 - at.step) if rows is None else rows
-        place = Place(
-            jnp.asarray(at.step, jnp.int64),
-            at.images,
-            at.home,
-            jnp.asarray(at.built, jnp.int64),
-            jnp.asarray(limit, jnp.int64),
-            jnp.asarray(self._seen[at.step : at.step + self.chunk]),
-        )
-        return self.inputs, at.between, self.fixed, place, tables
-
-    def _after(self, at: Snapshot, between: StepEnds, record: ChunkRecord) -> Snapshot:
-        step, slots = at.step + int(record.rows), self.list_of(at)[0].slots
-        if not bool(record.finite):
-            raise NumericalError(
-                f"the program that is differentiated blew up at step {step - 1}",
-                remedy="Use a smaller time step, or a start without overlapping atoms",
-            )
-        built, home = (step, between.x) if bool(record.due) else (at.built, at.home)
-        return Snapshot(between, step, built, record.images, home, slots)
+        step = int(at.place.step)
+        limit = min(self.chunk, self.problem.steps + 1 - step) if rows is None else rows
+        seen = jnp.asarray(self._seen[step : step + self.chunk])
+        limit = jnp.asarray(limit, jnp.int64)
+        return self.inputs, at.between, self.fixed, at.place, limit, seen, self.list_of(at)[1]
 
 
 @dataclass(frozen=True)
@@ -370,14 +300,10 @@ class Unrolled(Method):
     """The derivative of the steps that ran, by JAX.
 
     Attributes:
-        snapshots: states that may be kept beside the first; None: as many as there is memory for.
-        chunk: steps that are linearized together; None: up to 16, as memory has it.
-        compare: whether to make the run as well and report where this program departs from it.
+        budget: bytes of states that are kept, evenly spread; those between two of them are made again.
     """
 
-    snapshots: int | None = None
-    chunk: int | None = None
-    compare: bool = True
+    budget: int = KEPT
 
     name = "unrolled"
     description = "the derivative of the steps that ran, by JAX, in its own forward pass"
@@ -389,164 +315,69 @@ class Unrolled(Method):
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None):
         simulation, last = problem.simulation, problem.steps
-        program = ChunkedProgram(problem, self.chunk)
-        size = sum(leaf.nbytes for leaf in jax.tree.leaves(program.start[:1] + program.start[3:5]))
-        room = max(1, free() // size) if self.snapshots is None else self.snapshots
-        at, ends, kept = program.start, [0], [program.start]
-        while at.step <= last:
+        tell = progress or (lambda done, steps, phase: None)
+        program = ChunkedProgram(problem)
+        size = sum(leaf.nbytes for leaf in jax.tree.leaves(program.start[:2]))
+        room = max(1, self.budget // size)
+        at, ends, kept, hop = program.start, [0], [program.start], 1
+        while ends[-1] <= last:
             at = program.forward(at)
-            ends.append(at.step)
-            if len(kept) <= room:
+            ends.append(int(at.place.step))
+            if (len(ends) - 1) % hop == 0 and ends[-1] <= last:
                 kept.append(at)
-            if progress is not None:
-                progress(at.step - 1, last, "run")
+            if len(kept) > room:
+                kept, hop = kept[::2], 2 * hop
+            tell(ends[-1] - 1, last, "run")
         count = chunks_run = len(ends) - 1
-        if len(kept) <= count:
-            # not all of them: places that need the fewest chunks run again
-            kept = kept[:1]
-        stack = [(k, state) for k, state in enumerate(kept[:count])]
-        value, by_total = jax.value_and_grad(program.value)(at.between.total)
+        value, by_total = jax.value_and_grad(lambda total: problem.loss.value(total, program.frames))(
+            at.between.total
+        )
         nothing = jnp.zeros_like(at.between.x)
         onto, inputs = StepEnds(nothing, nothing, by_total), jax.tree.map(jnp.zeros_like, program.inputs)
-        own = Fingerprints(last)
-        for k in reversed(range(count)):
-            while stack[-1][0] < k:
-                j, here = stack[-1]
-                hop = ahead(k + 1 - j, room + 1 - len(stack))
-                for m in range(j, j + hop):
-                    here = program.forward(here, ends[m + 1] - ends[m])
-                chunks_run += hop
-                stack.append((j + hop, here))
-            _, here = stack.pop()
-            record, back = program.keep(here, ends[k + 1] - ends[k])
-            chunks_run += 1
-            if self.compare:
-                own.add(ends[k], int(record.rows), record.x, record.v, record.bits, program.list_of(here)[1])
-            onto, inputs = pull(back, onto, inputs)
-            if progress is not None:
-                progress(last - ends[k], last, "reverse pass")
+        own: Marks = {}
+        for block in reversed(range(len(kept))):
+            first, states = block * hop, [kept.pop()]
+            chunks = range(first, min(first + hop, count))
+            for k in chunks[:-1]:
+                states.append(program.forward(states[-1], ends[k + 1] - ends[k]))
+            chunks_run += 2 * len(chunks) - 1
+            for k in reversed(chunks):
+                at = states.pop()
+                record, back = program.keep(at, ends[k + 1] - ends[k])
+                rows = range(int(record.rows))
+                own.update(marks(ends[k], rows, record.x, record.v, record.bits, program.list_of(at)[0]))
+                onto, inputs = pull(back, onto, inputs)
+                tell(last - ends[k], last, "reverse pass")
         parts = program.cotangents(onto, inputs)
-        details: dict[str, Any] = {"steps linearized together": program.chunk, "chunks": count}
-        details["chunks run"] = chunks_run
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
+        run: Marks = {}
+        tape = RunTape(
+            simulation, problem.loss, last, budget=0,
+            each=lambda one: run.update(marks(one.first, range(one.rows), one.x, one.v, one.bits, one.table)),
+        )  # fmt: skip
+        details = {
+            "steps linearized together": program.chunk, "chunks": count, "chunks run": chunks_run,
+            "primal": {"value of the run": tape.value, **departure(run, own)},
+        }  # fmt: skip
         notes = independent(problem, gradient, saltation=False)
-        if self.compare:
-            run = Fingerprints(last)
-            tape = RunTape(
-                simulation, problem.loss, last, budget=0,
-                each=lambda one: run.add(
-                    one.first, one.rows, one.x, one.v, one.bits, simulation.tables(one.table)
-                ),
-            )  # fmt: skip
-            details["primal"] = {"value of the run": tape.value, **run.departure(own)}
         return self.result(float(value), gradient, notes, details)
 
 
-def ahead(length: int, room: int) -> int:
-    """How many chunks ahead the next state is kept, so that the fewest are run again.
-
-    Args:
-        length: chunks to reverse.
-        room: states that may still be kept.
-
-    Source: Griewank & Walther, Revolve, ACM Trans. Math. Softw. 26 (2000) 19.
-    """
-    if room < 1:
-        return length - 1
-    # with the state at the start there is one more
-    states, repeats = room + 1, 1
-    while comb(states + repeats, states) < length:
-        repeats += 1
-    # as far ahead as one repeat less allows, and no nearer to the end than one state less allows
-    near, far = comb(states + repeats - 2, states - 1), comb(states + repeats - 1, states)
-    return max(1, min(far, length - near))
+#: A digest of the state, and one of the pairs inside, by step, whatever the order of atoms and lists.
+Marks = dict[int, tuple[bytes, tuple[int, int]]]
 
 
-def free() -> int:
-    """Memory that may be planned with, bytes.
-
-    The kernel's estimate of what can be had without swapping, or the limit of the container where that is
-    less.
-    """
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        amount = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        amount = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
-    except OSError:
-        limit = used = "max"
-    if limit != "max":
-        amount = min(amount, int(limit) - int(used))
-    return int(_SHARE * max(amount, 0))
+def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tuple[int, Any]]:
+    """Digests of some steps with one list, in whose order positions, velocities and decisions are."""
+    x, v, bits = (np.asarray(part) for part in (x, v, bits))
+    for row in rows:
+        state = fingerprint(table.order, x[row], v[row])
+        yield first + row, (state, fingerprint_of_bits(bits[row], table.index, table.order))
 
 
-class Fingerprints:
-    """Of the states and decisions of one program, step by step, whatever the order of atoms and lists.
-
-    Args:
-        steps: last step.
-    """
-
-    def __init__(self, steps: int):
-        self.state, self.decision = (np.zeros(steps + 1, np.uint64) for _ in range(2))
-        self.known = np.zeros(steps + 1, bool)
-
-    def add(self, first: int, rows: int, x, v, bits, tables: Tables) -> None:
-        """Some steps with one list.
-
-        Args:
-            first, rows: first step and the number in use of those given.
-            x, v: in the order of the list, shape (room, 3, atoms). bits: packed decisions.
-        """
-        state, decision = _of_rows(jnp.asarray(x), jnp.asarray(v), jnp.asarray(bits), tables)
-        here = slice(first, first + rows)
-        self.state[here], self.decision[here] = np.asarray(state)[:rows], np.asarray(decision)[:rows]
-        self.known[here] = True
-
-    def departure(self, other: Fingerprints) -> dict[str, int | None]:
-        """First steps at which another program has another bit in its state, and other pairs inside."""
-        both = self.known & other.known
-
-        def first(different: np.ndarray) -> int | None:
-            return int(np.argmax(different)) if different.any() else None
-
-        return {
-            "steps compared": int(np.flatnonzero(both)[-1]) if both.any() else -1,
-            "first state": first(both & (self.state != other.state)),
-            "first decision": first(both & (self.decision != other.decision)),
-        }
-
-
-@jax.jit
-def _of_rows(
-    x: Float[Array, "rows 3 atoms"],
-    v: Float[Array, "rows 3 atoms"],
-    bits: UInt8[Array, "rows words atoms"],
-    tables: Tables,
-) -> tuple[UInt64[Array, "rows"], UInt64[Array, "rows"]]:
-    atoms = x.shape[-1]
-    order = tables.order.astype(jnp.uint64)
-    ends = jnp.append(order, jnp.zeros((), jnp.uint64))[tables.index]
-    pairs = _mixed(order * jnp.uint64(atoms) + ends)
-    places = jnp.arange(6, dtype=jnp.uint64)[:, None] * jnp.uint64(atoms) + order
-    shifts = jnp.arange(8, dtype=jnp.uint8)[:, None]
-
-    def one(row):
-        x, v, bits = row
-        words = lax.bitcast_convert_type(jnp.concatenate([x, v]), _UNSIGNED[x.dtype.itemsize])
-        state = jnp.sum(_mixed(_mixed(words.astype(jnp.uint64)) + places))
-        inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
-        return state, jnp.sum(jnp.where(inside, pairs, jnp.zeros((), jnp.uint64)))
-
-    return lax.map(one, (x, v, bits))
-
-
-def _mixed(words: UInt64[Array, "..."] | Int[Array, "..."]) -> UInt64[Array, "..."]:
-    """Every bit of the result depends on every bit of the word (splitmix64; Steele, Lea & Flood 2014)."""
-    z = words + jnp.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> jnp.uint64(30))) * jnp.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> jnp.uint64(27))) * jnp.uint64(0x94D049BB133111EB)
-    return z ^ (z >> jnp.uint64(31))
+def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
+    """First steps at which another program has another bit in its state, and other pairs inside."""
+    both = sorted(run.keys() & other.keys())
+    different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
+    state, decision = (steps[0] if steps else None for steps in different)
+    return {"steps compared": both[-1] if both else -1, "first state": state, "first decision": decision}

@@ -121,7 +121,7 @@ class Cutoff(ABC):
         Raises:
             Undecided: by the function, where the ball lies on both sides of the onset.
         """
-        from mdnum.numerics.enclosures import enclosed
+        from mdnum.numerics.exact import enclosed
 
         cut = enclosed(lambda r2, u, w, *at: self.cut(r2, u, w, AtCutoff(*at))[1], 7)
         return lambda r2: 2 * cut(r2, energy(r2), pull(r2) / 2, *at)

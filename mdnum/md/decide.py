@@ -90,10 +90,9 @@ class PairDecider:
         """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
 
         The exact margin is that of the state's positions in the system's own box and against its own
-        threshold, both doubles: narrowing any of them is rounding like any other (error analysis:
-        precision.bounds). Evaluated a thousandth beyond r_cut, it holds for every pair up to there; a pair
-        that is further away is decided rightly, or its computed margin is within the bound. It is that of
-        atoms within the reach; where they may have left it, ask `bounds_at`.
+        threshold, both doubles (error analysis: numerics.rounding). Evaluated a thousandth beyond r_cut, it
+        holds for every pair up to there; one further away is decided rightly, or its margin is within the
+        bound. It is that of atoms within the reach; where they may have left it, ask `bounds_at`.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 

@@ -1,9 +1,8 @@
-"""A run in whole numbers: places, momenta and pair forces as multiples of fixed units.
+"""A run in fixed-point numbers: positions, momenta and pair forces as whole multiples of fixed units.
 
-All units of length, force and energy are powers of two, so a double that is a whole multiple of one of them
-is that integer, exactly, and the rest of a rollout carries it as it carries any position. Sums of integers
-have no order, the squared distance of a decision has no rounding, and a step that adds one integer to another
-can be taken back by subtracting it.
+All units are powers of two, so a double that is a whole multiple of one is that integer, exactly, and the
+rest of a rollout carries it as any position. Sums of integers have no order, the squared distance of a
+decision has no rounding, and a step that adds one integer to another is reversed by subtracting it.
 
 The force of a pair is computed in float64 from the exact integer distance, by operations that every compiler
 rounds alike, and rounded to the unit of force. Seen from the other end it is the same number with the other
@@ -24,11 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
-from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import (
     Decisions,
     PairDecider,
@@ -38,9 +36,9 @@ from mdnum.md.decide import (
     halves_of,
     packed,
     unpacked,
-)  # fmt: skip
+)
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.pairforce import VOIGT, Forces, PairForce, other_than, symmetric
+from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, other_than, symmetric
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
 from mdnum.numerics.exact import fence, squared_norm, zero_bits
@@ -88,15 +86,14 @@ class Lattice:
     ) -> Lattice:
         """Units for a box, a list and a potential.
 
-        The spacing is the finest at which squared distances of listed pairs are exact. The unit of force is
-        the finest at which neither momenta nor forces leave the range of exact sums long before a run has
-        blown up; with the time step it makes the unit of momentum.
+        The spacing is the finest at which squared distances of listed pairs are exact; the unit of force the
+        finest at which neither momenta nor forces leave the range of exact sums long before a run has blown
+        up, which with the time step makes the unit of momentum.
 
         Args:
-            cell: the box. r_list: radius of the neighbor lists, length.
-            model: the potential with its cutoff.
-            momentum: size of the momentum of each atom at the start and of a thermal one, whichever is
-                larger, mass length/time.
+            r_list: radius of the neighbor lists, length.
+            momentum: size of the momentum of each atom at the start or of a thermal one, the larger, mass
+                length/time.
             kT: temperature as an energy. timestep: internal time.
 
         Raises:
@@ -157,7 +154,7 @@ class Lattice:
 
 
 def _depth(model: CutPotential) -> float:
-    """A scale of energy of a pair potential: its depth, or where it only repels, its height halfway in."""
+    """A scale of energy of a pair potential: its depth, or its height halfway in where it only repels."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -207,7 +204,6 @@ class LatticeDecider(PairDecider):
         return (0.0,) * len(self.r_cut)
 
     def inside(self, quantity, value):
-        """The decision, of integers or of what they stand for."""
         return quantity < value
 
     def host_squares(self, dx, dy, dz) -> Int[np.ndarray, "..."]:
@@ -416,13 +412,7 @@ def _counted_jvp(primals, tangents):
 
 
 class LatticeJudge(SlotJudge):
-    """Decides as `SlotJudge` does, with integers.
-
-    Args:
-        decider: the convention. cell: the box. zero: integer zero that XLA must not know.
-        positions: sorted, wrapped, shape (3, atoms), length.
-        lattice: the units.
-    """
+    """Decides as `SlotJudge` does, with integers in the units of a lattice."""
 
     def __init__(self, decider: LatticeDecider, cell: Cell, zero, positions, lattice: Lattice):
         inverse = 1 / lattice.spacing
@@ -497,9 +487,9 @@ class LatticeForce(PairForce):
         )
 
     @property
-    def law(self) -> Any:
+    def law(self) -> Guarded:
         """The potential with bits that no compiler changes."""
-        return _Reproducible(self.model, self.zero)
+        return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> LatticeJudge:
         """What decides at these positions."""
@@ -510,15 +500,7 @@ class LatticeForce(PairForce):
         """The decisions of a list at given positions, without forces."""
         return self.judge(positions).decide(tables)
 
-    def __call__(
-        self,
-        positions: Float[Array, "3 atoms"],
-        tables: Tables,
-        *,
-        decisions: bool,
-        given: UInt8[Array, "words atoms"] | None = None,
-        where: UInt8[Array, "words atoms"] | None = None,
-    ) -> Forces:
+    def __call__(self, positions, tables, *, decisions, given=None, where=None):
         """As `PairForce`: forces that are whole multiples of the unit of force.
 
         Where a pair is so close that its force would leave the range of exact sums, the energy is NaN.
@@ -608,16 +590,3 @@ def _closest(model: CutPotential, lattice: Lattice) -> float:
         counts = [np.abs(energy) / lattice.energy, force / lattice.force, force * r / lattice.energy]
     beyond = ~np.all(np.stack(counts) < 2.0**50, axis=0)
     return float(np.max(np.where(beyond, r * r, 0.0)))
-
-
-class _Reproducible(eqx.Module):
-    """A cut potential whose results do not depend on how it is compiled."""
-
-    model: CutPotential
-    zero: Array
-
-    def at_cutoff(self) -> AtCutoff:
-        return reproducible(self.model.at_cutoff, self.zero)()
-
-    def evaluate(self, r2, types, at: AtCutoff):
-        return reproducible(self.model.evaluate, self.zero)(r2, types, at)

@@ -101,12 +101,11 @@ class ManyBody(eqx.Module):
 
 # --- stillinger and Weber's silicon, through jax-md's energy function ---------------------------------
 
-# jax_md.quantity adds 1e-7 to both lengths before it divides by them, which bends every cosine by 1e-7 and
-# the forces of rattled silicon by 3e-7. The 1e-7 is a length, so it shrinks with the unit of length: in
-# units of 2^-24 Å it is 6e-15 Å, below rounding, and a power of two costs no digit anywhere else. (Not
-# more: jax-md also takes two neighbors closer than 1e-5 of that unit for one.) In float32 the offset is
-# about one rounding, and 2^4 puts it below.
-_UNIT = {"float64": 2.0**24, "float32": 2.0**4}
+# jax_md.quantity adds a length of 1e-7 to both lengths before it divides by them, which bends every cosine by
+# 1e-7 and the forces of rattled silicon by 3e-7. In units of 2^-24 Å it is 6e-15 Å, below rounding, and a
+# power of two costs no digit. (Not more: jax-md also takes two neighbors closer than 1e-5 of that unit for
+# one.)
+_UNIT = 2.0**24
 
 
 class StillingerWeber(ManyBody):
@@ -144,30 +143,26 @@ class StillingerWeber(ManyBody):
         """a sigma, length."""
         return self.a * self.sigma
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, energy units of epsilon; see ManyBody.energy."""
-        unit = _UNIT[str(jnp.dtype(positions.dtype))]
+    def energy(self, positions, neighbor, cell):
         vector = displacement(cell, self.pbc)
 
         def apart(Ra, Rb, **_):
             # a padded slot may be the atom itself; at distance zero jax-md's derivatives by sigma, A and B
             # are NaN, and its mask comes after
-            d = vector(Ra, Rb) * unit
-            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * unit, d)
+            d = vector(Ra, Rb) * _UNIT
+            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * _UNIT, d)
 
         # numbers stay Python floats here: nothing on this path downcasts them, and they take R's dtype
         _, total = upstream().energy.stillinger_weber_neighbor_list(
             apart,
             1.0,
-            sigma=self.sigma * unit,
+            sigma=self.sigma * _UNIT,
             A=self.A,
             B=self.B,
             lam=self.strength,
             gamma=self.gamma,
             epsilon=self.epsilon,
-            cutoff=self.r_cut * unit,
+            cutoff=self.r_cut * _UNIT,
             neighbor_list_fn=lambda *_, **__: None,
         )
         # jax-md mixes dtypes; the result has the dtype of the positions all the same
@@ -235,10 +230,7 @@ class Tersoff(ManyBody):
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, eV for the default constants; see ManyBody.energy."""
+    def energy(self, positions, neighbor, cell):
         idx = neighbor.idx
         vectors = neighbor_vectors(positions, idx, cell, self.pbc)
         # the argument is masked, not the result: a padded slot gets a harmless vector before any root
@@ -290,10 +282,7 @@ class EnergyFunction(ManyBody):
     r_cut: float = eqx.field(static=True)
     name: str = eqx.field(static=True, kw_only=True, default="energy function")
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy; see ManyBody.energy."""
+    def energy(self, positions, neighbor, cell):
         return self.function(self.parameters, positions, neighbor, cell)
 
 
@@ -391,10 +380,9 @@ class Setfl:
 
 
 def read_setfl(path: Path) -> Setfl:
-    """Read a table; numbers may be broken into lines in any way.
+    """Read a table; numbers may be broken into lines in any way, and keep every digit.
 
-    jax-md's own reader wants the word setfl in line 1 and no empty line at the end, and rounds everything
-    to float32, which costs the forces of copper 4e-4 eV/Å.
+    jax-md's own reader rounds everything to float32, which costs the forces of copper 4e-4 eV/Å.
 
     Raises:
         InputError: unreadable, not a setfl table, more than one element, numbers that are missing, left
@@ -455,8 +443,8 @@ def read_setfl(path: Path) -> Setfl:
 class Spline(eqx.Module):
     """Piecewise cubic through a table, twice continuously differentiable ("not-a-knot" ends).
 
-    The same interpolant as scipy's InterpolatedUnivariateSpline(k=3), hence as ASE's EAM. Outside the table
-    the first and last cubic are carried on; whoever must not leave the table asks `inside`.
+    The interpolant of scipy's InterpolatedUnivariateSpline(k=3), hence of ASE's EAM. Outside the table the
+    first and last cubic are carried on; see `inside`.
 
     Attributes:
         coefficients: of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals).
@@ -539,10 +527,7 @@ class EmbeddedAtom(ManyBody):
         on = self.embedding.inside(rho)
         return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))
 
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy, energy units of the table; see ManyBody.energy."""
+    def energy(self, positions, neighbor, cell):
         _, total = upstream().energy.eam_neighbor_list(
             displacement(cell, self.pbc),
             1.0,
@@ -565,7 +550,6 @@ def embedded_atom(
     Args:
         path: a single-element .eam.alloy file.
         symbols: of the atoms, to be compared with the table's element.
-        pbc: which axes are periodic.
 
     Raises:
         InputError: the file is no such table, or it is for another element.

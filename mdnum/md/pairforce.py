@@ -8,7 +8,7 @@ over the whole (slots, atoms) array takes twice the time at 4,000 atoms and ten 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -86,9 +86,9 @@ class PairForce(eqx.Module):
         )
 
     @property
-    def law(self) -> CutPotential | _Rounded:
+    def law(self) -> CutPotential | Guarded:
         """The potential as the policy computes it: in sixteen bits it is rounded after every operation."""
-        return _Rounded(self.model, self.zero) if self._short else self.model
+        return Guarded(self.model, self.zero, rounded) if self._short else self.model
 
     @property
     def _short(self) -> bool:
@@ -204,17 +204,20 @@ def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> B
     return inside ^ ((told[None, :] >> shift) & jnp.uint8(1) == 1)
 
 
-class _Rounded(eqx.Module):
-    """A cut potential whose results are rounded after every operation."""
+class Guarded(eqx.Module):
+    """A cut potential whose functions `how` changes: rounded after every operation, or reproducible."""
 
     model: CutPotential
     zero: Int[Array, ""]
+    how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        return rounded(self.model.at_cutoff, self.zero)()
+        """As the potential's."""
+        return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        return rounded(self.model.evaluate, self.zero)(r2, types, at)
+        """As the potential's."""
+        return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))

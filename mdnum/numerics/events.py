@@ -48,15 +48,6 @@ class Threshold:
         """The decision itself, of the shape of the quantity; NaN decides no."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
-    def ambiguous(self, quantity, bound):
-        """Whether another legitimate rounding of the quantity could have decided otherwise.
-
-        Args:
-            quantity: computed value(s).
-            bound: bound(s) on |computed - exact| in the quantity's space.
-        """
-        return np.abs(self.margin(quantity)) <= bound
-
 
 @dataclass(frozen=True)
 class Hysteresis:
@@ -151,11 +142,6 @@ class Ledger:
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left
 
-    def inside(self, first: int, steps: int) -> Int[np.ndarray, "steps"]:
-        """Number of yes decisions at each step 0..steps by the event algebra: first + entered - left."""
-        entered, left = self.counts(steps)
-        return first + np.cumsum(entered - left)
-
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
         """Sum of the jumps of the flips of each step 0..steps."""
         # bincount of nothing is a row of integers, whatever its weights
@@ -172,21 +158,6 @@ def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
     for column, size in zip(subject.T, sizes, strict=True):
         key = key * size + column
     return np.argsort(key)
-
-
-def broken_alternations(ledger: Ledger) -> int:
-    """Rows that repeat the direction of the same subject's flip before: 0 for a complete ledger.
-
-    A decision that turned yes can only turn no next, so a missed flip of a subject that flips again
-    leaves two equal directions in a row.
-    """
-    if not len(ledger):
-        return 0
-    keys = tuple(ledger.subject[:, k] for k in range(ledger.subject.shape[1]))
-    order = np.lexsort((ledger.step, *keys))
-    subject, entered = ledger.subject[order], ledger.entered[order]
-    same = np.all(subject[1:] == subject[:-1], axis=1)
-    return int(np.sum(same & (entered[1:] == entered[:-1])))
 
 
 # --- packed bits: eight slots to a byte --------------------------------------------------------------
@@ -254,23 +225,11 @@ def changes_in_time(
         room = total + 8
 
 
-def changed_bits(
-    before: UInt8[np.ndarray, "words columns"], now: UInt8[np.ndarray, "words columns"]
-) -> tuple[Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]]:
-    """The slots whose decision differs between two steps of one list.
-
-    Returns:
-        slot, column and the decision now (1 yes, 0 no) of every changed bit, by slot word, column, bit.
-    """
-    _, slot, column, values = changes_in_time(before, now[None])
-    return slot, column, values
-
-
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
     """Slot and column of every yes decision."""
-    slots, columns, _ = changed_bits(np.zeros_like(packed), packed)
+    _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 
 

@@ -2,7 +2,8 @@
 
 XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has other bits in
 another fusion, another instruction set, or in numpy. A decision must not depend on that: it is written
-with the products fenced, and then the host reproduces it bit for bit.
+with the products fenced, and then the host reproduces it bit for bit. A formula that is written as any
+other is run operation by operation instead: rounded behind each, or enclosed by intervals.
 """
 
 from __future__ import annotations
@@ -59,6 +60,85 @@ def _fence_jvp(primals, tangents):
     return _through_integers(x, zero), tangents[0]
 
 
+def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
+    """dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
+
+    Error: at most gamma_3 * r² for exact components (Higham 2002, 3.1).
+    """
+    return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
+
+
+# --- programs, operation by operation -------------------------------------------------------------------
+
+# what a function that is jitted by itself, as jnp.where is, looks like inside another
+_CALLS = ("jit", "pjit")
+Rule = Callable[[Any, list[Any]], Sequence[Any]]
+
+
+def _same(x: Any) -> Any:
+    return x
+
+
+def stepwise(
+    function: Callable[..., Any],
+    rule: Rule,
+    enter: Callable[[Any], Any] = _same,
+    leave: Callable[[Any], jax.Array] = _same,
+) -> Callable[..., Any]:
+    """The function of arrays, traced where it is called, whose operations a rule computes one by one.
+
+    Args:
+        function: may close over other arrays.
+        rule: of an equation of jax's program and its inputs: its outputs.
+        enter: makes what the rule works on of an argument, a constant, and what enters or leaves a call.
+        leave: makes an array of a result of the rule.
+    """
+
+    def run(*args: Any) -> Any:
+        leaves, tree = jax.tree.flatten(args)
+        program, shape = jax.make_jaxpr(
+            lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True
+        )(*leaves)
+        results = [leave(x) for x in interpreted(program, leaves, rule, enter)]
+        return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+    return run
+
+
+def interpreted(
+    program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
+) -> list[Any]:
+    """The results of a closed program (see `stepwise`)."""
+    jaxpr = program.jaxpr
+    known = dict(zip(jaxpr.constvars, map(enter, program.consts), strict=True))
+    known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
+
+    def value(atom: Any) -> Any:
+        return enter(atom.val) if isinstance(atom, Literal) else known[atom]
+
+    for equation in jaxpr.eqns:
+        inputs = [value(atom) for atom in equation.invars]
+        inner = equation.params.get("jaxpr")
+        if equation.primitive.name in _CALLS and isinstance(inner, ClosedJaxpr):
+            outputs = [enter(x) for x in interpreted(inner, inputs, rule, enter)]
+        else:
+            outputs = rule(equation, inputs)
+        known.update(zip(equation.outvars, outputs, strict=True))
+    return [value(atom) for atom in jaxpr.outvars]
+
+
+def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
+    """What jax itself makes of an equation's inputs.
+
+    Raises:
+        TypeError: it is a program of its own, such as a loop.
+    """
+    if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
+        raise TypeError(f"{equation.primitive.name} cannot be run operation by operation")
+    outputs = equation.primitive.bind(*inputs, **equation.params)
+    return list(outputs) if equation.primitive.multiple_results else [outputs]
+
+
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
     """The function with every sixteen-bit result in it rounded, one operation after the other.
 
@@ -72,51 +152,89 @@ def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]
         zero: an integer zero that XLA must not know (`zero_bits`).
     """
 
-    def stepwise(*args: Any) -> Any:
-        leaves, tree = jax.tree.flatten(args)
-        program, shape = jax.make_jaxpr(
-            lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True
-        )(*leaves)
-        results = _stepwise(program.jaxpr, program.consts, leaves, zero)
-        return jax.tree.unflatten(jax.tree.structure(shape), results)
+    def rule(equation: Any, inputs: list[Any]) -> list[jax.Array]:
+        outputs = bound(equation, inputs)
+        return [fence(x, zero) if _is_short(x.dtype) else x for x in outputs]
 
-    return stepwise
-
-
-# what a function that is jitted by itself, as jnp.where is, looks like inside another
-_CALLS = ("jit", "pjit")
-
-
-def _stepwise(program: Any, constants: Sequence[Any], arguments: Sequence[Any], zero: jax.Array) -> list[Any]:
-    """Run a program equation by equation, with a fence behind each sixteen-bit result."""
-    known = dict(zip(program.constvars, constants, strict=True))
-    known.update(zip(program.invars, arguments, strict=True))
-
-    def value(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else known[atom]
-
-    for equation in program.eqns:
-        inputs = [value(atom) for atom in equation.invars]
-        inner = equation.params.get("jaxpr")
-        if equation.primitive.name in _CALLS and isinstance(inner, ClosedJaxpr):
-            outputs = _stepwise(inner.jaxpr, inner.consts, inputs, zero)
-        else:
-            if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
-                raise TypeError(f"{equation.primitive.name} cannot be rounded operation by operation")
-            outputs = equation.primitive.bind(*inputs, **equation.params)
-            outputs = list(outputs) if equation.primitive.multiple_results else [outputs]
-            outputs = [fence(x, zero) if _is_short(x.dtype) else x for x in outputs]
-        known.update(zip(equation.outvars, outputs, strict=True))
-    return [value(atom) for atom in program.outvars]
+    return stepwise(function, rule)
 
 
 def _is_short(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.floating) and np.dtype(dtype).itemsize == 2
 
 
-def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
+def enclosed(function: Callable[..., jax.Array], arguments: int) -> Callable[..., Any]:
+    """A function of float64 numbers in ball arithmetic: every number an interval that holds the exact one.
 
-    Error: at most gamma_3 * r² for exact components (Higham 2002, 3.1).
+    Constants of the formula are the doubles that they are. A `where` whose condition holds for a part of a
+    ball only gives the union of both of its values; at most one of them may be the wrong branch.
+
+    Args:
+        function: of scalars; jax traces it once.
+        arguments: how many; numbers of flint.
+
+    Raises:
+        TypeError: by the function, for an operation that has no counterpart here.
     """
-    return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
+    from flint import arb
+
+    with jax.enable_x64(True):
+        program = jax.make_jaxpr(function)(*[jnp.float64(1)] * arguments)
+
+    def enter(x: Any) -> Any:
+        if isinstance(x, arb | bool | None):
+            return x
+        number = np.asarray(x)
+        return bool(number) if number.dtype == bool else arb(float(number))
+
+    def rule(equation: Any, inputs: list[Any]) -> list[Any]:
+        name = equation.primitive.name
+        if name not in _IN_BALLS:
+            raise TypeError(f"{name} has no counterpart in ball arithmetic")
+        return [_IN_BALLS[name](*inputs, **equation.params)]
+
+    return lambda *balls: interpreted(program, balls, rule, enter)[0]
+
+
+def _compare(yes: Callable[[Any, Any], bool], no: Callable[[Any, Any], bool]) -> Callable[..., bool | None]:
+    return lambda a, b, **_: True if yes(a, b) else False if no(a, b) else None
+
+
+def _select(condition: bool | None, no: Any, yes: Any, **_: Any) -> Any:
+    return no.union(yes) if condition is None else yes if condition else no
+
+
+def _both(a: bool | None, b: bool | None, **_: Any) -> bool | None:
+    return False if a is False or b is False else None if a is None or b is None else True
+
+
+_IN_BALLS: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b, **_: a + b,
+    "sub": lambda a, b, **_: a - b,
+    "mul": lambda a, b, **_: a * b,
+    "div": lambda a, b, **_: a / b,
+    "neg": lambda a, **_: -a,
+    "abs": lambda a, **_: abs(a),
+    "sqrt": lambda a, **_: a.sqrt(),
+    "rsqrt": lambda a, **_: a.rsqrt(),
+    "exp": lambda a, **_: a.exp(),
+    "log": lambda a, **_: a.log(),
+    "sin": lambda a, **_: a.sin(),
+    "cos": lambda a, **_: a.cos(),
+    "tanh": lambda a, **_: a.tanh(),
+    "square": lambda a, **_: a * a,
+    "pow": lambda a, b, **_: a**b,
+    "integer_pow": lambda a, *, y, **_: a**y,
+    "max": lambda a, b, **_: a.max(b),
+    "min": lambda a, b, **_: a.min(b),
+    "convert_element_type": lambda a, **_: a,
+    "broadcast_in_dim": lambda a, **_: a,
+    "copy": lambda a, **_: a,
+    "stop_gradient": lambda a, **_: a,
+    "select_n": _select,
+    "and": _both,
+    "gt": _compare(lambda a, b: a > b, lambda a, b: a <= b),
+    "ge": _compare(lambda a, b: a >= b, lambda a, b: a < b),
+    "lt": _compare(lambda a, b: a < b, lambda a, b: a >= b),
+    "le": _compare(lambda a, b: a <= b, lambda a, b: a > b),
+}

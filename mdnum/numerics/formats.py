@@ -1,4 +1,4 @@
-"""Formats of numbers, emulated: rounding to any of them, products of matrices in them, stochastic rounding.
+"""Formats of numbers, emulated: rounding to any of them, products of matrices in them, loss scaling.
 
 Which numbers a format has is what decides here; its speed is not emulated. TF32 is what some devices do to
 float32 matrix products unless told otherwise: the inputs keep 10 of 23 fraction bits, the sums are float32.
@@ -6,14 +6,15 @@ float32 matrix products unless told otherwise: the inputs keep 10 of 23 fraction
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from mdnum.errors import InputError
 from mdnum.numerics.roles import ALL
@@ -77,16 +78,6 @@ FORMATS: Mapping[str, FloatFormat] = {
     )
 }
 
-COLUMNS = (
-    "format",
-    "bits",
-    "significand",
-    "unit roundoff",
-    "largest",
-    "smallest normal",
-    "smallest subnormal",
-)
-
 
 def format_of(name: str) -> FloatFormat:
     """The format of a name.
@@ -105,8 +96,7 @@ def _spacing(x: Float[Array, "..."], form: FloatFormat) -> Float[Array, "..."]:
     field = (lax.bitcast_convert_type(x, jnp.int64) >> 52) & 0x7FF
     exponent = jnp.maximum(field - 1023, form.emin) + 1 - form.significand
     # a power of two from its bits: exact, where exp2 need not be
-    normal = lax.bitcast_convert_type((jnp.maximum(exponent, -1022) + 1023) << 52, jnp.float64)
-    return normal
+    return lax.bitcast_convert_type((jnp.maximum(exponent, -1022) + 1023) << 52, jnp.float64)
 
 
 @jax.custom_jvp
@@ -119,6 +109,18 @@ def _identity_slope_jvp(primals, tangents):
     return _identity_slope(*primals), tangents[0]
 
 
+def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array]) -> Float[Array, "..."]:
+    """x in the numbers of a format, of which it is so many spacings from 0 as `whole` says."""
+    form = format_of(name)
+    if form.significand >= 53:
+        return x
+    wide = lax.stop_gradient(x).astype(jnp.float64)
+    spacing = _spacing(wide, form)
+    rounded = whole(wide / spacing) * spacing
+    rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
+    return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
+
+
 def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """x rounded to the nearest number of a format, ties to even, in the dtype of x.
 
@@ -129,14 +131,7 @@ def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
         x: float64 or narrower.
         name: of the format; one with more digits or range than the dtype of x leaves x as it is.
     """
-    form = format_of(name)
-    if form.significand >= 53:
-        return x
-    wide = lax.stop_gradient(x).astype(jnp.float64)
-    spacing = _spacing(wide, form)
-    rounded = jnp.rint(wide / spacing) * spacing
-    rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
-    return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
+    return _rounded(x, name, jnp.rint)
 
 
 def matmul(
@@ -165,16 +160,13 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
     does not stand still. The uniform numbers have 53 bits. Its derivative is 1. Source: Croci et al., R. Soc.
     Open Sci. 9, 211631 (2022).
     """
-    form = format_of(name)
-    if form.significand >= 53:
-        return x
-    wide = lax.stop_gradient(x).astype(jnp.float64)
-    spacing = _spacing(wide, form)
-    below = jnp.floor(wide / spacing)
-    up = jax.random.uniform(key, x.shape, jnp.float64) < wide / spacing - below
-    rounded = (below + up.astype(jnp.float64)) * spacing
-    rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
-    return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
+
+    def up_or_down(places: Array) -> Array:
+        below = jnp.floor(places)
+        up = jax.random.uniform(key, x.shape, jnp.float64) < places - below
+        return below + up.astype(jnp.float64)
+
+    return _rounded(x, name, up_or_down)
 
 
 def cast(
@@ -214,3 +206,53 @@ def _quantize_jvp(primals, tangents):
     x, scale, lowest, highest = primals
     inside = (x >= lowest * scale) & (x <= highest * scale)
     return quantize(*primals), jnp.where(inside, tangents[0], jnp.zeros_like(x))
+
+
+# --- loss scaling -----------------------------------------------------------------------------------------
+#
+# A gradient that would fall below the smallest float16 is computed larger and divided after. The scale is the
+# cotangent with which the backward pass starts, so the loss itself is not multiplied and cannot overflow.
+# Unscaling happens in float64: a power of two, exact.
+
+
+class ScaledGradient(NamedTuple):
+    """A loss with its gradient.
+
+    Attributes:
+        value: the loss, in its own dtype.
+        gradient: as the differentiated argument, leaves in float64.
+        finite: whether every number of the gradient is finite.
+        scale: the factor that was used.
+    """
+
+    value: Float[Array, ""]
+    gradient: PyTree
+    finite: Bool[Array, ""]
+    scale: Float[Array, ""]
+
+
+def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: Any) -> ScaledGradient:
+    """The loss `function(*args)` and its gradient by the first argument.
+
+    Args:
+        function: of arrays; returns a scalar.
+        scale: a power of two (`check_scale`); too small and gradients vanish, too large and they overflow.
+    """
+    scale = jnp.asarray(scale, jnp.float64)
+    value, pullback = jax.vjp(lambda first: function(first, *args[1:]), args[0])
+    (gradient,) = pullback(scale.astype(value.dtype))
+    gradient = jax.tree.map(lambda g: g.astype(jnp.float64) / jnp.broadcast_to(scale, g.shape), gradient)
+    finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient)], bool))
+    return ScaledGradient(value, gradient, finite, scale)
+
+
+def check_scale(scale: float) -> None:
+    """That scaling by this factor is exact.
+
+    Raises:
+        InputError: it is no power of two.
+    """
+    if not (scale > 0 and math.frexp(scale)[0] == 0.5):
+        raise InputError(
+            f"a scale of {scale:g} is not a power of two", remedy="Give one; then scaling is exact"
+        )

@@ -7,11 +7,9 @@ rounds once. The fixed-point sum rounds every term to a coarser unit first and t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +31,6 @@ from mdnum.numerics.sums import (
     Reduction,
     Sequential,
     Sorted,
-    Whole,
 )
 from mdnum.registry import Registry
 
@@ -117,27 +114,8 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: _Format) -> UInt64[Array,
     return jnp.where(jnp.any(filled, axis=0), jnp.minimum(bits, infinity), jnp.uint64(0))
 
 
-def nearest(value: Fraction, dtype) -> Any:
-    """The float nearest to a rational number, ties to even, on the host; infinity where none is near."""
-    info = ml_dtypes.finfo(np.dtype(dtype))
-    kind = np.dtype(dtype).type
-    if value == 0:
-        return kind(0)
-    size = abs(value)
-    exponent = size.numerator.bit_length() - size.denominator.bit_length()
-    if size < Fraction(2) ** exponent:
-        exponent -= 1
-    place = max(exponent, int(info.minexp)) - info.nmant
-    digits = round(size / Fraction(2) ** place)
-    rounded = Fraction(digits) * Fraction(2) ** place
-    if rounded > Fraction(float(info.max)):
-        return kind(np.inf if value > 0 else -np.inf)
-    # exact: the rounded number is a float of this dtype, so it is one of float64
-    return kind(math.copysign(float(rounded), value))
-
-
 @dataclass(frozen=True)
-class Exact(Whole):
+class Exact(Reduction):
     """The exact sum, rounded once to nearest: the same bits in every order.
 
     Error: half an ulp of the result; no overflow on the way; up to 2^31 terms. An infinity or a NaN among
@@ -172,7 +150,7 @@ class Exact(Whole):
 
 
 @dataclass(frozen=True)
-class FixedPoint(Whole):
+class FixedPoint(Reduction):
     """A sum of integers: every term is rounded to a multiple of 2^-bits first.
 
     The same bits in every order, at the cost of one rounding per term. Error: at most n * 2^(-bits - 1)
@@ -219,7 +197,7 @@ def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[.
 
 
 #: Every order in which a sum can be made, by name: "exact", "permuted:3" (seed), "blocked:8" (width).
-REDUCTIONS: Registry[Reduction] = Registry("reduction", "mdnum.reductions", kind=Whole, separator=":")
+REDUCTIONS: Registry[Reduction] = Registry("reduction", "mdnum.reductions", kind=Reduction, separator=":")
 REDUCTIONS.add("sequential", lambda: Sequential(), description="left to right, as a loop does")
 REDUCTIONS.add("reversed", lambda: Sequential("reversed"), description="right to left")
 REDUCTIONS.add("permuted", _numbered(Permuted, 0), description="a random order; a number is its seed")
@@ -242,32 +220,6 @@ BY_NAME = {name: parse(name) for name in REDUCTIONS.shipped}
 # --- segments: sums that frameworks make behind one's back ----------------------------------------------
 
 
-def grouped(
-    index: Int[np.ndarray, "entries"], values: Float[Array, "entries ..."], segments: int
-) -> Float[Array, "most segments ..."]:
-    """Entries of the same index side by side, in storage order, for a reduction over the leading axis.
-
-    Shorter groups are filled with minus zero, which changes no sum and no sign.
-
-    Args:
-        index: segment of each entry, known (not traced).
-        values: the entries.
-        segments: how many segments there are.
-
-    Raises:
-        InputError: an index outside 0 ... segments - 1.
-    """
-    index = np.asarray(index)
-    if len(index) and not (index.min() >= 0 and index.max() < segments):
-        raise InputError(f"an index outside 0 ... {segments - 1}")
-    order = np.argsort(index, kind="stable")
-    counts = np.bincount(index, minlength=segments)
-    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
-    place = np.arange(len(index)) - np.repeat(starts, counts)
-    shape = (int(counts.max(initial=0)), segments, *values.shape[1:])
-    return jnp.full(shape, -0.0, values.dtype).at[place, index[order]].set(values[order])
-
-
 def segment_sum(
     values: Float[Array, "entries ..."],
     index: Int[np.ndarray, "entries"],
@@ -283,8 +235,21 @@ def segment_sum(
         segments: how many segments there are.
         reduction: applied to each segment's entries in storage order.
         zero: see `Reduction`.
+
+    Raises:
+        InputError: an index outside 0 ... segments - 1.
     """
-    return reduction(grouped(index, values, segments), zero)
+    index = np.asarray(index)
+    if len(index) and not (index.min() >= 0 and index.max() < segments):
+        raise InputError(f"an index outside 0 ... {segments - 1}")
+    order = np.argsort(index, kind="stable")
+    counts = np.bincount(index, minlength=segments)
+    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    place = np.arange(len(index)) - np.repeat(starts, counts)
+    shape = (int(counts.max(initial=0)), segments, *values.shape[1:])
+    # shorter segments end in minus zeros, which change no sum and no sign
+    side_by_side = jnp.full(shape, -0.0, values.dtype).at[place, index[order]].set(values[order])
+    return reduction(side_by_side, zero)
 
 
 def scatter_add(

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from mdnum.numerics.exact import fence
+from mdnum.numerics.exact import bound, fence, stepwise
 
 # ln 2 and π/2 in two parts; the first has zeros at its end, so that a small integer times it is exact
 _LN2 = (float.fromhex("0x1.62e42fee00000p-1"), float.fromhex("0x1.a39ef35793c76p-33"))
@@ -142,11 +142,18 @@ def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
 
 # --- programs ------------------------------------------------------------------------------------------
 
-# what a function that is jitted by itself, as jnp.where is, looks like inside another
-_CALLS = ("jit", "pjit")
 _SUMS = ("add", "sub")
 # results that are not a product or quotient, nor a rearranged one
 _SAFE = ("add", "sub", "sqrt", "abs", "max", "min", "round", "floor", "convert_element_type", "iota")
+
+
+@dataclass
+class _Held:
+    """A number of a program that is run: may it be added as it is, do all entries share it?"""
+
+    value: Any
+    safe: bool = True
+    shared: bool = False
 
 
 def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
@@ -157,65 +164,24 @@ def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[...,
         zero: an integer zero that XLA must not know (`mdnum.numerics.exact.zero_bits`).
     """
 
-    def stepwise(*args: Any) -> Any:
-        leaves, tree = jax.tree.flatten(args)
-        program, shape = jax.make_jaxpr(
-            lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True
-        )(*leaves)
-        results, _ = _run(program.jaxpr, program.consts, leaves, [True] * len(leaves), zero)
-        return jax.tree.unflatten(jax.tree.structure(shape), results)
+    def enter(x: Any) -> _Held:
+        return _Held(x.value, x.safe) if isinstance(x, _Held) else _Held(x)
 
-    return stepwise
-
-
-def _run(
-    program: Any, constants: Sequence[Any], arguments: Sequence[Any], safe: Sequence[bool], zero: jax.Array
-) -> tuple[list[Any], list[bool]]:
-    """Run a program; returns its results, and which of them may be added as they are."""
-    known: dict[Any, Any] = dict(zip(program.constvars, constants, strict=True))
-    known.update(zip(program.invars, arguments, strict=True))
-    addable: dict[Any, bool] = dict.fromkeys(program.constvars, True)
-    addable.update(zip(program.invars, safe, strict=True))
-
-    # a literal divides as any compiler divides by it, and cannot be looked up
-    shared: set[Any] = set()
-
-    def value(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else known[atom]
-
-    def is_safe(atom: Any) -> bool:
-        return isinstance(atom, Literal) or addable[atom]
-
-    def fenced(atom: Any) -> Any:
-        """The value of an operand of a sum; what has been fenced once need not be again."""
-        if is_safe(atom) or not _is_float(value(atom)):
-            return value(atom)
-        known[atom], addable[atom] = fence(known[atom], zero), True
-        return known[atom]
-
-    for equation in program.eqns:
+    def rule(equation: Any, inputs: list[_Held]) -> list[_Held]:
         name = equation.primitive.name
-        inner = equation.params.get("jaxpr")
-        fine = [name in _SAFE] * len(equation.outvars)
-        if name in _CALLS and isinstance(inner, ClosedJaxpr):
-            inputs = [value(atom) for atom in equation.invars]
-            outputs, fine = _run(inner.jaxpr, inner.consts, inputs, list(map(is_safe, equation.invars)), zero)
-        elif name in _OWN and _is_float(value(equation.invars[0])):
-            outputs = [_OWN[name](*(value(atom) for atom in equation.invars), zero=zero, **equation.params)]
-        else:
-            if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
-                raise TypeError(f"{name} cannot be run operation by operation")
-            inputs = [fenced(atom) if name in _SUMS else value(atom) for atom in equation.invars]
-            if name == "div" and not isinstance(equation.invars[1], Literal) and equation.invars[1] in shared:
-                # of a divisor that all entries share, XLA takes the reciprocal once
-                inputs[1] = fence(inputs[1], zero)
-            outputs = equation.primitive.bind(*inputs, **equation.params)
-            outputs = list(outputs) if equation.primitive.multiple_results else [outputs]
-            if name == "broadcast_in_dim":
-                shared.update(equation.outvars)
-        known.update(zip(equation.outvars, outputs, strict=True))
-        addable.update(zip(equation.outvars, fine, strict=True))
-    return [value(atom) for atom in program.outvars], [is_safe(atom) for atom in program.outvars]
+        if name in _OWN and _is_float(inputs[0].value):
+            return [_Held(_OWN[name](*(x.value for x in inputs), zero=zero, **equation.params), False)]
+        for held in inputs if name in _SUMS else ():
+            # what has been fenced once need not be again
+            if not held.safe and _is_float(held.value):
+                held.value, held.safe = fence(held.value, zero), True
+        values = [x.value for x in inputs]
+        if name == "div" and inputs[1].shared:
+            # of a divisor that all entries share, XLA takes the reciprocal once
+            values[1] = fence(values[1], zero)
+        return [_Held(x, name in _SAFE, name == "broadcast_in_dim") for x in bound(equation, values)]
+
+    return stepwise(function, rule, enter, lambda held: held.value)
 
 
 def _is_float(x: Any) -> bool:

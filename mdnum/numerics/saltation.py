@@ -11,10 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from jaxtyping import Bool, Float
-
-from mdnum.errors import NumericalError
 
 #: |n · F-| / (|n| |F-|) at and below which an event counts as grazing.
 GRAZING = 1e-8
@@ -93,26 +90,7 @@ def saltation_flagged(
     flow_after: Float[Any, "*batch state"],
     normal: Float[Any, "*batch state"],
 ) -> tuple[Float[Any, "*batch state state"], Bool[Any, "*batch"]]:
-    """The saltation matrix and whether the event grazes; for use inside jit.
-
-    Returns:
-        Xi = DR + (F+ - DR F-) n^T / (n^T F-), and the flag; where it is set, Xi is DR alone.
-    """
-    xp = normal.__array_namespace__()
-    touch = grazing(flow_before, normal)
-    speed = xp.where(touch, xp.ones_like(normal[..., 0]), (normal * flow_before).sum(-1))
-    jump = flow_after - (reset * flow_before[..., None, :]).sum(-1)
-    term = jump[..., :, None] * normal[..., None, :] / speed[..., None, None]
-    return reset + xp.where(touch[..., None, None], xp.zeros_like(term), term), touch
-
-
-def saltation(
-    reset: Float[Any, "*batch state state"],
-    flow_before: Float[Any, "*batch state"],
-    flow_after: Float[Any, "*batch state"],
-    normal: Float[Any, "*batch state"],
-) -> Float[Any, "*batch state state"]:
-    """The saltation matrix of an event, Xi = DR + (F+ - DR F-) n^T / (n^T F-).
+    """The saltation matrix of an event, Xi = DR + (F+ - DR F-) n^T / (n^T F-), and whether the event grazes.
 
     A perturbation dx just before the event is Xi dx just after it. For a ball of restitution e that meets
     the floor with velocity v it is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a
@@ -123,24 +101,17 @@ def saltation(
         flow_before, flow_after: time derivatives of the state just before and just after.
         normal: gradient of the event function at the event.
 
-    Raises:
-        NumericalError: the event grazes, so the time of the event has no derivative.
+    Returns:
+        Xi, and the flag; where it is set, the time of the event has no derivative and Xi is DR alone.
 
     Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
 
     Source: Kong, Payne, Zhu & Johnson, Saltation Matrices: The Essential Tool for Linearizing Hybrid
     Dynamical Systems, Proc. IEEE 112 (2024) 585, arXiv:2306.06862.
     """
-    matrix, touch = saltation_flagged(reset, flow_before, flow_after, normal)
-    if np.any(np.asarray(touch)):
-        where = int(np.flatnonzero(np.asarray(touch).reshape(-1))[0])
-        size = normal.shape[-1]
-        n, f = (np.asarray(x, np.float64).reshape(-1, size)[where] for x in (normal, flow_before))
-        raise NumericalError(
-            f"the trajectory grazes its threshold: |n · F-| is {abs(float(n @ f)):.3g}, expected above "
-            f"{GRAZING:g} |n| |F-| = {GRAZING * float(np.linalg.norm(n) * np.linalg.norm(f)):.3g}",
-            remedy="Move the start or the threshold so that it is crossed, or use saltation_flagged and "
-            "leave the flagged events out",
-            where=f"event {where}",
-        )
-    return matrix
+    xp = normal.__array_namespace__()
+    touch = grazing(flow_before, normal)
+    speed = xp.where(touch, xp.ones_like(normal[..., 0]), (normal * flow_before).sum(-1))
+    jump = flow_after - (reset * flow_before[..., None, :]).sum(-1)
+    term = jump[..., :, None] * normal[..., None, :] / speed[..., None, None]
+    return reset + xp.where(touch[..., None, None], xp.zeros_like(term), term), touch

@@ -1,4 +1,4 @@
-"""The order in which a sum is made, as an object.
+"""The order in which a sum is made, as an object; and its history, addition by addition.
 
 A reduction serves two callers. The force loop of molecular dynamics hands it blocks of terms (leading
 axis: the slots of the block) and keeps a carry, so that the terms of a whole neighbor list never exist at
@@ -12,16 +12,20 @@ The derivative of every reduction is that of the sum: rounding and order have no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
+from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import fence, integer_of
@@ -30,41 +34,8 @@ from mdnum.numerics.rounding import gamma, unit_roundoff
 Add = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-class Reduction(Protocol):
-    """Order of a sum, over slots that arrive in blocks or over the leading axis of an array."""
-
-    def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Take one block; returns the carried total and, if it is to be summed later, the block's own sum."""
-        ...
-
-    def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
-        """The sum, from the carried total and the stacked block sums (leading axis: blocks)."""
-        ...
-
-    def __call__(
-        self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
-    ) -> Float[Array, "..."]:
-        """The sum over the leading axis, rounded after every addition in the dtype of the terms.
-
-        Args:
-            terms: what is summed.
-            zero: an integer zero that XLA must not know (`exact.zero_bits`), for the fences. Without one,
-                sixteen-bit sums take one from the data; then products that were not fenced by the caller
-                may still be contracted into the sum.
-        """
-        ...
-
-    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """How far the computed sum can be from the exact one, on the host, in float64.
-
-        Holds as long as no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype but
-        float16 to zero).
-        """
-        ...
-
-
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _summed(reduction: Whole, terms, zero):
+def _summed(reduction: Reduction, terms, zero):
     if zero is None and terms.dtype.itemsize == 2:
         zero = _data_zero(terms)
     return reduction.sum_of(terms if zero is None else fence(terms, zero), _adder(zero))
@@ -87,21 +58,32 @@ def _data_zero(terms: jax.Array) -> jax.Array:
     return lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
 
 
-class Whole:
-    """Base of a reduction of a whole array, with its derivative; blocks are stacked and summed at the end."""
+class Reduction:
+    """Order of a sum, over slots that arrive in blocks or over the leading axis of an array.
 
-    def within(self, total, terms):
-        """Keep the block; it is summed by `finish`."""
+    A subclass says how a whole array is summed; its blocks are stacked and summed at the end.
+    """
+
+    def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
+        """Take one block; returns the carried total and, if it is to be summed later, the block's own sum."""
         return total, jnp.stack(list(terms))
 
-    def finish(self, total, blocks):
-        """The sum of all blocks, in the order of their slots."""
+    def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
+        """The sum, from the carried total and the stacked block sums (leading axis: blocks)."""
+        assert blocks is not None
         return self(blocks.reshape(-1, *blocks.shape[2:]))
 
     def __call__(
         self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
     ) -> Float[Array, "..."]:
-        """The sum over the leading axis (see `Reduction`)."""
+        """The sum over the leading axis, rounded after every addition in the dtype of the terms.
+
+        Args:
+            terms: what is summed.
+            zero: an integer zero that XLA must not know (`exact.zero_bits`), for the fences. Without one,
+                sixteen-bit sums take one from the data; then products that were not fenced by the caller
+                may still be contracted into the sum.
+        """
         if terms.size == 0:
             return jnp.zeros(terms.shape[1:], terms.dtype)
         return _compiled(self, terms, zero)
@@ -111,18 +93,17 @@ class Whole:
         raise NotImplementedError(type(self).__name__)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """How far the computed sum can be from the exact one (see `Reduction`)."""
-        depth = self.depth(len(terms))
-        return np.asarray(_chain(depth, terms.dtype) * np.abs(terms.astype(np.float64)).sum(axis=0))
+        """How far the computed sum can be from the exact one, on the host, in float64.
+
+        Holds as long as no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype but
+        float16 to zero).
+        """
+        factor = gamma(self.depth(len(terms)), terms.dtype)
+        return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
         """The most additions that one of n terms goes through."""
         return max(n - 1, 0)
-
-
-def _chain(depth: int, dtype) -> float:
-    factor = gamma(depth, dtype)
-    return factor if factor >= 0 else np.inf
 
 
 def _adder(zero: jax.Array | None) -> Add:
@@ -141,8 +122,16 @@ def in_order(terms, add, start=None):
     return total
 
 
+class Serial(Reduction):
+    """A reduction that adds term after term onto one number."""
+
+    def places(self, terms: np.ndarray) -> list[int]:
+        """Indices of terms, shape (n,), in the order in which they are added, on the host."""
+        raise NotImplementedError(type(self).__name__)
+
+
 @dataclass(frozen=True)
-class Sequential(Whole):
+class Sequential(Serial):
     """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4).
 
     Attributes:
@@ -166,6 +155,10 @@ class Sequential(Whole):
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """From zero, one after the other."""
         return in_order(terms[::-1] if self.order == "reversed" else terms, add)
+
+    def places(self, terms: np.ndarray) -> list[int]:
+        """One after the other."""
+        return list(range(len(terms)))[:: -1 if self.order == "reversed" else 1]
 
 
 def _tree(terms: list[jax.Array]) -> jax.Array:
@@ -195,7 +188,7 @@ def _levels(terms, add, width: int):
 
 
 @dataclass(frozen=True)
-class Blocked(Whole):
+class Blocked(Reduction):
     """A tree of a given width: each node adds that many neighbors left to right, as a device's blocks do.
 
     Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree, a width of at
@@ -239,7 +232,7 @@ class Pairwise(Blocked):
 
 
 @dataclass(frozen=True)
-class Permuted(Whole):
+class Permuted(Serial):
     """A loop over the terms in a random order: what atomic additions on a device do, made repeatable.
 
     Attributes:
@@ -250,12 +243,15 @@ class Permuted(Whole):
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """In the order drawn for this many terms."""
-        order = np.random.default_rng(self.seed).permutation(terms.shape[0])
-        return in_order(terms[order], add)
+        return in_order(terms[np.array(self.places(terms))], add)
+
+    def places(self, terms: Any) -> list[int]:
+        """Drawn for this many terms."""
+        return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
 
 
 @dataclass(frozen=True)
-class Halves(Whole):
+class Halves(Reduction):
     """Two loops side by side, over the first half of the terms and over the second, added at the end.
 
     What two scatters do, one for each end of a pair, where each pair is held once. Error: at most
@@ -275,7 +271,7 @@ class Halves(Whole):
 
 
 @dataclass(frozen=True)
-class Twice(Whole):
+class Twice(Reduction):
     """Every term twice, halved: a loop, and the same loop once more onto its result.
 
     What a scatter onto the sums of a dense list does, where each pair is held from both ends. Error: at most
@@ -293,7 +289,7 @@ class Twice(Whole):
 
 
 @dataclass(frozen=True)
-class Sorted(Whole):
+class Sorted(Serial):
     """A loop over the terms by magnitude; equal magnitudes by sign, so no order of arrival matters.
 
     Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
@@ -310,6 +306,12 @@ class Sorted(Whole):
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
+    def places(self, terms: np.ndarray) -> list[int]:
+        """By magnitude."""
+        wide = terms.astype(np.float64)
+        order = np.lexsort((wide, np.abs(wide))).tolist()
+        return order if self.order == "ascending" else order[::-1]
+
 
 # --- compensated: the rounding error of every addition is computed exactly and carried along ------------
 
@@ -319,7 +321,7 @@ def _start(terms: jax.Array) -> tuple[jax.Array, jax.Array]:
     return zeros, zeros
 
 
-class _Compensated(Whole):
+class _Compensated(Reduction):
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
         """(2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
         u, n = unit_roundoff(terms.dtype), len(terms)
@@ -366,3 +368,160 @@ class Neumaier(_Compensated):
 
         (total, lost), _ = lax.scan(step, _start(terms), terms, unroll=min(4, terms.shape[0]))
         return add(total, lost)
+
+
+# --- a sum, addition by addition -------------------------------------------------------------------------
+#
+# On the host and exact: every float is a rational number, so the true sum of the terms so far stands next
+# to the running sum. The arithmetic is that of the reduction in the dtype of the terms; the last row has
+# the bits that the reduction gives inside jit, with two exceptions. XLA on a CPU flushes subnormals of
+# every dtype but float16 to zero, the host keeps them. And the orders that stream in the force loop of
+# molecular dynamics (sequential, pairwise) add there products that XLA contracts into the sum, one rounding
+# less per term, so that their last digits may differ.
+
+
+@dataclass(frozen=True)
+class Addition:
+    """One addition.
+
+    Attributes:
+        term: index of the term that was added.
+        addend: what was added to the accumulator.
+        running: the accumulator afterwards.
+        exact: the sum of the terms so far.
+        bits_lost: binary digits of the exact result of this addition below the last place that was kept;
+            0 where the addition was exact.
+        absorbed: a nonzero addend left no trace.
+    """
+
+    term: str
+    addend: float
+    running: float
+    exact: Fraction
+    bits_lost: int
+    absorbed: bool
+
+
+@dataclass(frozen=True)
+class RunningSum:
+    """A sum with its history.
+
+    Attributes:
+        dtype: of the terms and of the accumulator.
+        reduction: the order.
+        rows: one per addition.
+        result: what the reduction gives.
+        exact: the sum of the terms.
+    """
+
+    dtype: str
+    reduction: Any
+    rows: tuple[Addition, ...]
+    result: float
+    exact: Fraction
+
+    @property
+    def error(self) -> float:
+        """Result minus exact sum, to float64."""
+        return float(Fraction(self.result) - self.exact)
+
+    @property
+    def bits_lost(self) -> int:
+        """Over all additions."""
+        return sum(row.bits_lost for row in self.rows)
+
+    columns = ("term", "addend", "running sum", "exact sum", "bits lost")
+
+    def table(self) -> tuple[tuple[Any, ...], ...]:
+        """Plain rows under `columns`, floats as the shortest decimals that give the same float64."""
+        return tuple(
+            (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
+        )
+
+
+def running_sum_table(
+    terms: Any, reduction: Reduction = Sequential(), dtype: DTypeLike | None = None
+) -> RunningSum:
+    """The history of a sum in the order of a reduction.
+
+    Args:
+        terms: the numbers, shape (n,).
+        reduction: a loop: sequential, reversed, permuted or sorted.
+        dtype: terms are rounded to it first; that of the terms where None.
+
+    Raises:
+        InputError: no terms, a number that is not finite, or a reduction that is no loop.
+    """
+    terms = np.asarray(terms)
+    terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
+    if terms.ndim != 1 or len(terms) == 0:
+        raise InputError(f"terms of shape {terms.shape}", remedy="Give one axis with at least one term.")
+    if not np.isfinite(terms.astype(np.float64)).all():
+        raise InputError("a term is not finite, so the sum has no history")
+    if not isinstance(reduction, Serial):
+        remedy = "Give sequential, reversed, permuted or sorted"
+        raise InputError(f"{reduction} is no loop over the terms", remedy=remedy)
+    with np.errstate(all="ignore"):
+        rows = tuple(_loop(terms, reduction.places(terms)))
+    exact = sum((Fraction(float(t)) for t in terms), Fraction(0))
+    return RunningSum(str(terms.dtype), reduction, rows, rows[-1].running, exact)
+
+
+def _place(x: Any) -> int:
+    """Exponent of the last place of a float: x is a multiple of 2^place."""
+    info = ml_dtypes.finfo(x.dtype)
+    exponent = math.frexp(float(x))[1] - 1 if x else info.minexp
+    return max(exponent, int(info.minexp)) - info.nmant
+
+
+def _lowest(value: Fraction) -> int:
+    """Exponent of the lowest binary digit of a dyadic rational."""
+    numerator, denominator = abs(value.numerator), value.denominator
+    return (numerator & -numerator).bit_length() - denominator.bit_length()
+
+
+def _lost(true: Fraction, kept: Fraction, place: int) -> int:
+    return 0 if true == kept else max(1, place - _lowest(true))
+
+
+def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Addition]:
+    total, exact = terms.dtype.type(0), Fraction(0)
+    for k in order:
+        new = total + terms[k]
+        true = Fraction(float(total)) + Fraction(float(terms[k]))
+        exact += Fraction(float(terms[k]))
+        yield Addition(
+            str(k),
+            float(terms[k]),
+            float(new),
+            exact,
+            _lost(true, Fraction(float(new)), _place(new)) if np.isfinite(new) else 0,
+            bool(new == total and terms[k] != 0),
+        )
+        total = new
+
+
+@dataclass(frozen=True, eq=False)
+class Tap(Reduction):
+    """A reduction that keeps the terms it was given, for a look at a sum inside a compiled program.
+
+    Put it where a reduction goes (in the force of molecular dynamics, say), run once, and read `seen`: one
+    array of shape (n, ...) for every sum that was made, in the order in which the program makes them. Not
+    for long runs: everything is kept.
+
+    Attributes:
+        inner: the order of the sum.
+        seen: the terms of every sum.
+    """
+
+    inner: Reduction
+    seen: list[Float[np.ndarray, "n ..."]] = field(default_factory=list)
+
+    def sum_of(self, terms, add):
+        """As the inner reduction; the terms are handed to the host on the way."""
+        jax.debug.callback(lambda t: self.seen.append(np.array(t)), terms, ordered=True)
+        return self.inner(terms)
+
+    def bound(self, terms):
+        """As the inner reduction."""
+        return self.inner.bound(terms)

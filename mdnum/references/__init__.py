@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mdnum.references.calculator import MdnumCalculator
+    from mdnum.references.ase_models import MdnumCalculator
     from mdnum.references.energy_check import check_dynamics, check_energy
     from mdnum.references.oracle import all_pairs
     from mdnum.references.pair_check import Search, all_searches, check_pairs, effective_cutoff
@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "MdnumCalculator": "calculator",
+    "MdnumCalculator": "ase_models",
     "Search": "pair_check",
     "all_pairs": "oracle",
     "all_searches": "pair_check",

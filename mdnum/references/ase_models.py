@@ -1,4 +1,4 @@
-"""The ASE calculator that corresponds to a system, with the conversions between the two conventions.
+"""ASE calculators: the one that corresponds to a system, and mdnum as one.
 
 What differs between the codes, and what is done about it:
 
@@ -20,20 +20,24 @@ shifted and switched forms such a pair has no energy, so only its force can diff
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from ase import Atoms
-from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
+from ase.calculators.calculator import Calculator, PropertyNotImplementedError
 from ase.calculators.tersoff import Tersoff, TersoffParameters
-from ase.stress import voigt_6_to_full_3x3_stress
+from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from numpy import ndarray
+from pydantic import ValidationError
 
+from mdnum import systems
+from mdnum.errors import InputError
 from mdnum.references.independent import (
+    ClassicalCalculator,
     OnNeighborList,
     PairForm,
     PairModel,
@@ -42,9 +46,7 @@ from mdnum.references.independent import (
     edges_of,
     pair_forms,
 )
-from mdnum.systems import System
-
-_PROPERTIES = ["energy", "free_energy", "energies", "forces", "stress"]
+from mdnum.systems import System, SystemSpec
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def independent(system: System) -> Reference:
     )
 
 
-class StepAtCutoff(Calculator):
+class StepAtCutoff(ClassicalCalculator):
     """One of ASE's calculators with a constant added for each pair inside the cutoff.
 
     Args:
@@ -126,27 +128,21 @@ class StepAtCutoff(Calculator):
         step: energy of a pair.
     """
 
-    implemented_properties = _PROPERTIES
-    nolabel = True
-
     def __init__(self, inner: Calculator, form: PairForm, step: float, **kwargs: Any):
         super().__init__(**kwargs)
         self.inner, self.form, self.step = inner, form, step
 
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate (see ase.calculators.calculator.Calculator)."""
-        super().calculate(atoms, properties or ["energy"], system_changes)
-        atoms = cast(Atoms, self.atoms)
+    def evaluated(self, atoms, changes):
         # get_property, not calculate: it is what tells ASE's class that the atoms have changed
         results = _results(self.inner, atoms, atoms.cell.rank == 3)
         edges = edges_of(atoms, self.form.r_cut)
         inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
         energy = results["energy"] + self.step * (inside.sum() // 2)
         energies = results["energies"] + 0.5 * self.step * inside
-        self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
+        return {**results, "energy": energy, "energies": energies}
 
 
-class SpeciesSum(Calculator):
+class SpeciesSum(ClassicalCalculator):
     """A mixture from calculators that know one species: unlike pairs a-b are all minus a-a minus b-b.
 
     Args:
@@ -155,39 +151,29 @@ class SpeciesSum(Calculator):
         pairs; about one for the mixtures shipped.
     """
 
-    implemented_properties = _PROPERTIES
-    nolabel = True
-
     def __init__(self, parts: Sequence[tuple[Calculator, str, str]], **kwargs: Any):
         super().__init__(**kwargs)
         self.parts = tuple(parts)
 
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate (see ase.calculators.calculator.Calculator)."""
-        super().calculate(atoms, properties or ["energy"], system_changes)
-        atoms = cast(Atoms, self.atoms)
+    def evaluated(self, atoms, changes):
         symbols = np.array(atoms.get_chemical_symbols())
         n = len(symbols)
         total: dict[str, Any] = {"energy": 0.0, "energies": np.zeros(n), "forces": np.zeros((n, 3))}
         if atoms.cell.rank == 3:
             total["stress"] = np.zeros(6)
         for calculator, a, b in self.parts:
-            groups = (
-                [((symbols == a), 1.0)]
-                if a == b
-                else [((symbols == a) | (symbols == b), 1.0), ((symbols == a), -1.0), ((symbols == b), -1.0)]
-            )
+            first, second = symbols == a, symbols == b
+            groups = [(first, 1.0)] if a == b else [(first | second, 1.0), (first, -1.0), (second, -1.0)]
             for chosen, sign in groups:
                 if not chosen.any():
                     continue
                 calculator.reset()
-                results = _results(calculator, atoms[chosen], "stress" in total)
-                total["energy"] += sign * results["energy"]
-                total["energies"][chosen] += sign * results["energies"]
-                total["forces"][chosen] += sign * results["forces"]
-                if "stress" in total:
-                    total["stress"] += sign * results["stress"]
-        self.results = {**total, "free_energy": total["energy"]}
+                for name, value in _results(calculator, atoms[chosen], "stress" in total).items():
+                    if name in ("energies", "forces"):
+                        total[name][chosen] += sign * value
+                    else:
+                        total[name] += sign * value
+        return total
 
 
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
@@ -298,3 +284,101 @@ def _short_listed_eam(file: Path) -> Calculator:
             self.neighbors.update(atoms)
 
     return ShortListed(potential=str(file), form="alloy", skin=0.0)
+
+
+# --- the other way round: mdnum as an ASE calculator, for anything in ASE that wants one ----------------
+
+# a change of either is another program; positions and cell are arguments of it
+_REBUILD = {"numbers", "pbc"}
+
+
+class MdnumCalculator(ClassicalCalculator):
+    """What mdnum computes for a system file, wherever ASE takes a calculator.
+
+    For relaxing with ase.optimize, for stress and equations of state, and for holding mdnum's forces
+    against ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its
+    skin; for molecular dynamics use mdnum's rollout, which records its flips.
+
+    Args:
+        system: a `System`, or the name or path of one; its structure is not used.
+        overrides: keys of the system file to change, as `--set` does.
+        potential, cutoff, units: instead of a system: the tables of a system file as dictionaries, and
+            "metal" (Å, eV) or "lj".
+    Raises:
+        InputError: neither or both of system and potential; tables that a system file could not hold. At the
+            first use: species without constants, a cell narrower than two cutoffs.
+
+    Example:
+        >>> argon = MdnumCalculator(
+        ...     potential={"kind": "lennard-jones", "sigma": 3.405, "epsilon": 0.0103235},
+        ...     cutoff={"kind": "switched", "radius": 8.5, "onset": 7.0},
+        ... )
+    """
+
+    def __init__(
+        self,
+        system: System | str | None = None,
+        *,
+        overrides: Mapping[str, Any] | None = None,
+        potential: Mapping[str, Any] | None = None,
+        cutoff: Mapping[str, Any] | None = None,
+        units: str = "metal",
+        **kwargs: Any,
+    ):
+        super().__init__(**kwargs)
+        where = "MdnumCalculator"
+        if (system is None) == (potential is None):
+            remedy = "Say MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
+            raise InputError("give either a system or a potential", remedy=remedy, where=where)
+        if potential is not None:
+            self._template = System("calculator", _spec(potential, cutoff, units), None, Atoms())
+        elif isinstance(system, System):
+            if overrides:
+                remedy = "Pass the name of the system, or load it with the overrides"
+                raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
+            self._template = system
+        else:
+            self._template = systems.load(str(system), overrides, world="md")
+        self._evaluator: Any = None
+
+    @property
+    def system(self) -> System:
+        """What is evaluated: the tables of the system file with the atoms of the last call."""
+        return self._template if self._evaluator is None else self._evaluator.simulation.system
+
+    def evaluated(self, atoms, changes):
+        if self._evaluator is None or _REBUILD & set(changes):
+            from mdnum.systems.build import Evaluator
+
+            # only what the forces depend on: constraints and the like stay with ASE
+            bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+            # the evaluator keeps as much of the skin as the box has room for; it must not be refused for it
+            neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
+            spec = self._template.spec.model_copy(update={"neighbors": neighbors})
+            simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
+            self._evaluator = Evaluator(simulation, skin=self._template.spec.skin)
+        evaluation = self._evaluator(atoms.get_positions(), np.asarray(atoms.cell))
+        results = {"energy": float(evaluation.energy), "forces": np.array(evaluation.forces)}
+        if np.isfinite(evaluation.energies).all():  # a many-body potential need not split by atom
+            results["energies"] = np.array(evaluation.energies)
+        if atoms.cell.rank == 3 and atoms.pbc.all():
+            results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(evaluation.stress))
+        return results
+
+
+def _spec(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None, units: str) -> SystemSpec:
+    """The tables of a system file around a potential; structure and dynamics are never looked at."""
+    data: dict[str, Any] = {
+        "units": units,
+        "structure": {"file": "none"},
+        "potential": dict(potential),
+        "dynamics": {"kind": "nve", "timestep": 1.0},
+    }
+    if cutoff is not None:
+        data["cutoff"] = dict(cutoff)
+    try:
+        return SystemSpec.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(first["msg"], where=f"MdnumCalculator: {where}") from None

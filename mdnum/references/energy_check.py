@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
+from ase.geometry import complete_cell
 from ase.md.verlet import VelocityVerlet
+from jaxtyping import Int
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
-from mdnum.references.neighborhoods import neighborhoods
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import System, build, schema
 from mdnum.systems.build import Evaluation
@@ -108,37 +110,23 @@ class EnergyReport:
     def worst(self) -> dict[str, Any]:
         """The worst of all frames, in the names of summary.json's `ase`."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
-        return {
-            "reference": self.reference,
-            "energy_rel": max(frame.energy_rel for frame in self.frames),
-            "force_max": max(frame.force_max for frame in self.frames),
-            "stress_max": max(stress) if stress else None,
-            "force_scale": max(frame.force_scale for frame in self.frames),
-            "ok": self.ok,
-            **({} if self.sampled is None else {"sampled": self.sampled}),
-        }
+        names = ("energy_rel", "force_max", "force_scale")
+        worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
+        worst |= {"reference": self.reference, "stress_max": max(stress) if stress else None, "ok": self.ok}
+        return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per frame."""
-        narrow = self.precision != "float64"
+        narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
+        columns = {
+            "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
+            "force, relative": "force_rel", "stress, largest": "stress_max",
+            **(narrow if self.precision != "float64" else {}),
+            "against numpy": "energy_third", "ambiguous pairs": "ambiguous", "agrees": "ok",
+        }  # fmt: skip
         return [
-            {
-                "frame": frame.frame,
-                "reference": self.reference,
-                "energy": frame.energy,
-                "energy, relative": frame.energy_rel,
-                "force, largest": frame.force_max,
-                "force, relative": frame.force_rel,
-                "stress, largest": frame.stress_max,
-                **(
-                    {"energy, roundings": frame.energy_roundings, "force, roundings": frame.force_roundings}
-                    if narrow
-                    else {}
-                ),
-                "against numpy": frame.energy_third,
-                "ambiguous pairs": frame.ambiguous,
-                "agrees": frame.ok,
-            }
+            {"frame": frame.frame, "reference": self.reference}
+            | {title: getattr(frame, name) for title, name in columns.items()}
             for frame in self.frames
         ]
 
@@ -249,11 +237,8 @@ def _compare(
 ) -> FrameComparison:
     theirs = _of_first(evaluate(calculator, stored), len(mine.forces))
     third = _of_first(evaluate(other, stored), len(mine.forces)) if other is not None else None
-
     scale = _Scales.of(system, simulation, stored, mine, theirs)
-    energy, energy_reference = float(mine.energy), theirs["energy"]
-    energy_rel = _over(abs(energy - energy_reference), max(abs(energy_reference), 1e-3 * scale.energy))
-    force_max = float(np.abs(np.asarray(mine.forces) - theirs["forces"]).max(initial=0.0))
+    energy_rel, force_max = _off(mine, theirs, scale.energy)
     stress_max = stress_rel = None
     if theirs["stress"] is not None:
         stress_max = float(np.abs(np.asarray(mine.stress) - theirs["stress"]).max())
@@ -263,29 +248,21 @@ def _compare(
         tolerance = ENERGY_PAIR if system.spec.cutoff is not None else ENERGY_MANY_BODY
         ok = energy_rel <= tolerance and force_rel <= FORCE and (stress_rel is None or stress_rel <= FORCE)
     else:
-        ok = (
-            abs(energy - energy_reference) <= ROUNDINGS * scale.energy_expected
-            and force_max <= ROUNDINGS * scale.force_expected
-        )
+        close = abs(float(mine.energy) - theirs["energy"]) <= ROUNDINGS * scale.energy_expected
+        ok = close and force_max <= ROUNDINGS * scale.force_expected
+    expected = scale.energy_expected, scale.force_expected
+    thirds = (None, None) if third is None else _off(mine, third, scale.energy)
     return FrameComparison(
-        name,
-        energy,
-        energy_reference,
-        energy_rel,
-        force_max,
-        scale.force,
-        force_rel,
-        stress_max,
-        stress_rel,
-        scale.energy_expected,
-        scale.force_expected,
-        _over(abs(energy - third["energy"]), max(abs(third["energy"]), 1e-3 * scale.energy))
-        if third
-        else None,
-        float(np.abs(np.asarray(mine.forces) - third["forces"]).max(initial=0.0)) if third else None,
-        scale.ambiguous,
-        ok,
-    )
+        name, float(mine.energy), theirs["energy"], energy_rel, force_max, scale.force, force_rel, stress_max,
+        stress_rel, *expected, *thirds, scale.ambiguous, ok,
+    )  # fmt: skip
+
+
+def _off(mine: Evaluation, other: Mapping[str, Any], scale: float) -> tuple[float, float]:
+    """(relative difference of the energies, largest of a force component)."""
+    energy, force = float(mine.energy), np.abs(np.asarray(mine.forces) - other["forces"])
+    relative = _over(abs(energy - other["energy"]), max(abs(other["energy"]), 1e-3 * scale))
+    return relative, float(force.max(initial=0.0))
 
 
 def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
@@ -356,14 +333,13 @@ class _Scales:
             step = 1e-4 * form.r_cut
             energies[rows], forces[rows] = np.abs(u), np.abs(du)
             stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
-        per_atom = np.zeros(len(atoms))
-        np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        summed = np.zeros(len(atoms))
-        np.add.at(summed, i, energies)
+        squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
+        per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
         energy_expected = np.sqrt(
-            ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum() + (unit * summed.sum()) ** 2
+            ((forces * shift) ** 2).sum()
+            + ((12.0 * unit * energies) ** 2).sum()
+            + (unit * energies.sum()) ** 2
         )
         force = max(largest_force, float(forces.max(initial=0.0)))
         return cls(
@@ -543,3 +519,61 @@ def _growth(position: list[float]) -> float:
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
     return float(np.exp(np.polyfit(np.arange(len(tail)), np.log(tail), 1)[0]))
+
+
+# --- a few atoms of a large system with all their neighbors: small enough to be evaluated by anybody -----
+
+#: Places at random, and atoms nearest to each whose energies and forces are compared.
+PLACES, ATOMS = 8, 32
+
+
+def neighborhoods(
+    atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
+) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
+    """Groups of atoms at random places, each with every atom within reach of one of them, as a free cluster.
+
+    What a pair potential of that reach gives the chosen atoms in the cluster is what it gives them in the
+    whole system, so a difference there is one of the whole. Found by a tree over the atoms and their images,
+    which shares nothing with mdnum's cell lists.
+
+    Args:
+        atoms: the whole, of any cell; coordinates may lie outside of it.
+        reach: no interaction is longer, length.
+        places, count: how many groups, and atoms in each at most, all within reach of its place.
+        seed: of the random places, each an atom.
+
+    Yields:
+        (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
+    """
+    x, origin = _with_images(atoms, reach)
+    tree = KDTree(x)
+    # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
+    reach = reach * (1 + 1e-9)
+    rng = np.random.default_rng(seed)
+    numbers = atoms.numbers
+    for center in rng.choice(len(atoms), size=min(places, len(atoms)), replace=False):
+        # the first rows of x are the atoms themselves
+        near = np.array(tree.query_ball_point(x[center], reach))
+        chosen = near[np.argsort(((x[near] - x[center]) ** 2).sum(axis=1), kind="stable")[:count]]
+        around = np.concatenate([np.array(rows) for rows in tree.query_ball_point(x[chosen], reach)])
+        rows = np.concatenate([chosen, np.setdiff1d(around, chosen)])
+        yield Atoms(numbers=numbers[origin[rows]], positions=x[rows]), origin[chosen]
+
+
+def _with_images(atoms: Atoms, reach: float) -> tuple[ndarray, ndarray]:
+    """Positions in the box, then their images out to twice the reach beyond its faces; whose each is."""
+    cell = complete_cell(np.where(atoms.pbc[:, None], atoms.cell, 0.0))
+    inverse = np.linalg.inv(cell)
+    x = atoms.positions
+    fractional = x @ inverse
+    x = x - np.where(atoms.pbc, np.floor(fractional), 0.0) @ cell
+    fractional = x @ inverse
+    margin = 2.001 * reach * np.linalg.norm(inverse, axis=0)
+    origin = np.arange(len(x))
+    for axis in np.flatnonzero(atoms.pbc):
+        low, high = fractional[:, axis] < margin[axis], fractional[:, axis] >= 1 - margin[axis]
+        shift = np.eye(3)[axis]
+        fractional = np.concatenate([fractional, fractional[low] + shift, fractional[high] - shift])
+        x = np.concatenate([x, x[low] + cell[axis], x[high] - cell[axis]])
+        origin = np.concatenate([origin, origin[low], origin[high]])
+    return x, origin

@@ -10,7 +10,8 @@ F_i += g, F_j -= g, stress = sum(g outer d) / volume.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, cast
@@ -85,34 +86,45 @@ class Model(Protocol):
         ...
 
 
-class OnNeighborList(Calculator):
-    """An ASE calculator for a model of edges.
+class ClassicalCalculator(Calculator):
+    """An ASE calculator with energies, forces and stress, and no electrons: the free energy is the energy."""
+
+    implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
+    nolabel = True
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        """Evaluate (see ase.calculators.calculator.Calculator)."""
+        super().calculate(atoms, properties or ["energy"], system_changes)
+        results = self.evaluated(cast(Atoms, self.atoms), system_changes)
+        self.results = {"free_energy": results["energy"], **results}
+
+    def evaluated(self, atoms: Atoms, changes: Sequence[str]) -> dict[str, Any]:
+        """Results of atoms, given what changed since the last ones."""
+        raise NotImplementedError
+
+
+class OnNeighborList(ClassicalCalculator):
+    """An ASE calculator for a model of edges, on ASE's neighbor list.
 
     Args:
         model: what to evaluate.
     """
 
-    implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
-    nolabel = True
-
     def __init__(self, model: Model, **kwargs: Any):
         super().__init__(**kwargs)
         self.model = model
 
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate the model on ASE's neighbor list (see ase.calculators.calculator.Calculator)."""
-        super().calculate(atoms, properties or ["energy"], system_changes)
-        atoms = cast(Atoms, self.atoms)
+    def evaluated(self, atoms, changes):
         edges = edges_of(atoms, self.model.reach)
         energies, gradient = self.model(edges)
         i, j, d, n = edges.i, edges.j, edges.d, len(atoms)
         forces = np.stack(
             [np.bincount(i, gradient[:, k], n) - np.bincount(j, gradient[:, k], n) for k in range(3)], axis=1
         )
-        energy = float(energies.sum())
-        self.results = {"energy": energy, "free_energy": energy, "energies": energies, "forces": forces}
+        results = {"energy": float(energies.sum()), "energies": energies, "forces": forces}
         if atoms.cell.rank == 3:
-            self.results["stress"] = full_3x3_to_voigt_6_stress(gradient.T @ d / atoms.get_volume())
+            results["stress"] = full_3x3_to_voigt_6_stress(gradient.T @ d / atoms.get_volume())
+        return results
 
 
 @dataclass(frozen=True)
@@ -257,10 +269,6 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
     return np.concatenate(first).astype(int), np.concatenate(second).astype(int)
 
 
-def _only(edges: Edges, keep: ndarray) -> Edges:
-    return Edges(edges.symbols, edges.i[keep], edges.j[keep], edges.d[keep], edges.r[keep])
-
-
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """cos of the angle between edges e and f, with its gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
@@ -274,8 +282,27 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
         target[:, axis] += np.bincount(rows, values[:, axis], len(target))
 
 
+class _OneSpecies(ABC):
+    """A model of the edges within its reach, of whatever species."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """No edge longer than this matters."""
+
+    @abstractmethod
+    def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
+        """Energies and gradient as of a `Model`, of edges within reach, with their directions."""
+
+    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
+        gradient, inside = np.zeros_like(edges.d), edges.r < self.reach
+        near = Edges(edges.symbols, edges.i[inside], edges.j[inside], edges.d[inside], edges.r[inside])
+        energies, gradient[inside] = self.within(near, near.d / near.r[:, None])
+        return energies, gradient
+
+
 @dataclass(frozen=True)
-class StillingerWeberModel:
+class StillingerWeberModel(_OneSpecies):
     """Stillinger and Weber's silicon (Phys. Rev. B 31, 5262, 1985, equations 2.1 to 2.5).
 
     Attributes: the constants of the paper; epsilon in eV, sigma in Å.
@@ -296,9 +323,7 @@ class StillingerWeberModel:
     def reach(self) -> float:
         return self.a * self.sigma
 
-    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
-        everything, inside = edges, edges.r < self.reach
-        edges = _only(edges, inside)
+    def within(self, edges, unit):
         x = edges.r / self.sigma
         tail = np.exp(1.0 / (x - self.a))
         dtail = -tail / (x - self.a) ** 2
@@ -306,7 +331,6 @@ class StillingerWeberModel:
         dcore = -self.p * self.B * x ** (-self.p - 1) + self.q * x ** (-self.q - 1)
         pair = 0.5 * self.epsilon * self.A * core * tail
         slope = 0.5 * self.epsilon * self.A * (dcore * tail + core * dtail) / self.sigma
-        unit = edges.d / edges.r[:, None]
         inner = slope[:, None] * unit
 
         e, f = _triplets(edges)
@@ -321,15 +345,12 @@ class StillingerWeberModel:
         bend = strength * excess**2
         _add_rows(inner, e, twist[:, None] * dce + (bend * darm[e] * arm[f])[:, None] * unit[e])
         _add_rows(inner, f, twist[:, None] * dcf + (bend * arm[e] * darm[f])[:, None] * unit[f])
-
         n = len(edges.symbols)
-        gradient = np.zeros_like(everything.d)
-        gradient[inside] = inner
-        return np.bincount(edges.i, pair, n) + np.bincount(edges.i[e], angle, n), gradient
+        return np.bincount(edges.i, pair, n) + np.bincount(edges.i[e], angle, n), inner
 
 
 @dataclass(frozen=True)
-class TersoffModel:
+class TersoffModel(_OneSpecies):
     """Tersoff's bond order for one species (Phys. Rev. B 38, 9902, 1988), in LAMMPS's names.
 
     Attributes: the 14 constants of a LAMMPS or ASE entry; the default is Tersoff's T3 silicon.
@@ -362,10 +383,8 @@ class TersoffModel:
             np.where(within, -0.25 * np.pi / self.D * np.cos(phase), 0.0),
         )
 
-    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
-        everything, inside = edges, edges.r < self.reach
-        edges = _only(edges, inside)
-        r, unit = edges.r, edges.d / edges.r[:, None]
+    def within(self, edges, unit):
+        r = edges.r
         taper, dtaper = self._taper(r)
 
         # zeta of edge e: a sum over the other edges f of the same atom
@@ -400,7 +419,4 @@ class TersoffModel:
         along_f = along_f + (taper[f] * grow * dg)[:, None] * dcf
         _add_rows(inner, e, weight[:, None] * along_e)
         _add_rows(inner, f, weight[:, None] * along_f)
-
-        gradient = np.zeros_like(everything.d)
-        gradient[inside] = inner
-        return np.bincount(edges.i, bond, len(edges.symbols)), gradient
+        return np.bincount(edges.i, bond, len(edges.symbols)), inner

@@ -22,24 +22,15 @@ from mdnum.references.conformance.peers import known
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
 from mdnum.systems import System
 
-AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = (
-    "agrees",
-    "differs at the cutoff",
-    "differs",
-    "failed",
-    "not asked",
-)
+AGREES, AT_THE_CUTOFF, DIFFERS = "agrees", "differs at the cutoff", "differs"
+FAILED, NOT_ASKED = "failed", "not asked"
 _SINGLE = 2.0**-24
 _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them.
-
-    Attributes:
-        listed: the list, made anew at every question.
-    """
+    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them."""
 
     listed: PairList
 
@@ -130,18 +121,15 @@ def own_searches(system: System) -> tuple[Search, ...]:
     dtype = system.spec.precision.decision
     unit = _SINGLE if "float32" in (dtype, system.spec.precision.state) else 2.0**-53
 
-    def own(name: str, search: Callable[..., Any], affords: float = 1.0) -> Search:
-        limits = ListLimits(minimum_image=True)
-        return Search(
-            PairList(
-                name, lambda: search, package="mdnum", full=False, unit=unit, limits=limits, affords=affords
-            )
-        )
-
-    return (
-        own("mdnum force loop", _force_loop(system)),
-        own("mdnum, host list", _listed("host", compare, dtype)),
-        own("mdnum, jax-md list", _listed("jax-md", compare, dtype), affords=0),
+    searches = {
+        "mdnum force loop": (_force_loop(system), 1.0),
+        "mdnum, host list": (_listed("host", compare, dtype), 1.0),
+        "mdnum, jax-md list": (_listed("jax-md", compare, dtype), 0.0),
+    }
+    own = {"package": "mdnum", "full": False, "unit": unit, "limits": ListLimits(minimum_image=True)}
+    return tuple(
+        Search(PairList(name, lambda search=search: search, affords=affords, **own))
+        for name, (search, affords) in searches.items()
     )
 
 
@@ -204,8 +192,7 @@ class SearchResult:
         verdict: "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed";
             "not asked": see note.
         pairs: pairs found inside the cutoff.
-        missing: pairs of the oracle that it does not have, beyond its rounding.
-        extra: pairs that the oracle does not have, beyond its rounding.
+        missing, extra: pairs that only the oracle has, or only the search, beyond its rounding.
         borderline: pairs decided otherwise than by real arithmetic, within its rounding.
         effective: the cutoff it acts on.
         seconds: time of the first search, compiling included.
@@ -253,14 +240,11 @@ class PairsReport:
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per search."""
+        counts = ("pairs", "missing", "extra", "borderline")
         return [
-            {
-                "search": one.name,
-                "version": one.version,
-                "pairs": None if one.note else one.pairs,
-                "missing": None if one.note else one.missing,
-                "extra": None if one.note else one.extra,
-                "borderline": None if one.note else one.borderline,
+            {"search": one.name, "version": one.version}
+            | {name: None if one.note else getattr(one, name) for name in counts}
+            | {
                 "stops counting": one.effective.stops if one.effective else None,
                 "compares": one.effective.comparison if one.effective else None,
                 "ms, first call": None if one.note else round(1e3 * one.seconds, 2),
@@ -279,10 +263,9 @@ def check_pairs(
 ) -> PairsReport:
     """Compare the pairs that every search finds inside the cutoff with brute force.
 
-    A system with a radius for each pair of species asks a search once per radius and keeps the pairs it
-    applies to. The oracle follows the comparison of the system file (`<` or `<=`), decided in rational
-    arithmetic near the threshold; a search that decides such a pair otherwise is "at the cutoff", which is
-    rounding or convention and not an error.
+    A search is asked once for each radius that pairs of species have. The oracle follows the comparison of
+    the system file, decided in rational arithmetic near the threshold; a search that decides such a pair
+    otherwise is "at the cutoff", which is rounding or convention and not an error.
 
     Args:
         system: what to check.
@@ -325,10 +308,8 @@ def check_pairs(
             return replace(result, verdict=FAILED, note=note)
         missing, extra, borderline = counts.tolist()
         verdict = DIFFERS if missing or extra else AT_THE_CUTOFF if borderline else AGREES
-        return SearchResult(
-            search.name, search.listed.version, verdict, pairs, missing, extra, borderline, stops, seconds,
-            search.ours,
-        )  # fmt: skip
+        counted = {"pairs": pairs, "missing": missing, "extra": extra, "borderline": borderline}
+        return replace(result, verdict=verdict, effective=stops, seconds=seconds, **counted)
 
     return PairsReport(
         system.name,
@@ -396,16 +377,12 @@ def effective_cutoff(
 ) -> EffectiveCutoff:
     """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
 
-    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself
-    and nothing is lost before the search sees it: what is measured is the search alone. In a periodic box
-    (5 r_cut wide) its own wrapping counts too.
+    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself and
+    what is measured is the search alone; in a periodic box (5 r_cut wide) its own wrapping counts too.
 
     Args:
-        search: what to ask.
-        r_cut: the cutoff to ask for.
         periodic: in a periodic box, as in a simulation; else free atoms.
-        oriented: how many randomly oriented pairs to place within 3 ulps of r_cut; default what the
-            search can afford.
+        oriented: randomly oriented pairs to place within 3 ulps of r_cut; default what the search can afford.
         seed: of the orientations.
     Error: none, doubles are walked over one by one in the end; it assumes that a search which counts a
         distance counts the smaller ones (checked at relative distances of 1e-5).

@@ -46,11 +46,6 @@ class MdProgram:
     frame: ReferenceFrame | None = None
 
     @property
-    def name(self) -> str:
-        """Of the system."""
-        return self.simulation.system.name
-
-    @property
     def size(self) -> int:
         """Number of atoms."""
         return self.simulation.atoms
@@ -64,11 +59,6 @@ class MdProgram:
     def timestep(self) -> float:
         """In the user's unit of time."""
         return float(self.simulation.system.spec.dynamics.timestep)
-
-    @property
-    def unit(self) -> str:
-        """Of lengths."""
-        return self.simulation.units.length
 
     @property
     def scale(self) -> float:

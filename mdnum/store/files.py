@@ -39,8 +39,6 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turns what the operating system says about path into a FolderError with a remedy."""
-    from mdnum.store.files import resumable
-
     try:
         yield
     except OSError as error:
@@ -67,8 +65,13 @@ def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
         if error.errno == errno.ELOOP:
             raise _linked(path) from None
         raise
-    _refuse(os.fstat(handle), path, mode != "rb", handle)
-    return os.fdopen(handle, mode)
+    file = os.fdopen(handle, mode)
+    try:
+        _refuse(os.fstat(handle), path, mode != "rb")
+    except FolderError:
+        file.close()
+        raise
+    return file
 
 
 def refuse_link(path: Path, in_place: bool = False) -> None:
@@ -130,10 +133,8 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
     Raises:
         FolderError: the disk is full, or the folder cannot be written; nothing is left behind.
     """
-    from mdnum.store import files as manifest
-
     # first both digests, then the file: it agrees with the manifest wherever a kill falls
-    manifest.foretell(path, manifest.digest_of(data))
+    foretell(path, digest_of(data))
     with replacing(path) as file:
         file.write(data)
 
@@ -162,22 +163,14 @@ def read_text(path: Path) -> str:
         raise FolderError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
-def _refuse(seen: os.stat_result, path: Path, in_place: bool, handle: int | None = None) -> None:
-    refused = None
+def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
     if stat.S_ISLNK(seen.st_mode):
-        refused = _linked(path)
-    elif not stat.S_ISREG(seen.st_mode):
-        refused = FolderError("is no plain file", remedy="Remove it, or use another folder", where=str(path))
-    elif in_place and seen.st_nlink > 1:
-        refused = FolderError(
-            "has a second name (a hard link), under which it would be changed too",
-            remedy="Put a copy in its place",
-            where=str(path),
-        )
-    if refused is not None:
-        if handle is not None:
-            os.close(handle)
-        raise refused
+        raise _linked(path)
+    if not stat.S_ISREG(seen.st_mode):
+        raise FolderError("is no plain file", remedy="Remove it, or use another folder", where=str(path))
+    if in_place and seen.st_nlink > 1:
+        seen_so = "has a second name (a hard link), under which it would be changed too"
+        raise FolderError(seen_so, remedy="Put a copy in its place", where=str(path))
 
 
 def _linked(path: Path) -> FolderError:
@@ -193,7 +186,6 @@ def _linked(path: Path) -> FolderError:
 NAME = "manifest.json"
 #: May be missing.
 ABSENT = ""
-_CHUNK = 1 << 20
 # listed from their first write on; scripts and structures among them, which a page or a person goes by
 _FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 # what a command goes on from, by the world of the folder
@@ -236,7 +228,7 @@ def digest_of_file(file: BinaryIO) -> str:
     """Digest of all bytes of an open file."""
     file.seek(0)
     found = hashlib.blake2b(digest_size=16)
-    while chunk := file.read(_CHUNK):
+    while chunk := file.read(1 << 20):
         found.update(chunk)
     return found.hexdigest()
 

@@ -19,11 +19,12 @@ import numpy as np
 import pyarrow as pa
 
 from mdnum.errors import FolderError, MdnumError
+from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
 from mdnum.store.files import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
-from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -243,10 +244,6 @@ class RunFolder:
                 file.close()
         self._log = self._lock = None
 
-    def write_system(self, toml: str) -> None:
-        """Writes system.toml, the fully resolved system."""
-        write_text(self.path / "system.toml", toml)
-
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes summary.json (NaN and infinity, which JSON does not have, become null)."""
         self._write_json("summary.json", summary)
@@ -367,7 +364,7 @@ class RunFolder:
         empty = [key for key in table.column_names if table[key].null_count]
         if empty:
             raise FolderError(f"column {empty[0]!r} of table {name!r} has gaps", where=str(self.path))
-        return {key: table[key].to_numpy() for key in table.column_names}
+        return {key: as_numpy(table[key]) for key in table.column_names}
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""
@@ -624,7 +621,7 @@ class RunFolder:
         self._lock = lock
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
-        text = json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         write_text(self.path / name, text + "\n")
 
     def _read_json(self, name: str) -> dict[str, Any]:
@@ -714,17 +711,3 @@ def _again(path: Path) -> str:
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
         return f"Nothing of it was kept: give the `{verb}` command again"
     return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "__array__"):
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value

@@ -20,150 +20,125 @@ from mdnum.store.files import disk_errors, opened, replacing, subfolder
 _FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
 
 
-def _columns(**columns: pa.DataType) -> Mapping[str, pa.DataType]:
-    return MappingProxyType(columns)
+def _named(kind: pa.DataType, names: str) -> dict[str, pa.DataType]:
+    return dict.fromkeys(names.split(), kind)
+
+
+#: The type of a column goes by its name; float64 where it is not here, and a table may differ.
+_TYPES: Mapping[str, pa.DataType] = {
+    **_named(
+        _INT,
+        "step pairs epoch start length pairs_listed capacity occupancy lost_pairs lost_pair_steps "
+        "first_lost_step cross also history runs cluster first_bit steps horizon overflow underflow "
+        "subnormal scaled_overflow scaled_underflow frame number near frames at_risk counted between within "
+        "flips pairs_a pairs_b only_a only_b passed refused skipped atoms begin end",
+    ),
+    **_named(_SHORT, "left i j contacts iterations ball iteration atom rank rule fewest most"),
+    **_named(_BOOL, "entered ambiguous dangerous stopped differs contact inside wrong grazing began ended"),
+    **_named(
+        _TEXT,
+        "reason variant run confirmed digest program flags reduction hash failed policy state force "
+        "decision accumulate asked part curve line residue first second area code case text script",
+    ),
+}
+
+
+def _columns(names: str, **types: pa.DataType) -> Mapping[str, pa.DataType]:
+    return MappingProxyType({name: types.get(name, _TYPES.get(name, _FLOAT)) for name in names.split()})
 
 
 #: The columns of each table; a writer may add more.
 COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
     {
         "series": _columns(
-            step=_INT, time=_FLOAT, potential=_FLOAT, kinetic=_FLOAT, total=_FLOAT, temperature=_FLOAT,
-            pressure=_FLOAT, pairs=_INT, entered=_SHORT, left=_SHORT, displacement=_FLOAT,
-            energy_jump=_FLOAT, ambiguous=_SHORT, min_margin=_FLOAT, conserved=_FLOAT,
+            "step time potential kinetic total temperature pressure pairs entered left displacement "
+            "energy_jump ambiguous min_margin conserved",
+            entered=_SHORT,
+            ambiguous=_SHORT,
         ),
         "flips": _columns(
-            step=_INT, i=_SHORT, j=_SHORT, entered=_BOOL, distance=_FLOAT, margin=_FLOAT,
-            radial_speed=_FLOAT, energy_jump=_FLOAT, force_jump=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+            "step i j entered distance margin radial_speed energy_jump force_jump bound ambiguous"
         ),
         "epochs": _columns(
-            epoch=_INT, start=_INT, length=_INT, displacement=_FLOAT, skin_consumed=_FLOAT,
-            pairs_listed=_INT, capacity=_INT, occupancy=_INT, reason=_TEXT, dangerous=_BOOL,
-            lost_pairs=_INT, lost_pair_steps=_INT, first_lost_step=_INT, build_ms=_FLOAT,
-            margin=_FLOAT,
+            "epoch start length displacement skin_consumed pairs_listed capacity occupancy reason dangerous "
+            "lost_pairs lost_pair_steps first_lost_step build_ms margin",
         ),
         "steps": _columns(
-            step=_INT, time=_FLOAT, contacts=_SHORT, entered=_SHORT, left=_SHORT, iterations=_SHORT,
-            reason=_TEXT, residual=_FLOAT, stop_margin=_FLOAT, min_margin=_FLOAT, ambiguous=_SHORT,
-            mean_height=_FLOAT, energy=_FLOAT,
+            "step time contacts entered left iterations reason residual stop_margin min_margin ambiguous "
+            "mean_height energy",
+            entered=_SHORT,
+            ambiguous=_SHORT,
         ),
-        "contacts": _columns(
-            step=_INT, ball=_SHORT, entered=_BOOL, height=_FLOAT, margin=_FLOAT, velocity=_FLOAT,
-            bound=_FLOAT, ambiguous=_BOOL,
-        ),
-        "solver": _columns(
-            step=_INT, ball=_SHORT, iteration=_SHORT, residual=_FLOAT, margin=_FLOAT, stopped=_BOOL,
-            reason=_TEXT,
-        ),
-        "heights": _columns(step=_INT, ball=_SHORT, y=_FLOAT, v=_FLOAT),
-        "separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
+        "contacts": _columns("step ball entered height margin velocity bound ambiguous"),
+        "solver": _columns("step ball iteration residual margin stopped reason"),
+        "heights": _columns("step ball y v"),
+        "separations": _columns("variant step separation"),
         "separation": _columns(
-            step=_INT, time=_FLOAT, free=_FLOAT, imposed=_FLOAT, back=_FLOAT, cross=_INT, overridden=_FLOAT,
-            furthest=_FLOAT, energy_a=_FLOAT, energy_b=_FLOAT, energy_imposed=_FLOAT,
+            "step time free imposed back cross overridden furthest energy_a energy_b energy_imposed"
         ),
-        "cross_flips": _columns(
-            step=_INT, i=_SHORT, j=_SHORT, differs=_BOOL, run=_TEXT, entered=_BOOL, margin=_FLOAT,
-            bound=_FLOAT,
-        ),
-        "ambiguous_pairs": _columns(run=_TEXT, step=_INT, i=_SHORT, j=_SHORT, margin=_FLOAT, bound=_FLOAT),
-        "around": _columns(step=_INT, run=_TEXT, ball=_SHORT, y=_FLOAT, v=_FLOAT, contact=_BOOL),
-        "neighborhood": _columns(
-            atom=_SHORT, x=_FLOAT, y=_FLOAT, z=_FLOAT, dx=_FLOAT, dy=_FLOAT, dz=_FLOAT,
-        ),
+        "cross_flips": _columns("step i j differs run entered margin bound"),
+        "ambiguous_pairs": _columns("run step i j margin bound"),
+        "around": _columns("step run ball y v contact"),
+        "neighborhood": _columns("atom x y z dx dy dz"),
         "boundaries": _columns(
-            below=_FLOAT, above=_FLOAT, step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, also=_INT,
-            margin_below=_FLOAT, margin_above=_FLOAT, bound=_FLOAT, loss_below=_FLOAT, loss_above=_FLOAT,
-            jump=_FLOAT, energy_below=_FLOAT, energy_above=_FLOAT, separation=_FLOAT, confirmed=_TEXT,
+            "below above step i j inside also margin_below margin_above bound loss_below loss_above jump "
+            "energy_below energy_above separation confirmed",
         ),
-        "intervals": _columns(
-            low=_FLOAT, high=_FLOAT, history=_INT, digest=_TEXT, loss_low=_FLOAT, loss_high=_FLOAT,
-            runs=_INT, gap=_FLOAT,
-        ),
-        "points": _columns(at=_FLOAT, history=_INT, loss=_FLOAT, energy=_FLOAT),
+        "intervals": _columns("low high history digest loss_low loss_high runs gap"),
+        "points": _columns("at history loss energy"),
         "variants": _columns(
-            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, first_bit=_INT,
-            steps=_INT, separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
+            "variant program flags reduction cluster first_bit steps separation seconds hash failed"
         ),
-        "variant_separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
+        "variant_separations": _columns("variant step separation"),
         "policies": _columns(
-            policy=_TEXT, state=_TEXT, force=_TEXT, decision=_TEXT, accumulate=_TEXT, horizon=_INT, i=_SHORT,
-            j=_SHORT, margin=_FLOAT, gain=_FLOAT, closer_bits=_FLOAT, growth_rate=_FLOAT, failed=_TEXT,
+            "policy state force decision accumulate horizon i j margin gain closer_bits growth_rate failed"
         ),
-        "policy_separations": _columns(policy=_TEXT, step=_INT, separation=_FLOAT),
-        "ambiguous": _columns(
-            policy=_TEXT, step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, margin=_FLOAT, bound=_FLOAT,
-            exact=_FLOAT, wrong=_BOOL,
-        ),
-        "reach": _columns(
-            step=_INT, positive=_FLOAT, negative=_FLOAT, i=_SHORT, j=_SHORT, furthest=_FLOAT,
-        ),
-        "foretold": _columns(
-            asked=_TEXT, step=_INT, i=_SHORT, j=_SHORT, amplitude=_FLOAT, margin=_FLOAT, ulps=_FLOAT,
-        ),
-        "growth": _columns(
-            horizon=_INT, step=_INT, onto_positions=_FLOAT, onto_velocities=_FLOAT, size=_FLOAT, speed=_FLOAT,
-        ),
-        "flip_contributions": _columns(
-            step=_INT, i=_SHORT, j=_SHORT, entered=_BOOL, margin=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
-            radial_speed=_FLOAT, weight=_FLOAT, grazing=_BOOL,
-        ),
-        "trust": _columns(horizon=_INT),
+        "policy_separations": _columns("policy step separation"),
+        "ambiguous": _columns("policy step i j inside margin bound exact wrong"),
+        "reach": _columns("step positive negative i j furthest"),
+        "foretold": _columns("asked step i j amplitude margin ulps"),
+        "growth": _columns("horizon step onto_positions onto_velocities size speed"),
+        "flip_contributions": _columns("step i j entered margin bound ambiguous radial_speed weight grazing"),
+        "trust": _columns("horizon"),
         "scaling": _columns(
-            horizon=_INT, overflow=_INT, underflow=_INT, subnormal=_INT, largest=_FLOAT, smallest=_FLOAT,
-            scaled_overflow=_INT, scaled_underflow=_INT,
+            "horizon overflow underflow subnormal largest smallest scaled_overflow scaled_underflow"
         ),
-        "curves": _columns(part=_TEXT, curve=_TEXT, line=_TEXT, x=_FLOAT, y=_FLOAT),
+        "curves": _columns("part curve line x y"),
         "energies": _columns(
-            run=_TEXT, step=_INT, time=_FLOAT, potential=_FLOAT, kinetic=_FLOAT, total=_FLOAT, entered=_INT,
-            left=_INT, jumps=_FLOAT, rest=_FLOAT,
+            "run step time potential kinetic total entered left jumps rest", entered=_INT, left=_INT
         ),
         "crossings": _columns(
-            run=_TEXT, step=_INT, i=_INT, j=_INT, rank=_INT, entered=_BOOL, threshold=_FLOAT,
-            distance=_FLOAT, margin=_FLOAT, energy_jump=_FLOAT,
+            "run step i j rank entered threshold distance margin energy_jump", i=_INT, j=_INT, rank=_INT
         ),
         "frames": _columns(
-            rule=_SHORT, frame=_INT, number=_INT, time=_FLOAT, pairs=_INT, near=_INT, entered=_INT,
-            left=_INT, ambiguous=_INT, min_margin=_FLOAT, fewest=_SHORT, neighbors=_FLOAT, most=_SHORT,
+            "rule frame number time pairs near entered left ambiguous min_margin fewest neighbors most",
+            entered=_INT,
+            left=_INT,
+            ambiguous=_INT,
         ),
-        "members": _columns(rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, distance=_FLOAT),
-        "lifetimes": _columns(
-            rule=_SHORT, frames=_INT, time=_FLOAT, at_risk=_INT, survival=_FLOAT, error=_FLOAT,
-            intermittent=_FLOAT, residence=_FLOAT, again=_FLOAT,
-        ),
-        "neighbors": _columns(rule=_SHORT, neighbors=_INT, counted=_INT),
-        "residues": _columns(rule=_SHORT, residue=_TEXT, between=_INT, within=_INT),
-        "busiest": _columns(
-            rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, flips=_INT, inside=_INT, first=_TEXT, second=_TEXT,
-        ),
-        "apart": _columns(
-            frame=_INT, time=_FLOAT, time_b=_FLOAT, furthest=_FLOAT, typical=_FLOAT, atom=_SHORT,
-            pairs_a=_INT, pairs_b=_INT, only_a=_INT, only_b=_INT,
-        ),
+        "members": _columns("rule i j rank distance"),
+        "lifetimes": _columns("rule frames time at_risk survival error intermittent residence again"),
+        "neighbors": _columns("rule neighbors counted", neighbors=_INT),
+        "residues": _columns("rule residue between within"),
+        "busiest": _columns("rule i j rank flips inside first second", inside=_INT),
+        "apart": _columns("frame time time_b furthest typical atom pairs_a pairs_b only_a only_b"),
         "differing": _columns(
-            rule=_SHORT, frame=_INT, i=_SHORT, j=_SHORT, rank=_SHORT, inside=_TEXT, distance_a=_FLOAT,
-            distance_b=_FLOAT, margin_a=_FLOAT, margin_b=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+            "rule frame i j rank inside distance_a distance_b margin_a margin_b bound ambiguous", inside=_TEXT
         ),
-        "areas": _columns(
-            area=_TEXT, asked=_INT, passed=_INT, failed=_INT, refused=_INT, skipped=_INT,
-        ),
-        "failures": _columns(
-            code=_TEXT, area=_TEXT, case=_TEXT, atoms=_INT, steps=_INT, step=_INT, text=_TEXT, script=_TEXT,
-        ),
+        "areas": _columns("area asked passed failed refused skipped", asked=_INT, failed=_INT),
+        "failures": _columns("code area case atoms steps step text script"),
     }
-)  # fmt: skip
+)
 
 #: Tables that go by another world's name and have columns of their own, by world and name.
 _OWN: Mapping[tuple[str, str], Mapping[str, pa.DataType]] = MappingProxyType(
     {
         ("flips", "flips"): _columns(
-            rule=_SHORT, frame=_INT, i=_SHORT, j=_SHORT, rank=_SHORT, entered=_BOOL, distance=_FLOAT,
-            before=_FLOAT, margin=_FLOAT, margin_before=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+            "rule frame i j rank entered distance before margin margin_before bound ambiguous"
         ),
-        ("flips", "contacts"): _columns(
-            rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, begin=_INT, end=_INT, began=_BOOL, ended=_BOOL,
-        ),
+        ("flips", "contacts"): _columns("rule i j rank begin end began ended"),
     }
-)  # fmt: skip
+)
 
 
 def columns_of(world: str, table: str) -> Mapping[str, pa.DataType]:
@@ -419,12 +394,34 @@ class TableStream:
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    # a private copy: arrow would otherwise share the caller's memory until the flush
+    # by its buffers, since pa.array imports pandas, which takes half a second; and of a private copy: arrow
+    # would otherwise share the caller's memory until the flush
     values = np.array(values)
     if pa.types.is_string(kind):
-        return pa.array(values.tolist(), kind)
-    # NaN stays NaN (from_pandas would make it null); a float that is no integer is refused by the cast
-    return pa.array(values, from_pandas=False).cast(kind) if values.size else pa.array([], kind)
+        texts = [text.encode() for text in values.tolist()]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        return pa.StringArray.from_buffers(len(texts), pa.py_buffer(offsets), pa.py_buffer(b"".join(texts)))
+    held = np.packbits(values, bitorder="little") if values.dtype == bool else np.ascontiguousarray(values)
+    given = pa.from_numpy_dtype(values.dtype)
+    # a float that is no integer is refused by the cast
+    return pa.Array.from_buffers(given, len(values), [None, pa.py_buffer(held)]).cast(kind)
+
+
+def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
+    """A column without gaps as numpy, by its buffers: `to_numpy` imports pandas."""
+    parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
+    if pa.types.is_string(column.type):
+        return np.array([text for part in parts for text in part.to_pylist()], object)
+    kind = np.dtype(column.type.to_pandas_dtype())
+    read = [np.zeros(0, kind)]
+    for part in filter(len, parts):
+        if pa.types.is_boolean(column.type):
+            bits = np.frombuffer(part.buffers()[1], np.uint8)
+            values = np.unpackbits(bits, bitorder="little").astype(bool)
+        else:
+            values = np.frombuffer(part.buffers()[1], kind)
+        read.append(values[part.offset :][: len(part)])
+    return np.concatenate(read)
 
 
 @contextmanager

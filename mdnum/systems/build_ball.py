@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.ball import contacts, integrators, limits, stopping
+from mdnum.ball import limits, step, stopping
 from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
@@ -20,10 +20,10 @@ from mdnum.systems import ball
 from mdnum.systems.load import BallSystem, load
 
 _INTEGRATORS: Mapping[str, Any] = {
-    "explicit-euler": integrators.ExplicitEuler,
-    "semi-implicit-euler": integrators.SemiImplicitEuler,
-    "velocity-verlet": integrators.BallVerlet,
-    "event-located": integrators.EventLocated,
+    "explicit-euler": step.ExplicitEuler,
+    "semi-implicit-euler": step.SemiImplicitEuler,
+    "velocity-verlet": step.BallVerlet,
+    "event-located": step.EventLocated,
 }
 _RULES: Mapping[str, Any] = {
     "sum": stopping.GlobalSum,
@@ -81,8 +81,8 @@ def build_ball(
     if not isinstance(system, BallSystem):
         system = load(system, overrides, world="ball")
     variants = tuple(
-        BallVariant(variant.name, variant.changes, problem(variant.spec, steps, f"variant {variant.name!r}"))
-        for variant in system.variants
+        BallVariant(name, system.spec.variants[name], problem(spec, steps, f"variant {name!r}"))
+        for name, spec in system.variants.items()
     )
     return BallSimulation(system, problem(system.spec, steps, system.name), variants)
 
@@ -152,11 +152,11 @@ def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "st
 def _contact(spec: ball.BallSpec) -> Any:
     match table := spec.contact:
         case ball.PenaltyContact():
-            return contacts.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
+            return step.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
         case ball.ProjectionContact():
-            return contacts.Projection(table.k, table.alpha, _stop_rule(spec), table.restitution)
+            return step.Projection(table.k, table.alpha, _stop_rule(spec), table.restitution)
         case ball.ImpactContact():
-            return contacts.Impact(table.restitution, table.rest_speed)
+            return step.Impact(table.restitution, table.rest_speed)
 
 
 def _integrator(spec: ball.BallSpec) -> Any:
@@ -164,9 +164,9 @@ def _integrator(spec: ball.BallSpec) -> Any:
     if table.kind != "implicit-midpoint":
         return _INTEGRATORS[table.kind](table.timestep)
     if isinstance(spec.contact, ball.PenaltyContact):
-        return integrators.ImplicitMidpoint(table.timestep, _stop_rule(spec))
+        return step.ImplicitMidpoint(table.timestep, _stop_rule(spec))
     # without a contact force a step is a formula, and nothing is solved
-    return integrators.ImplicitMidpoint(table.timestep)
+    return step.ImplicitMidpoint(table.timestep)
 
 
 def _stop_rule(spec: ball.BallSpec) -> Any:

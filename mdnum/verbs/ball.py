@@ -117,7 +117,7 @@ def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Loss, derivatives, closed form and variants; and the separations from the variants."""
-    from mdnum.ball.compare import first_difference
+    from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
     problem, asked = simulation.problem, simulation.system.spec.gradient

@@ -8,12 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import BallDifference
-from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact, ExactPenalty
-from mdnum.ball.rollout import BallRun, residual_bound
-from mdnum.ball.state import Reason
-from mdnum.ball.stopping import FixedCount
+from mdnum.ball.rollout import BallDifference, BallRun, residual_bound
+from mdnum.ball.step import Penalty, Projection
+from mdnum.ball.stopping import FixedCount, Reason
 from mdnum.systems import ball
 from mdnum.systems.build_ball import BallSimulation, BallVariant
 from mdnum.systems.load import BallSystem

@@ -14,7 +14,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.store.tables import TableStream
+from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
 from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering
@@ -260,7 +260,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     def columns(name: str, part: int, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
         found: dict[str, list[np.ndarray]] = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
         for batch in streams[name].batches(["rule", *kinds]):
-            rows = {name: batch[name].to_numpy() for name in ("rule", *kinds)}
+            rows = {name: as_numpy(batch[name]) for name in ("rule", *kinds)}
             mine = rows["rule"] == rule
             if parts > 1:
                 mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part

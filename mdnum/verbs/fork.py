@@ -72,7 +72,7 @@ def fork(
 
     Returns:
         its result is a `mdnum.forks.Fork`, and where all choices were screened a list of
-        `mdnum.forks.screen.Screened`.
+        `mdnum.forks.pair.Screened`.
 
     Raises:
         InputError: the system cannot be run, the choice is unknown or does not apply to it, or something was
@@ -126,9 +126,9 @@ def fork_screen(
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a list of `mdnum.forks.screen.Screened`.
+        its result is a list of `mdnum.forks.pair.Screened`.
     """
-    from mdnum.forks.screen import screen
+    from mdnum.forks.pair import screen
     from mdnum.systems import load
 
     loaded: System | BallSystem = load(system, keep.get("overrides"))

@@ -21,7 +21,7 @@ from mdnum.verbs.frame import Answer, Keep, Outcome, View
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from mdnum.forks.variants import Variant
+    from mdnum.forks.processes import Variant
     from mdnum.systems import BallSystem, System
 
 TEXTS = Texts(__file__)
@@ -116,7 +116,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
     """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
-    from mdnum.forks.exact.bounds import certified_horizon
+    from mdnum.forks.certified import certified_horizon
     from mdnum.forks.exact.program import with_policy
     from mdnum.numerics import PrecisionPolicy
 
@@ -280,18 +280,18 @@ def fork_processes(
     Args:
         system: a loaded system, a shipped name or the path of a system file; pair potentials only.
         steps: of each program; default 200, or the system's own where they are fewer.
-        which: the variants; default `mdnum.forks.variants.VARIANTS`.
+        which: the variants; default `mdnum.forks.processes.VARIANTS`.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.variants.Variants`.
+        its result is a `mdnum.forks.processes.Variants`.
 
     Raises:
         InputError: the system cannot be run, or its potential is a many-body one.
         FolderError: the folder cannot be used.
         MdnumError: not one of the variants ran.
     """
-    from mdnum.forks.variants import VARIANTS, variants
+    from mdnum.forks.processes import VARIANTS, variants
 
     loaded = of_md(system, keep.get("overrides"), "processes", pairwise=True)
     last, asked = last_step(loaded, steps, PROGRAM_STEPS), VARIANTS if which is None else tuple(which)
@@ -312,7 +312,7 @@ def fork_processes(
         } for row in found.rows]  # fmt: skip
         answer.summary = basics(loaded, found.steps) | {
             "steps_asked": last, "reference": found.reference, "clusters": found.clusters,
-            "causes": [_cause(code, values) for code, values in found.causes],
+            "causes": [_cause(**cause) for cause in found.causes],
             "failed_variants": [row["variant"] for row in rows if row["failed"]], "variants": rows,
         }  # fmt: skip
         apart = {row.variant.name: row.separations for row in found.rows if len(row.separations)}
@@ -326,9 +326,9 @@ def fork_processes(
     return answer.outcome
 
 
-def _cause(code: str, values: Mapping[str, Any]) -> str:
-    what = {"what": TEXTS(f"what_{values['program']}")} if "program" in values else {}
-    return TEXTS(f"cause_{code}", **values, **what)
+def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: Any) -> str:
+    what = TEXTS(f"cause_of_{program}") if program else ""
+    return TEXTS(f"cause_{code}", names=", ".join(names), what=what, **values)
 
 
 def judge_processes(view: View) -> Verdict:

@@ -100,7 +100,7 @@ def fork_map(
             "failed_runs": found.failed, "confirm": confirm,
             "confirmed": sum(edge.confirmed is True for edge in found.boundaries) if confirm else None,
             "jump_largest": max(jumps, default=None),
-            "separation_largest": max((edge.apart for edge in found.boundaries), default=None),
+            "separation_largest": max((edge.separation for edge in found.boundaries), default=None),
             "boundaries": edges, "intervals": intervals, "unresolved": found.unresolved,
             "compiles": found.number.compiles,
         }  # fmt: skip
@@ -134,7 +134,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "inside": above.decided < below.decided if edge.channel == "stop" else bool(above.decided),
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,
         "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump, **gradients,
-        "energy_below": below.energy, "energy_above": above.energy, "separation": edge.apart,
+        "energy_below": below.energy, "energy_above": above.energy, "separation": edge.separation,
         "confirmed": {True: "yes", False: "no", None: "not asked"}[edge.confirmed],
     }  # fmt: skip
 
@@ -307,13 +307,13 @@ def fork_forecast(
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.forecast.Forecast`.
+        its result is a `mdnum.forks.linearized.Forecast`.
 
     Raises:
         InputError: the system cannot be run, its potential is a many-body one, or size is no length.
         FolderError: the folder cannot be used.
     """
-    from mdnum.forks.forecast import LINEAR, forecast
+    from mdnum.forks.linearized import LINEAR, forecast
     from mdnum.systems import build
 
     if not 0 < size < float("inf"):

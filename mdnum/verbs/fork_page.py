@@ -282,11 +282,10 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
     minimal = s.get("minimal")
     if minimal is None:
         return
-    pairs, values = minimal["pairs"] or (), {**minimal, "n": len(minimal["pairs"] or ())}
     if not minimal["tests"]:
-        yield TEXTS("minimal_refused", **values)
+        yield TEXTS("minimal_refused", **minimal)
         return
-    yield f"{TEXTS('minimal_' + minimal['reason'], **values)} {TEXTS('minimal_tests', **values)}"
+    yield f"{minimal['reason']} {TEXTS('minimal_tests', **minimal)}"
 
     def spells(pair: Mapping[str, Any]) -> str:
         spans = [
@@ -298,9 +297,10 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
         more = f", and {many(len(spans) - 3, 'time')} more" if len(spans) > 3 else ""
         return ", ".join(spans[:3]) + more
 
-    if pairs:
+    if minimal["pairs"]:
         yield table_of(
-            pairs, {"pair": lambda pair: f"{pair['i']}–{pair['j']}", "decided differently, steps": spells}
+            minimal["pairs"],
+            {"pair": lambda pair: f"{pair['i']}–{pair['j']}", "decided differently, steps": spells},
         )
 
 

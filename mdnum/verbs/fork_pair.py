@@ -339,7 +339,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 def _exponent(made: Fork) -> dict[str, Any]:
     """The largest Lyapunov exponent of run A beside the growth that was seen, or why there is none."""
-    from mdnum.forks.tangent import lyapunov
+    from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:
         return {"lyapunov": None, "lyapunov_reason": TEXTS(f"lyapunov_{name}", **values)}
@@ -397,4 +397,5 @@ def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
     except InputError as error:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
     pairs = found.pairs and [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs]
-    return {**vars(found), "pairs": pairs}
+    row = {**vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "pairs": pairs}
+    return row | {"reason": TEXTS(f"minimal_{found.code}", **row, n=len(pairs or ()))}

@@ -399,7 +399,7 @@ def _ball_system(
     if not isinstance(system, BallSystem):
         made = load(system, {**(overrides or {}), **changes}, world="ball")
     elif changes:
-        made = replace(system, spec=system.against(changes, "asked").variants[-1].spec)
+        made = replace(system, spec=system.against(changes, "asked").variants["asked"])
     return made if steps is None else made.for_steps(steps)
 
 

@@ -18,6 +18,7 @@ from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Table, curves, pairs
 from mdnum.report.words import count, many, number, percent, plain
+from mdnum.store.tables import as_numpy
 from mdnum.verbs.frame import View
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class RunView(View):
         """What the table of flips says, which may be larger than memory."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
         for batch in self.folder.batches("flips", _COLUMNS):
-            flips.take({name: batch[name].to_numpy() for name in _COLUMNS})
+            flips.take({name: as_numpy(batch[name]) for name in _COLUMNS})
         if not flips.nearest:
             flips.take(self.folder.read("flips", _COLUMNS, rows=1))
         return flips

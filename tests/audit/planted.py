@@ -12,6 +12,7 @@ from ase.build import bulk
 from ase.calculators.calculator import Calculator, all_changes
 
 from mdnum.audit.base import CheckResult, Observed
+from mdnum.audit.checks import CHECKS
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
 
@@ -37,6 +38,13 @@ def subject(make: Callable[[], Any], atoms: Atoms | None = None, order: int | No
     end = (R_CUT, ("Ar", "Ar"), order or 0, (0.0,) * 3, (0.0,) * 3, R_CUT, R_CUT, True, 1e-9)
     found.known["thresholds"] = [] if order is None else [PairThreshold(*end)]
     return found
+
+
+def asked(
+    name: str, make: Callable[[], Any], atoms: Atoms | None = None, order: int | None = 4
+) -> CheckResult:
+    """What a check finds of a calculator."""
+    return CHECKS[name]()(subject(make, atoms, order))
 
 
 def codes(result: CheckResult | Iterable[Observed]) -> dict[str, str]:
@@ -66,16 +74,17 @@ class Good(Calculator):
         self.results = {"energy": energy, "free_energy": energy, "forces": forces}
 
     def answer(self, atoms: Atoms) -> tuple[float, np.ndarray]:
-        positions, shifts = self.positions(atoms), self.shifts(atoms)
-        i, _, vectors = self.pairs(positions, shifts, atoms)
+        i, j, vectors = self.neighbors(atoms)
         distances = np.linalg.norm(vectors, axis=1)
         u, slope = self.pair(distances)
-        energy = 0.5 * float(np.sum(u))
-        along = (slope / distances)[:, None] * vectors
+        weight = self.weight(atoms, i, j)
         forces = np.zeros((len(atoms), 3))
         # each directed pair once: j's half of the force on i
-        np.add.at(forces, i, along)
-        return self.extra(atoms, energy, forces)
+        np.add.at(forces, i, (weight * slope / distances)[:, None] * vectors)
+        return self.extra(atoms, 0.5 * float(np.sum(weight * u)), forces)
+
+    def neighbors(self, atoms: Atoms) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
 
     def positions(self, atoms: Atoms) -> np.ndarray:
         """As the search wants them: wrapped along periodic axes."""
@@ -87,18 +96,13 @@ class Good(Calculator):
 
     def shifts(self, atoms: Atoms) -> np.ndarray:
         """All lattice vectors that can matter to wrapped positions."""
-        if not atoms.pbc.any():
-            return np.zeros((1, 3))
         rows = atoms.cell.array[atoms.pbc]
-        widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
-        counts = [range(-int(R_CUT / width) - 1, int(R_CUT / width) + 2) for width in widths]
-        return np.array(list(itertools.product(*counts))) @ rows
+        widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0) if len(rows) else ()
+        return _lattice(rows, [int(R_CUT / width) + 1 for width in widths])
 
     def pairs(self, positions, shifts, atoms) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        vectors = positions[None, :, None] + shifts[None, None] - positions[:, None, None]
-        squares = np.sum(vectors**2, axis=3)
-        i, j, image = np.nonzero((squares < R_CUT**2) & (squares > 1e-12))
-        return i, j, vectors[i, j, image]
+        i, j, _, vectors = near(positions, shifts, R_CUT)
+        return i, j, vectors
 
     def pair(self, distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energy of a pair, and its derivative by the distance."""
@@ -107,8 +111,30 @@ class Good(Calculator):
         slope = (-8 * (1 - x2) ** 3 * well - 3.2 * window) * distances / R_CUT**2
         return window * well, slope
 
+    def weight(self, atoms: Atoms, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        return np.ones(len(i))
+
     def extra(self, atoms: Atoms, energy: float, forces: np.ndarray) -> tuple[float, np.ndarray]:
         return energy, forces
+
+
+def _lattice(rows: np.ndarray, counts: list[int]) -> np.ndarray:
+    steps = np.array(list(itertools.product(*(range(-n, n + 1) for n in counts))))
+    return steps @ rows if len(rows) else np.zeros((1, 3))
+
+
+def near(positions: np.ndarray, shifts: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
+    """(i, j, number of the shift, vector) of all directed pairs within reach."""
+    vectors = positions[None, :, None] + shifts[None, None] - positions[:, None, None]
+    squares = np.sum(vectors**2, axis=3)
+    i, j, image = np.nonzero((squares < reach**2) & (squares > 1e-12))
+    return i, j, image, vectors[i, j, image]
+
+
+def inside(i: np.ndarray, j: np.ndarray, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    squares = np.sum(vectors**2, axis=1)
+    keep = (squares < R_CUT**2) & (squares > 1e-12)
+    return i[keep], j[keep], vectors[keep]
 
 
 def but(_base: type[Good] = Good, **methods: Any) -> type[Any]:
@@ -116,41 +142,55 @@ def but(_base: type[Good] = Good, **methods: Any) -> type[Any]:
     return type("Planted", (_base,), methods)
 
 
+def keeping(mask: Callable[..., np.ndarray], **more: Any) -> type[Any]:
+    """Keeps some of its pairs alone: mask(calculator, atoms, i, j, vectors)."""
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = Good.pairs(self, positions, shifts, atoms)
+        keep = mask(self, atoms, i, j, vectors)
+        return i[keep], j[keep], vectors[keep]
+
+    return but(pairs=pairs, **more)
+
+
+def adding(extra: Callable[[Atoms, float, np.ndarray], tuple[float, np.ndarray]]) -> type[Any]:
+    """Changes energy and forces when they are done."""
+    return but(extra=lambda self, atoms, energy, forces: extra(atoms, energy, forces))
+
+
+def through(energy: Callable[[float], Any] = float, forces: Callable[..., Any] = np.array) -> type[Any]:
+    """Energy, or forces, through another format."""
+    return adding(lambda atoms, e, f: (energy(e), forces(f)))
+
+
+# -- how a structure is written down ---------------------------------------------------------------
+
 #: Looks for neighbors one cell away and does not wrap: unwrapped coordinates lose theirs.
 OneImage = but(positions=lambda self, atoms: atoms.positions)
 
 
-class FaceDropped(Good):
-    """Puts atoms into cells of a grid by their wrapped fraction; one that rounds to 1 is in none."""
-
-    def pairs(self, positions, shifts, atoms):
-        i, j, vectors = super().pairs(positions, shifts, atoms)
-        # the same wrap in two steps, as codes do that work with fractions: -tiny becomes exactly 1
-        shares = atoms.cell.scaled_positions(atoms.positions)
-        lost = np.any(shares - np.floor(shares) >= 1.0, axis=1)
-        keep = ~lost[i] & ~lost[j]
-        return i[keep], j[keep], vectors[keep]
+def _in_a_cell(self, atoms, i, j, vectors):
+    # the same wrap in two steps, as codes do that work with fractions: -tiny becomes exactly 1
+    shares = atoms.cell.scaled_positions(atoms.positions)
+    lost = np.any(shares - np.floor(shares) >= 1.0, axis=1)
+    return ~lost[i] & ~lost[j]
 
 
-class FirstSix(Good):
-    """Keeps six neighbors of each atom, those that come first."""
-
-    def pairs(self, positions, shifts, atoms):
-        i, j, vectors = super().pairs(positions, shifts, atoms)
-        rank = np.arange(len(i)) - np.searchsorted(i, i)
-        keep = rank < 6
-        return i[keep], j[keep], vectors[keep]
+#: Puts atoms into cells of a grid by their wrapped fraction; one that rounds to 1 is in none.
+FaceDropped = keeping(_in_a_cell)
+#: Keeps six neighbors of each atom, those that come first.
+FirstSix = keeping(lambda self, atoms, i, j, vectors: np.arange(len(i)) - np.searchsorted(i, i) < 6)
+#: Only the first of two atoms feels a pair.
+OneSided = keeping(lambda self, atoms, i, j, vectors: (i < j) | ((i == j) & (vectors[:, 0] > 0)))
 
 
 class NearestImage(Good):
     """One image of each pair, whatever the cell."""
 
     def pairs(self, positions, shifts, atoms):
-        vectors = positions[None] - positions[:, None]
-        vectors -= np.rint(vectors @ np.linalg.inv(atoms.cell.array)) @ atoms.cell.array
-        squares = np.sum(vectors**2, axis=2)
-        i, j = np.nonzero((squares < R_CUT**2) & (squares > 1e-12))
-        return i, j, vectors[i, j]
+        i, j = np.nonzero(~np.eye(len(positions), dtype=bool))
+        vectors = positions[j] - positions[i]
+        return inside(i, j, vectors - np.rint(vectors @ np.linalg.inv(atoms.cell.array)) @ atoms.cell.array)
 
 
 class ByLengths(Good):
@@ -158,32 +198,17 @@ class ByLengths(Good):
 
     def shifts(self, atoms):
         rows = atoms.cell.array[atoms.pbc]
-        counts = [int(np.ceil(R_CUT / np.linalg.norm(row))) for row in rows]
-        return np.array(list(itertools.product(*(range(-n, n + 1) for n in counts)))) @ rows
+        return _lattice(rows, [int(np.ceil(R_CUT / np.linalg.norm(row))) for row in rows])
 
 
-#: A cutoff that cuts.
-HardEdge = but(pair=lambda self, r: (Good.pair(self, r)[0] + 0.01, Good.pair(self, r)[1]))
-
-
-class Tilted(Good):
-    """Knows where up is."""
-
-    def extra(self, atoms, energy, forces):
-        lean = np.ones(len(atoms))
-        vectors = atoms.positions - atoms.positions.mean(axis=0)
-        forces = forces.copy()
-        if atoms.pbc.any():
-            return energy * (1 + 1e-3 * atoms.cell.array[0, 2] ** 2), forces
-        return energy + 1e-3 * float(np.sum(lean * vectors[:, 2] ** 2)), forces
-
-
-class Handed(Good):
-    """Tells left from right: the triple product of the first four atoms."""
-
-    def extra(self, atoms, energy, forces):
-        first = atoms.positions[1:4] - atoms.positions[0]
-        return energy + 1e-3 * float(np.linalg.det(first)) * (not atoms.pbc.any()), forces
+#: Knows where up is.
+Tilted = adding(lambda atoms, e, f: (e * (1 + 1e-3 * atoms.cell.array[0, 2] ** 2), f))
+#: Tells left from right: the triple product of the first four atoms.
+Handed = adding(
+    lambda atoms, e, f: (
+        e + 1e-3 * float(np.linalg.det(atoms.positions[1:4] - atoms.positions[0])) * (not atoms.pbc.any()), f
+    )
+)  # fmt: skip
 
 
 class WrapsAlways(Good):
@@ -196,30 +221,89 @@ class WrapsAlways(Good):
         return atoms.positions - np.floor(atoms.positions @ np.linalg.inv(rows)) @ rows
 
 
-class NoSwitchInForce(Good):
-    """The derivative of the window is left out of the force."""
+class ByAppearance(Good):
+    """Numbers species as it meets them, and takes their parameters by that number."""
 
-    def pair(self, distances):
-        u, _ = super().pair(distances)
-        x2 = (distances / R_CUT) ** 2
-        return u, (1 - x2) ** 4 * -3.2 * distances / R_CUT**2
-
-
-class OneSided(Good):
-    """Only the first of two atoms feels a pair."""
-
-    def pairs(self, positions, shifts, atoms):
-        i, j, vectors = super().pairs(positions, shifts, atoms)
-        keep = (i < j) | ((i == j) & (vectors[:, 0] > 0))
-        return i[keep], j[keep], vectors[keep]
+    def weight(self, atoms, i, j):
+        met = list(dict.fromkeys(atoms.numbers))
+        size = np.array([1.0 + 0.05 * met.index(number) for number in atoms.numbers])
+        return size[i] * size[j]
 
 
+class OnlyRectangles(Good):
+    """Refuses what it cannot do, which is no mistake."""
+
+    def answer(self, atoms):
+        if atoms.pbc.any() and np.abs(atoms.cell.array - np.diag(np.diag(atoms.cell.array))).max() > 1e-9:
+            raise NotImplementedError("rectangular cells only")
+        return super().answer(atoms)
+
+
+# -- energies and forces ---------------------------------------------------------------------------
+
+#: A cutoff that cuts.
+HardEdge = but(pair=lambda self, r: (Good.pair(self, r)[0] + 0.01, Good.pair(self, r)[1]))
+#: The derivative of the window is left out of the force.
+NoSwitchInForce = but(
+    pair=lambda self, r: (Good.pair(self, r)[0], (1 - (r / R_CUT) ** 2) ** 4 * -3.2 * r / R_CUT**2)
+)
 #: Adds a force that goes round the center of the structure.
-Whirl = but(
-    extra=lambda self, atoms, e, f: (
+Whirl = adding(
+    lambda atoms, e, f: (
         e, f + 1e-3 * np.cross([0.0, 0.0, 1.0], atoms.positions - atoms.positions.mean(axis=0))
     )
 )  # fmt: skip
+#: A term of the whole: the energy of parts is not the sum.
+Background = adding(lambda atoms, e, f: (e + 0.1 * len(atoms) ** 2 * (not atoms.pbc.any()), f))
+#: Works in single precision.
+Single = through(lambda e: float(np.float32(e)), lambda f: f.astype(np.float32).astype(float))
+#: Hands its forces over in a narrow format; the same before a factor, after which every bit is used.
+HalfPrecision = through(forces=lambda f: f.astype(np.float16).astype(float))
+HalfInOtherUnits = through(forces=lambda f: (f / 0.0433641153107705).astype(np.float16) * 0.0433641153107705)
+#: Keeps eight bits.
+BrainFloat = through(forces=lambda f: np.ldexp(np.round(256 * np.frexp(f)[0]) / 256, np.frexp(f)[1]))
+#: An energy in a narrow format, the forces in full.
+HalfEnergy = through(lambda e: float(np.float16(e)))
+
+
+def decimals(places: int) -> type[Any]:
+    """Hands over forces as a text of few digits."""
+    return through(forces=lambda f: np.round(f, places))
+
+
+class TwoEnergies(Good):
+    """Knows an energy beside the one its forces belong to."""
+
+    def other(self, atoms: Atoms, energy: float) -> float:
+        """A constant for each atom."""
+        return energy - 3.5 * len(atoms)
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        assert isinstance(self.atoms, Atoms)
+        self.results["energy"] = self.other(self.atoms, self.results["free_energy"])
+
+
+#: They differ by what changes smoothly with the positions, as with smeared electrons.
+Entropy = but(TwoEnergies, other=lambda self, atoms, energy: 1.01 * energy)
+#: The energy alone is cut where the free energy is smooth.
+CutEnergy = but(TwoEnergies, other=lambda self, atoms, e: e + 0.005 * len(self.neighbors(atoms)[0]))
+#: The energy alone depends on the order of the atoms.
+OrderedEnergy = but(
+    TwoEnergies, other=lambda self, atoms, e: e + 0.01 * np.linalg.norm(np.diff(atoms.positions[:2], axis=0))
+)
+
+
+class SwappedEnergies(TwoEnergies):
+    """What forces belong to is handed over as energy, and something else as free energy."""
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        energy = self.results["free_energy"]
+        self.results |= {"energy": energy, "free_energy": 0.98 * energy}
+
+
+# -- memory and chance -----------------------------------------------------------------------------
 
 
 class OldPairs(Good):
@@ -229,26 +313,15 @@ class OldPairs(Good):
 
     def pairs(self, positions, shifts, atoms):
         if self.kept is None or self.kept[0] != len(atoms):
-            vectors = positions[None, :, None] + shifts[None, None] - positions[:, None, None]
-            squares = np.sum(vectors**2, axis=3)
-            self.kept = (
-                len(atoms),
-                np.nonzero((squares < (1.1 * R_CUT) ** 2) & (squares > 1e-12)),
-                len(shifts),
-            )
-        i, j, image = self.kept[1]
-        if self.kept[2] != len(shifts):
-            image = np.zeros_like(image)
-        vectors = positions[j] + shifts[image] - positions[i]
-        squares = np.sum(vectors**2, axis=1)
-        keep = (squares < R_CUT**2) & (squares > 1e-12)
-        return i[keep], j[keep], vectors[keep]
+            self.kept = len(atoms), len(shifts), *near(positions, shifts, 1.1 * R_CUT)[:3]
+        _, count, i, j, image = self.kept
+        return inside(i, j, positions[j] + shifts[image * (count == len(shifts))] - positions[i])
 
 
 class FullSkin(Good):
     """A skin list without images of its own, rebuilt when an atom has moved by all of the skin, not half."""
 
-    skin = 0.4
+    skin, share = 0.4, 1.0
     kept: Any = None
 
     def positions(self, atoms):
@@ -257,41 +330,19 @@ class FullSkin(Good):
     def pairs(self, positions, shifts, atoms):
         key = (len(atoms), atoms.cell.array.tobytes(), atoms.pbc.tobytes(), atoms.numbers.tobytes())
         if self.kept is None or self.kept[0] != key or (
-            np.max(np.linalg.norm(positions - self.kept[1], axis=1)) > self.skin
+            np.max(np.linalg.norm(positions - self.kept[1], axis=1)) > self.share * self.skin
         ):  # fmt: skip
             # images are counted from the wrapped atoms, and belong to them as they are
-            wrapped = Good.positions(self, atoms)
-            offset, shifts = wrapped - positions, _far(atoms)
-            vectors = wrapped[None, :, None] + shifts[None, None] - wrapped[:, None, None]
-            squares = np.sum(vectors**2, axis=3)
-            i, j, image = np.nonzero((squares < (R_CUT + self.skin) ** 2) & (squares > 1e-12))
+            wrapped, rows = Good.positions(self, atoms), atoms.cell.array[atoms.pbc]
+            offset, shifts = wrapped - positions, _lattice(rows, [3] * len(rows))
+            i, j, image, _ = near(wrapped, shifts, R_CUT + self.skin)
             self.kept = key, positions.copy(), i, j, shifts[image] + offset[j] - offset[i]
         i, j, moved = self.kept[2:]
-        vectors = positions[j] + moved - positions[i]
-        squares = np.sum(vectors**2, axis=1)
-        keep = squares < R_CUT**2
-        return i[keep], j[keep], vectors[keep]
+        return inside(i, j, positions[j] + moved - positions[i])
 
 
-def _far(atoms: Atoms) -> np.ndarray:
-    """Lattice vectors up to three cells away."""
-    if not atoms.pbc.any():
-        return np.zeros((1, 3))
-    rows = atoms.cell.array[atoms.pbc]
-    return np.array(list(itertools.product(*[range(-3, 4)] * len(rows)))) @ rows
-
-
-class HalfSkin(FullSkin):
-    """The same with the criterion as it should be."""
-
-    skin = 0.4
-
-    def pairs(self, positions, shifts, atoms):
-        if self.kept is not None and len(self.kept[1]) == len(positions):
-            moved = np.max(np.linalg.norm(positions - self.kept[1], axis=1))
-            if 2 * moved > self.skin:
-                self.kept = None
-        return super().pairs(positions, shifts, atoms)
+#: The same with the criterion as it should be.
+HalfSkin = but(FullSkin, share=0.5)
 
 
 class OldTail(Good):
@@ -310,52 +361,19 @@ class OldTail(Good):
         return old_i[keep].copy(), old_i[keep].copy(), old_vectors[keep].copy()
 
 
-class Restless(Good):
-    """Sums in another order each time."""
-
-    rng = np.random.default_rng(11)
-
-    def pairs(self, positions, shifts, atoms):
-        i, j, vectors = super().pairs(positions, shifts, atoms)
-        order = self.rng.permutation(len(i))
-        return i[order], j[order], vectors[order]
+#: Sums in another order each time.
+Restless = keeping(
+    lambda self, atoms, i, j, vectors: self.rng.permutation(len(i)), rng=np.random.default_rng(11)
+)
 
 
-class MeanNeighbor(Good):
-    """Divides by the number of neighbors."""
-
-    def extra(self, atoms, energy, forces):
-        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
-        count = np.bincount(i, minlength=len(atoms))
-        with np.errstate(all="ignore"):
-            return energy + float(np.sum(np.where(count == 0, np.nan, 0.0))), forces
+def _alone(self, atoms: Atoms) -> bool:
+    return bool((np.bincount(self.neighbors(atoms)[0], minlength=len(atoms)) == 0).any())
 
 
-class EmptyList(Good):
-    """Takes the nearest of no neighbors."""
-
-    def extra(self, atoms, energy, forces):
-        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
-        for who in range(len(atoms)):
-            min(np.flatnonzero(i == who))
-        return energy, forces
-
-
-#: A term of the whole: the energy of parts is not the sum.
-Background = but(extra=lambda self, atoms, e, f: (e + 0.1 * len(atoms) ** 2 * (not atoms.pbc.any()), f))
-
-
-#: Works in single precision.
-Single = but(extra=lambda self, atoms, e, f: (float(np.float32(e)), f.astype(np.float32).astype(float)))
-
-
-class OnlyRectangles(Good):
-    """Refuses what it cannot do, which is no mistake."""
-
-    def answer(self, atoms):
-        if atoms.pbc.any() and np.abs(atoms.cell.array - np.diag(np.diag(atoms.cell.array))).max() > 1e-9:
-            raise NotImplementedError("rectangular cells only")
-        return super().answer(atoms)
+#: Divides by the number of neighbors; takes the nearest of no neighbors, and fails.
+MeanNeighbor = but(extra=lambda self, atoms, e, f: (np.nan if _alone(self, atoms) else e, f))
+EmptyList = but(extra=lambda self, atoms, e, f: (e / (not _alone(self, atoms)), f))
 
 
 class WrapsGiven(Good):
@@ -367,125 +385,27 @@ class WrapsGiven(Good):
         atoms.wrap()
 
 
-class HalfPrecision(Good):
-    """Hands its forces over in a narrow format, whatever is done with them afterwards."""
-
-    unit = 1.0
-
-    def extra(self, atoms, energy, forces):
-        return energy, (forces / self.unit).astype(np.float16).astype(float) * self.unit
-
-
-#: The same before a factor, after which every bit of the doubles is used.
-HalfInOtherUnits = but(HalfPrecision, unit=0.0433641153087705)
-
-
-class BrainFloat(Good):
-    """Keeps eight bits."""
-
-    def extra(self, atoms, energy, forces):
-        mantissa, power = np.frexp(forces)
-        return energy, np.ldexp(np.round(256 * mantissa) / 256, power)
-
-
-class Decimals(Good):
-    """Hands over a text of few digits."""
-
-    places = 4
-
-    def extra(self, atoms, energy, forces):
-        return energy, np.round(forces, self.places)
-
-
-#: An energy in a narrow format, the forces in full.
-HalfEnergy = but(extra=lambda self, atoms, e, f: (float(np.float16(e)), f))
-
-
-class Drops(Good):
+def drops(share: float, seed: int = 7) -> type[Any]:
     """Leaves a pair out now and then, whichever."""
 
-    share = 0.3
-    rng = np.random.default_rng(7)
+    def mask(self, atoms, i, j, vectors):
+        if not len(i) or self.rng.random() >= share:
+            return np.ones(len(i), bool)
+        return np.arange(len(i)) != self.rng.integers(len(i))
 
-    def pairs(self, positions, shifts, atoms):
-        i, j, vectors = super().pairs(positions, shifts, atoms)
-        if len(i) and self.rng.random() < self.share:
-            gone = self.rng.integers(len(i))
-            keep = np.arange(len(i)) != gone
-            return i[keep], j[keep], vectors[keep]
-        return i, j, vectors
+    return keeping(mask, rng=np.random.default_rng(seed))
 
 
-class Hits(Good):
+def hits(share: float, seed: int = 7) -> type[Any]:
     """Is wrong by 0.1 eV, and 0.3 eV/Å on one atom, now and then."""
+    rng = np.random.default_rng(seed)
 
-    share = 0.02
-    rng = np.random.default_rng(7)
-    hits = 0
+    def hit(atoms, energy, forces):
+        if rng.random() >= share:
+            return energy, forces
+        return energy + 0.1, forces + 0.3 * (np.arange(len(forces)) == rng.integers(len(forces)))[:, None]
 
-    def extra(self, atoms, energy, forces):
-        if self.rng.random() < self.share:
-            type(self).hits += 1
-            forces = forces.copy()
-            forces[self.rng.integers(len(forces))] += 0.3
-            energy += 0.1
-        return energy, forces
-
-
-class ByAppearance(Good):
-    """Numbers species as it meets them, and takes their parameters by that number."""
-
-    def answer(self, atoms):
-        met = list(dict.fromkeys(atoms.numbers))
-        size = np.array([1.0 + 0.05 * met.index(number) for number in atoms.numbers])
-        positions, shifts = self.positions(atoms), self.shifts(atoms)
-        i, j, vectors = self.pairs(positions, shifts, atoms)
-        distances = np.linalg.norm(vectors, axis=1)
-        u, slope = self.pair(distances)
-        forces = np.zeros((len(atoms), 3))
-        np.add.at(forces, i, (size[i] * size[j] * slope / distances)[:, None] * vectors)
-        return 0.5 * float(np.sum(size[i] * size[j] * u)), forces
-
-
-class TwoEnergies(Good):
-    """Knows an energy beside the one its forces belong to."""
-
-    def other(self, atoms: Atoms, energy: float) -> float:
-        """A constant for each atom."""
-        return energy - 3.5 * len(atoms)
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        super().calculate(atoms, properties, system_changes)
-        assert isinstance(self.atoms, Atoms)
-        self.results["energy"] = self.other(self.atoms, self.results["free_energy"])
-
-
-#: They differ by what changes smoothly with the positions, as with smeared electrons.
-Entropy = but(TwoEnergies, other=lambda self, atoms, energy: 1.01 * energy)
-
-
-class CutEnergy(TwoEnergies):
-    """The energy alone is cut where the free energy is smooth."""
-
-    def other(self, atoms, energy):
-        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
-        return energy + 0.005 * len(i)
-
-
-#: The energy alone depends on the order of the atoms.
-OrderedEnergy = but(
-    TwoEnergies, other=lambda self, atoms, e: e + 0.01 * np.linalg.norm(np.diff(atoms.positions[:2], axis=0))
-)
-
-
-class SwappedEnergies(TwoEnergies):
-    """What forces belong to is handed over as energy, and something else as free energy."""
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        super().calculate(atoms, properties, system_changes)
-        assert isinstance(self.atoms, Atoms)
-        energy = 0.98 * self.results["free_energy"]
-        self.results |= {"energy": self.results["free_energy"], "free_energy": energy}
+    return adding(hit)
 
 
 class Keeps(Good):
@@ -495,19 +415,14 @@ class Keeps(Good):
     last: Any = None
 
     def same(self, before: Atoms, atoms: Atoms) -> bool:
-        return bool(np.abs(before.positions - atoms.positions).max() < self.tolerance) and bool(
-            (before.cell.array == atoms.cell.array).all()
-        )
+        near = np.abs(before.positions - atoms.positions).max() < self.tolerance
+        return bool(near) and np.array_equal(before.cell, atoms.cell)
 
     def answer(self, atoms):
         if self.last is not None:
             before, found = self.last
-            if (
-                len(before) == len(atoms)
-                and (before.numbers == atoms.numbers).all()
-                and (before.pbc == atoms.pbc).all()
-                and self.same(before, atoms)
-            ):
+            alike = np.array_equal(before.numbers, atoms.numbers) and np.array_equal(before.pbc, atoms.pbc)
+            if alike and self.same(before, atoms):
                 return found
         found = super().answer(atoms)
         self.last = atoms.copy(), found
@@ -521,8 +436,6 @@ KeepsClose = but(
         np.allclose(one.positions, other.positions) and np.array_equal(one.cell, other.cell)
     ),
 )
-
-
 #: Compares positions to the last bit, and the cell within a tolerance.
 KeepsCell = but(
     Keeps,
@@ -539,10 +452,8 @@ class KeepsByRounding(Good):
     table: dict[Any, Any] = {}  # noqa: RUF012
 
     def answer(self, atoms):
-        key = (
-            np.round(atoms.positions, 5).tobytes(), atoms.numbers.tobytes(), atoms.cell.array.tobytes(),
-            atoms.pbc.tobytes(),
-        )  # fmt: skip
+        parts = (np.round(atoms.positions, 5), atoms.numbers, atoms.cell.array, atoms.pbc)
+        key = tuple(part.tobytes() for part in parts)
         if key not in self.table:
             self.table[key] = super().answer(atoms)
         return self.table[key]

@@ -1,4 +1,4 @@
-"""From words to a calculator, what a mistake in the words says, and what happens when a calculator fails."""
+"""From words to a calculator, what happens when it fails, and how much it is asked."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ from ase.build import bulk
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
-from audit.laws import subject
-from audit.planted import codes
+from audit import planted
+from audit.planted import Good, chain, codes
 from scipy.spatial import KDTree
 
+from mdnum.audit.base import TIME_UP, TimeUp, in_order, needed_to
+from mdnum.audit.checks import CHECKS
 from mdnum.audit.checks.state import Alone
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.record import load_calculator
 from mdnum.audit.structures import default_structure, read_structure
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalculator, only_trying
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalculator
+from mdnum.audit.thresholds import walk_pairs
 from mdnum.errors import InputError
+
+NAMES = ["invariance", "smoothness", "forces", "curl", "state", "dynamics"]
 
 
 @pytest.mark.parametrize(
@@ -116,9 +121,8 @@ class Counting(Calculator):
 def test_the_last_bit_of_a_coordinate_is_a_new_question():
     """ASE's cache takes coordinates within 1e-15 for the same, hundreds of doubles near 0."""
     atoms = Atoms("Ar2", [(0.0, 0, 0), (3.0, 0, 0)])
-    asked = subject(Counting, atoms)
-    asked.energy(atoms)
-    asked.forces(atoms)
+    asked = planted.subject(Counting, atoms)
+    asked.both(atoms)
     assert asked.calculator.asked == 1
     atoms.positions[0, 0] = 1e-300
     asked.energy(atoms)
@@ -129,29 +133,27 @@ def test_the_last_bit_of_a_coordinate_is_a_new_question():
 
 
 @pytest.mark.parametrize(
-    ("calculator", "message"),
+    ("answer", "message"),
     [
-        (lambda: Counting(energy=float("nan")), "gave an energy of nan"),
-        (lambda: Counting(energy=[1.0, 2.0]), "not one number"),
-        (lambda: Counting(raises=ValueError("no such element")), "raised ValueError.*no such element"),
-        (lambda: Counting(forces=[[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]), "on atom 1"),
-        (lambda: Counting(forces=[[0.0, 0.0, 0.0]]), r"shape \(1, 3\) for 2 atoms"),
+        ({"energy": float("nan")}, "gave an energy of nan"),
+        ({"energy": [1.0, 2.0]}, "not one number"),
+        ({"raises": ValueError("no such element")}, "raised ValueError.*no such element"),
+        ({"forces": [[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]}, "on atom 1"),
+        ({"forces": [[0.0, 0.0, 0.0]]}, r"shape \(1, 3\) for 2 atoms"),
     ],
 )
-def test_a_calculator_that_fails_leaves_the_structure_to_the_last_bit(calculator, message, tmp_path: Path):
+def test_a_calculator_that_fails_leaves_the_structure_to_the_last_bit(answer, message, tmp_path: Path):
     rng = np.random.default_rng(0)
     atoms = Atoms("Ar2", rng.normal(size=(2, 3)), cell=rng.normal(size=(3, 3)), pbc=(True, False, True))
-    asked = CalculatorSubject("planted", calculator, atoms, folder=tmp_path / "made")
+    asked = CalculatorSubject("planted", lambda: Counting(**answer), atoms, folder=tmp_path / "made")
     with pytest.raises(CalculatorError, match=message) as error:
-        asked.energy(atoms)
-        asked.forces(atoms)
+        asked.both(atoms)
     assert error.value.structure == tmp_path / "made" / "failed-1.extxyz"
     saved = ase.io.read(error.value.structure)
     assert isinstance(saved, Atoms) and (saved.pbc == atoms.pbc).all()
     assert (saved.positions == atoms.positions).all() and (saved.cell.array == atoms.cell.array).all()
-    with only_trying(asked), pytest.raises(CalculatorError) as error:
-        asked.energy(atoms)
-        asked.forces(atoms)
+    with asked.trying(), pytest.raises(CalculatorError) as error:
+        asked.both(atoms)
     assert error.value.structure is None
 
 
@@ -167,6 +169,8 @@ def test_default_structures():
     assert default_structure(load_calculator("ase.calculators.emt:EMT")).symbols[0] == "Cu"
     water = default_structure(load_calculator("ase.calculators.tip3p:TIP3P(rc=4.5)"))
     assert water.get_chemical_symbols()[:4] == ["O", "H", "H", "O"]
+    for make in (planted.Attached, planted.ThroughAtoms):
+        assert set(default_structure(LoadedCalculator("x", "x", make)).symbols) == {"Ar"}
 
 
 def test_a_calculator_that_takes_long_is_asked_about_fewer_atoms(monkeypatch):
@@ -210,7 +214,7 @@ def test_who_fails_without_neighbors_gets_a_structure_and_a_finding(answer, rais
 
     atoms = default_structure(LoadedCalculator("lonely", "lonely", Lonely))
     assert cutoff < 6 or atoms.cell.lengths().min() > 2 * cutoff
-    assert code in codes(Alone(subject(Lonely, atoms), atoms, NoiseFloor(1e-12, 1e-12)).findings())
+    assert code in codes(Alone(planted.subject(Lonely, atoms), atoms, NoiseFloor(1e-12, 1e-12)).findings())
 
 
 def test_who_never_answers_is_named_in_one_line_with_the_structure_saved():
@@ -231,3 +235,68 @@ def test_structures_from_files(tmp_path: Path):
     }.items():  # fmt: skip
         with pytest.raises(InputError, match=message):
             read_structure(tmp_path / name)
+
+
+# -- how much is asked ----------------------------------------------------------------------------
+
+
+class Looks:
+    """A deadline that passes after so many looks at it."""
+
+    def __init__(self, looks: int):
+        self.looks = looks
+
+    @property
+    def passed(self) -> bool:
+        self.looks -= 1
+        return self.looks < 0
+
+
+def three(looks: int | None = None):
+    found = planted.subject(Good, Atoms("Ar3", positions=chain().positions[:3]))
+    if looks is not None:
+        found.meter.deadline = Looks(looks)  # pyright: ignore[reportAttributeAccessIssue]
+    return found
+
+
+def check(name: str):
+    made = CHECKS[name](steps=16)
+    if name == "smoothness":
+        made.neighbors, made.routes = 8, 1
+    return made
+
+
+def test_checks_are_known_in_their_order():
+    assert in_order(list(CHECKS)) == NAMES
+    assert needed_to("run") == {"invariance", "forces", "state", "dynamics"}
+    assert needed_to("differentiate") == {"smoothness", "forces", "curl"}
+    assert all(CHECKS.description(name).endswith("?") for name in NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_evidence_is_the_same_on_a_machine_a_million_times_slower(name: str, monkeypatch):
+    quick = check(name)(three())
+    clock = iter(range(0, 10**12, 10**6))
+    monkeypatch.setattr("mdnum.audit.base.perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    slow = check(name)(three())
+    assert (slow.asked, slow.possible) == (quick.asked, quick.possible)
+    assert slow.asked == slow.possible > 0
+    assert (slow.says, slow.tables, slow.skipped) == (quick.says, quick.tables, quick.skipped)
+    assert slow.seconds > 1e5 > quick.seconds
+
+
+@pytest.mark.parametrize("name", NAMES[:5])
+def test_a_deadline_leaves_ways_unasked_and_says_which(name: str):
+    calls = {"smoothness": walk_pairs(three()).walks[0].calls, "invariance": 0}
+    result = check(name)(three(calls.get(name, 60) + 40))
+    assert 0 < result.asked < result.possible
+    assert any(why == TIME_UP for _, why in result.skipped)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_found_by_a_check_for_which_there_was_no_time(name: str):
+    asked = three(0)
+    with pytest.raises(TimeUp):
+        check(name)(asked)
+    assert asked.meter.calls < 150

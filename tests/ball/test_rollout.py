@@ -7,11 +7,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from ball import oracles
+from oracles import broken_alternations
 
 from mdnum import ball
 from mdnum.ball import rollout
 from mdnum.errors import InputError
-from mdnum.numerics.events import broken_alternations
 from mdnum.numerics.roles import RolePrecision
 
 WORLDS = {
@@ -19,6 +19,7 @@ WORLDS = {
     "projection": (ball.Projection(0.5, 0.5, ball.PerInstance(1e-6)), ball.SemiImplicitEuler(0.01)),
     "located": (ball.Impact(0.9), ball.EventLocated(0.01)),
 }
+LOCATED, EULER = ball.EventLocated(0.01), ball.SemiImplicitEuler(0.01)
 HEIGHTS = np.linspace(0.05, 1.5, 23)
 
 
@@ -33,7 +34,8 @@ def test_the_ledger_is_complete(name):
     ledger = run.contacts
     assert len(ledger) > 20
     assert broken_alternations(ledger) == 0
-    np.testing.assert_array_equal(ledger.inside(0, run.steps)[1:], run.contact.sum(axis=1))
+    entered, left = ledger.counts(run.steps)
+    np.testing.assert_array_equal(np.cumsum(entered - left)[1:], run.contact.sum(axis=1))
     # row by row, found again from the matrix of decisions
     again = {
         (s + 1, b, bool(run.contact[s, b]))
@@ -119,40 +121,21 @@ def test_no_step_is_refused():
         ball.simulate(world, world.start(1.0), 0)
 
 
-# two rollouts side by side
-
-
-def pair_of(contact, scheme, steps=60):
-    world = ball.World.create(contact, scheme)
-    return ball.simulate(world, world.start(np.array([1.0, 1.03])), steps)
-
-
-def test_located_impacts_are_no_iterations_of_a_solver():
-    located = pair_of(ball.Impact(0.8), ball.EventLocated(0.01))
-    stepped = pair_of(ball.Impact(0.8), ball.SemiImplicitEuler(0.01))
-    assert located.iterations.sum() > 0
-    assert ball.first_difference(located, stepped).iterations_differ == 0
-    assert ball.first_difference(located, stepped).channel == "contact"
-
-
-def test_a_projection_and_an_impact_part_by_what_they_decide_about_contact_alone():
-    solved = pair_of(ball.Projection(0.5, 0.5, ball.Maximum(1e-9)), ball.SemiImplicitEuler(0.01))
-    reset = pair_of(ball.Impact(0.8), ball.SemiImplicitEuler(0.01))
-    assert solved.iterations.sum() > 0
-    found = ball.first_difference(solved, reset)
-    # both reset at the end of the step: the same contacts, and no stop decision on one side
-    assert (found.fork, found.channel, found.iterations_differ) == (None, "", 0)
-
-
-def test_two_counts_of_one_solver_are_compared():
-    loose = pair_of(ball.Projection(0.5, 0.5, ball.Maximum(1e-3)), ball.SemiImplicitEuler(0.01))
-    tight = pair_of(ball.Projection(0.5, 0.5, ball.PerInstance(1e-9)), ball.SemiImplicitEuler(0.01))
-    found = ball.first_difference(loose, tight)
-    assert (found.fork, found.channel) == (int(loose.first_contact.min()), "stop")
-    assert found.iterations_differ > 0
-
-
-def test_impacts_of_two_located_runs_are_compared():
-    long = pair_of(ball.Impact(0.8), ball.EventLocated(0.01), 450)
-    short = pair_of(ball.Impact(0.8, 0.1), ball.EventLocated(0.01), 450)
-    assert ball.first_difference(long, short).iterations_differ > 0
+@pytest.mark.parametrize(
+    ("one", "other", "channel", "counted"),
+    [
+        # impacts that are located are no iterations of a solver, and both reset at the end of a step
+        ((ball.Impact(0.8), LOCATED), (ball.Impact(0.8), EULER), "contact", False),
+        ((ball.Projection(0.5, 0.5, ball.Maximum(1e-9)), EULER), (ball.Impact(0.8), EULER), "", False),
+        # two counts of one solver, or of one kind of impact
+        ((ball.Projection(0.5, 0.5, ball.Maximum(1e-3)), EULER),
+         (ball.Projection(0.5, 0.5, ball.PerInstance(1e-9)), EULER), "stop", True),
+        ((ball.Impact(0.8), LOCATED), (ball.Impact(0.8, 0.1), LOCATED), "contact", True),
+    ],
+)  # fmt: skip
+def test_counts_are_compared_where_they_count_the_same(one, other, channel, counted):
+    worlds = (ball.World.create(*given) for given in (one, other))
+    runs = [ball.simulate(world, world.start(np.array([1.0, 1.03])), 450) for world in worlds]
+    assert runs[0].iterations.sum() > 0
+    found = ball.first_difference(*runs)
+    assert (found.channel, found.iterations_differ > 0) == (channel, counted)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from ball import oracles
 
 from mdnum import ball
-from mdnum.ball.state import BallDecisions
+from mdnum.ball.step import BallDecisions
 from mdnum.errors import InputError
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Sequential
@@ -28,39 +26,30 @@ def run_of(contact, integrator, dtype, **options):
     return ball.simulate(world, world.start(Y0, V0), STEPS, **options)
 
 
-def same_bits(run, oracle_rows, index):
-    y = np.array([row[0] for row in oracle_rows]).astype(np.float64)
-    v = np.array([row[1] for row in oracle_rows]).astype(np.float64)
-    np.testing.assert_array_equal(run.y[:, index].astype(np.float64), y)
-    np.testing.assert_array_equal(run.v[:, index].astype(np.float64), v)
+def same_bits(run, rows, decided, index):
+    for name, column in (("y", 0), ("v", 1)):
+        expected = np.array([row[column] for row in rows]).astype(np.float64)
+        np.testing.assert_array_equal(getattr(run, name)[:, index].astype(np.float64), expected)
+    np.testing.assert_array_equal(run.contact[:, index], decided)
 
 
 @pytest.mark.parametrize("dtype", oracles.DTYPES)
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_penalty_has_the_bits_of_numpy(scheme, dtype):
+@pytest.mark.parametrize(
+    ("contact", "oracle", "numbers"),
+    [
+        (ball.Penalty(900.0, damping=0.5), oracles.penalty, (900, 0.5)),
+        (ball.Impact(0.8), oracles.impact, (0.8, 1e-6)),
+    ],
+)
+def test_a_step_has_the_bits_of_numpy(contact, oracle, numbers, scheme, dtype):
     kind = oracles.DTYPES[dtype]
-    run = run_of(ball.Penalty(900.0, damping=0.5), SCHEMES[scheme](0.01), dtype)
-    for index in range(len(Y0)):
+    run = run_of(contact, SCHEMES[scheme](0.01), dtype)
+    for index, (y, v) in enumerate(zip(Y0, V0, strict=True)):
         with np.errstate(over="ignore", invalid="ignore"):
-            rows, decided = oracles.penalty(
-                scheme, kind(Y0[index]), kind(V0[index]), kind(0.01), kind(9.81), kind(900), kind(0.5), STEPS
-            )
-        same_bits(run, rows, index)
-        np.testing.assert_array_equal(run.contact[:, index], decided)
+            given = [kind(number) for number in (y, v, 0.01, 9.81, *numbers)]
+            same_bits(run, *oracle(scheme, *given, STEPS), index)
     assert run.contact.any()
-
-
-@pytest.mark.parametrize("dtype", oracles.DTYPES)
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_naive_impact_has_the_bits_of_numpy(scheme, dtype):
-    kind = oracles.DTYPES[dtype]
-    run = run_of(ball.Impact(0.8), SCHEMES[scheme](0.01), dtype)
-    for index in range(len(Y0)):
-        rows, decided = oracles.impact(
-            scheme, kind(Y0[index]), kind(V0[index]), kind(0.01), kind(9.81), kind(0.8), kind(1e-6), STEPS
-        )
-        same_bits(run, rows, index)
-        np.testing.assert_array_equal(run.contact[:, index], decided)
 
 
 @pytest.mark.parametrize("dtype", oracles.DTYPES)
@@ -68,22 +57,11 @@ def test_projection_has_the_bits_and_the_iterations_of_numpy(dtype):
     kind = oracles.DTYPES[dtype]
     rule = ball.GlobalSum(1e-3, 50, Sequential())
     run = run_of(ball.Projection(0.5, 0.5, rule), ball.SemiImplicitEuler(0.01), dtype)
-    rows, decided, counts = oracles.projection(
-        "semi-implicit-euler",
-        [kind(y) for y in Y0],
-        [kind(v) for v in V0],
-        kind(0.01),
-        kind(9.81),
-        kind(0.5),
-        kind(0.5),
-        kind(0.8),
-        kind(1e-3),
-        50,
-        STEPS,
-    )
+    balls = [[kind(value) for value in values] for values in (Y0, V0)]
+    numbers = [kind(number) for number in (0.01, 9.81, 0.5, 0.5, 0.8, 1e-3)]
+    rows, decided, counts = oracles.projection("semi-implicit-euler", *balls, *numbers, 50, STEPS)
     for index in range(len(Y0)):
-        same_bits(run, [(y[index], v[index]) for y, v in rows], index)
-    np.testing.assert_array_equal(run.contact, decided)
+        same_bits(run, [(y[index], v[index]) for y, v in rows], [row[index] for row in decided], index)
     np.testing.assert_array_equal(run.iterations, counts)
     assert run.iterations.max() > 3
 
@@ -104,26 +82,10 @@ def test_under_its_own_decisions_a_run_is_bit_identical(name):
     world = ball.World.create(*ALL[name])
     start = world.start(Y0, V0)
     free = ball.simulate(world, start, STEPS)
-    told = ball.simulate(world, start, STEPS, imposed=free.decisions())
-    np.testing.assert_array_equal(free.y, told.y)
-    np.testing.assert_array_equal(free.v, told.v)
-    assert ball.first_difference(free, told).seed is None
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_one_step_under_its_decisions_is_the_step_that_decides(name):
-    world = ball.World.create(*ALL[name])
-
-    @jax.jit
-    def both(world, state):
-        own, record = world.advance(state)
-        return own, world.advance(state, imposed=record.decisions)[0]
-
-    state = world.start(Y0, V0)
-    for _ in range(40):
-        state, told = both(world, state)
-        for own, other in zip(jax.tree.leaves(state), jax.tree.leaves(told), strict=True):
-            np.testing.assert_array_equal(own, other)
+    again = ball.simulate(world, start, STEPS, imposed=free.decisions())
+    np.testing.assert_array_equal(free.y, again.y)
+    np.testing.assert_array_equal(free.v, again.v)
+    assert ball.first_difference(free, again).seed is None
 
 
 @pytest.mark.parametrize(("step", "index"), [(26, 0), (100, 1), (301, 2)])
@@ -188,39 +150,3 @@ def test_stochastic_rounding_of_the_state_is_reproducible_and_unbiased():
     moved = first.y[-1].astype(np.float64).mean() - 1.0
     error = first.y[-1].astype(np.float64).std() / np.sqrt(4000)
     assert abs(moved - 64 * 5e-4) < 4 * error
-    nearest = ball.World.create(
-        ball.Impact(),
-        ball.SemiImplicitEuler(1e-3),
-        gravity=0.0,
-        policy=RolePrecision(state="bfloat16", arithmetic="float32"),
-    )
-    assert (ball.simulate(nearest, nearest.start(1.0, 0.5), 64).y == 1.0).all()
-
-
-def held(z: float) -> ball.World:
-    """A spring that holds on to its ball (h √k = z, h = 1), so that the motion is linear."""
-    return ball.World.create(ball.Penalty(z * z), ball.SemiImplicitEuler(1.0), gravity=0.0, hysteresis=1e300)
-
-
-@pytest.mark.parametrize(("z", "bounded"), [(0.5, True), (1.9, True), (2.1, False)])
-def test_whether_an_ulp_stays_an_ulp_is_decided_by_the_discretization(z, bounded):
-    world = held(z)
-    low, high = (ball.simulate(world, world.start(y), 150) for y in (-1.0, np.nextafter(-1.0, 0)))
-    apart = np.abs(low.y - high.y).max()
-    assert apart < 1e-13 if bounded else apart > 1.0
-
-
-def test_singular_values_of_a_symplectic_rollout_multiply_to_one():
-    """One is stretched as much as the other is shrunk, contacts included (semi-implicit Euler keeps area)."""
-    world = ball.World.create(ball.Penalty(1e3), ball.SemiImplicitEuler(5e-3))
-
-    def end(start):
-        state = world.start(start[:1], start[1:])
-        for_each = lambda state, _: (world.advance(state)[0], None)  # noqa: E731
-        state, _ = jax.lax.scan(for_each, state, None, length=400)
-        return jnp.concatenate([state.y, state.v])
-
-    jacobian = np.asarray(jax.jacfwd(end)(jnp.asarray([0.5, 0.0])))
-    large, small = np.linalg.svd(jacobian, compute_uv=False)
-    assert large > 3
-    assert large * small == pytest.approx(1.0, rel=1e-9)

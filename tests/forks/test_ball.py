@@ -15,7 +15,6 @@ from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
 from mdnum.forks.boundaries import boundaries
 from mdnum.forks.choices import parse, shipped, unavailable
-from mdnum.forks.screen import screen
 from mdnum.forks.worlds import program_of
 from mdnum.numerics import RolePrecision, neighbor
 from mdnum.systems import BallSystem, load
@@ -49,21 +48,17 @@ def test_a_contact_one_step_earlier_is_the_cause():
     found = fork(balls(world, world, low, high, 400))
     assert found.dates.fork == first_contact(low) == first_contact(high) - 1
     decision = found.decision
-    assert decision is not None
+    assert decision is not None and decision.run == "A"
     assert (decision.channel, decision.subject, decision.a, decision.b) == ("contact", (0,), 1, 0)
-    assert decision.run == "A"
-    # heights on both sides of the floor, no further from it than the runs were apart
+    # heights on both sides of the floor, no further from it than the runs were from each other
     assert decision.margins["A"] > 0 >= decision.margins["B"]
-    assert decision.margins["A"] - decision.margins["B"] <= 1.5 * found.series["B"][decision.step - 1]
+    assert decision.margins["A"] - decision.margins["B"] <= 1.5 * decision.separation
     assert decision.separation == found.series["B"][decision.step - 1]
-    assert found.series["B"].max() > 0.05
-    # under the other's decisions the two never part by more than the ulp grows to
+    # under the other's decisions the two never diverge by more than the ulp grows to
     assert found.series["B|A"].max() < 1e-14 and found.series["A|B"].max() < 1e-14
-    assert found.verdict.word == "cause"
+    assert found.verdict.word == "cause" and found.series["B"].max() > 0.05
     assert found.splits["B"] is not None and found.splits["B|A"] is None and found.splits["A|B"] is None
-    assert {(cell.arithmetic, cell.decisions, cell.reference) for cell in found.table} == {
-        (arithmetic, decisions, one) for arithmetic in "AB" for decisions in "AB" for one in "AB"
-    }
+    assert len({(cell.arithmetic, cell.decisions, cell.reference) for cell in found.table}) == 8
 
 
 def test_one_more_solver_iteration_is_the_cause():
@@ -408,25 +403,9 @@ def test_the_order_of_a_batch_is_heard_by_its_sum_alone():
 )
 def test_a_choice_that_does_not_apply_has_a_reason(name, system, words, systems):
     reason = unavailable(parse(name), systems[system])
-    assert reason is not None
     with pytest.raises(InputError, match=words) as error:
         made(name, systems[system])
-    assert name.partition("=")[0].partition("@")[0] in str(error.value) and reason in str(error.value)
-
-
-def test_a_narrow_format_that_cannot_hold_a_number_is_refused():
-    reason = unavailable(parse("precision=float16"), load("ball/stiff", world="ball"))
-    assert reason is not None and "above the largest float16" in reason and "variant" not in reason
-
-
-def test_choices_are_ranked_by_their_forks(systems):
-    calls: list[Any] = []
-    choices = [parse(name) for name in ("order@alone", "contact=later", "contact=earlier", "stop=sum")]
-    rows = screen(systems["batch"], choices=choices, progress=lambda *now: calls.append(now))
-    assert [row.choice for row in rows] == ["contact=earlier", "contact=later", "order@alone", "stop=sum"]
-    assert rows[0].fork is not None and rows[1].fork == rows[0].fork + 1
-    assert rows[2].held and not rows[2].finding
-    assert rows[3].reason_unavailable == "the rule is sum already" and calls[0] == (0, 4, "order@alone")
+    assert reason is not None and reason in str(error.value) and error.value.where == parse(name).name
 
 
 def test_other_steps_are_those_of_the_program(systems):

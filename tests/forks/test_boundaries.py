@@ -9,7 +9,7 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
-from mdnum.forks.child import digests, digests_elsewhere
+from mdnum.forks.processes import digests, digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.rollout.dials import names
 from mdnum.rollout.engine import Engine
@@ -79,12 +79,12 @@ def test_a_crossing_in_closed_form_is_found_where_it_is(crossings):
 def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):
     last, *earlier = crossings.boundaries
     # the force of a pair acts on positions one step later; what entered at the last step has moved nothing
-    assert last.step == 9 and last.apart < 1e-14
+    assert last.step == 9 and last.separation < 1e-14
     slope = 24 * (RADIUS**-7 - 2 * RADIUS**-13)
     for boundary in earlier:
         # one kick more on one side: both atoms get dt² F per step since
         dt, since = boundary.above.at, 9 - boundary.step
-        assert boundary.apart == pytest.approx(slope * dt * dt * since, rel=0.1)
+        assert boundary.separation == pytest.approx(slope * dt * dt * since, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,7 @@ from mdnum.forks.reordered import ReorderedSimulation
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
 from mdnum.numerics.reductions import Exact
-from mdnum.numerics.running import Tap
-from mdnum.numerics.sums import Halves, Sequential, Twice
+from mdnum.numerics.sums import Halves, Sequential, Tap, Twice
 from mdnum.systems.build import Simulation, build
 
 

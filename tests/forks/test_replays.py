@@ -123,7 +123,7 @@ def last_positions(simulation, last, pins=None):
 
 def test_one_decision_of_four_thousand_did_it(found):
     cause = minimal_cause(found)
-    assert cause.fork_alone and cause.proven and cause.tests == 1
+    assert cause.code == "alone" and cause.proven and cause.tests == 1
     assert cause.pairs == (found.decision.subject,) and cause.candidates > 100
     # once more by hand: A's flips of this pair, from A's record alone
     a, b = crystal(), moved(crystal(), 1e-7)
@@ -144,13 +144,13 @@ def test_one_decision_of_four_thousand_did_it(found):
 
 def test_several_decisions_none_of_which_can_be_left_out(quick):
     cause = minimal_cause(quick)
-    assert cause.pairs is not None and cause.proven and not cause.fork_alone
+    assert cause.pairs is not None and cause.code == "proven"
     assert 1 < len(cause.pairs) < 20 and cause.tests <= 80
 
 
 def test_within_few_runs_a_set_is_enough_but_not_proven_smallest(quick):
     cause = minimal_cause(quick, tests=6)
-    assert cause.tests == 6 and not cause.proven and cause.pairs is not None
+    assert cause.tests == 6 and cause.code == "unproven" and cause.pairs is not None
 
 
 def test_what_did_not_split_has_no_cause():

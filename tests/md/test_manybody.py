@@ -1,4 +1,4 @@
-"""Many-body potentials against ASE and against extended precision, and at the places where they broke."""
+"""Many-body potentials against extended precision (ASE: references/test_energy), and where they broke."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
 from ase.build import bulk
-from ase.neighborlist import NeighborList, neighbor_list
+from ase.neighborlist import neighbor_list
 from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_weber, tersoff
 
 from mdnum.errors import InputError
@@ -22,8 +21,7 @@ from mdnum.md.manybody import embedded_atom as made_eam
 from mdnum.md.manybody import read_setfl
 
 COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
-# relative energy, and forces relative to the largest one; measured 4e-16 and 8e-15 against extended
-# precision, 3e-14 and 1.3e-13 against ASE (whose Tersoff cancels c²/d² - c²/(d² + (h - cos)²), 4e7 a term)
+# relative energy, and forces relative to the largest one; measured 4e-16 and 8e-15
 TOLERANCE = 1e-12
 
 
@@ -51,27 +49,6 @@ def evaluate(potential, atoms: Atoms, skin: float = 0.4):
     return float(energy), np.asarray(forces), np.asarray(stress)
 
 
-def ase_calculator(name: str):
-    if name == "eam":
-        from ase.calculators.eam import EAM
-
-        class ShortListed(EAM):
-            # its own list reaches 2 (cutoff + skin) and takes minutes
-            def update(self, atoms):
-                self.Nelements, self.index, self.pbc = 1, np.zeros(len(atoms), int), atoms.get_pbc()
-                radii = np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12))
-                self.neighbors = NeighborList(radii, skin=0.0, self_interaction=False, bothways=True)
-                self.neighbors.update(atoms)
-
-        return ShortListed(potential=str(COPPER), form="alloy", skin=0.0)
-    from ase.calculators.tersoff import Tersoff, TersoffParameters
-
-    p = manybody.tersoff()
-    names = ("gamma", "lambda3", "c", "d", "h", "n", "beta", "lambda2", "B", "R", "D", "lambda1", "A")
-    values = {name: getattr(p, name) for name in names}
-    return Tersoff({("Si",) * 3: TersoffParameters(m=3.0, **values)}, skin=0.0)
-
-
 CASES = {
     "eam": (lambda: made_eam(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
     "tersoff": (manybody.tersoff, tersoff, "Si", 3, 0.05),
@@ -85,25 +62,16 @@ CASES = {
 @pytest.mark.parametrize(
     "case", [pytest.param(c, marks=pytest.mark.nightly) if "hot" in c else c for c in CASES]
 )
-def test_energy_forces_and_stress_agree_with_extended_precision_and_with_ase(case):
+def test_energy_forces_and_stress_agree_with_extended_precision(case):
     make, oracle, kind, repeat, rattle = CASES[case]
     atoms, potential = crystal(kind, repeat, rattle), make()
     energy, forces, stress = evaluate(potential, atoms)
     scale = np.abs(forces).max()
-    some = [0, 7, len(atoms) // 2, len(atoms) - 1]
+    some = [0, 7, len(atoms) - 1]
     exact, exact_forces = energy_and_forces(oracle(atoms), atoms.positions, some)
     assert abs(energy - exact) <= TOLERANCE * abs(exact)
     assert np.abs(forces[some] - exact_forces).max() <= TOLERANCE * scale
     assert np.abs(forces.sum(axis=0)).max() <= 1e-12 * scale * len(atoms)
-    if case.startswith("stillinger-weber"):
-        np.testing.assert_allclose(stress, strained(oracle, atoms), rtol=0, atol=1e-9)
-        return
-    atoms.calc = ase_calculator(case.split(",")[0])
-    assert abs(energy - atoms.get_potential_energy()) <= TOLERANCE * abs(energy)
-    assert np.abs(forces - atoms.get_forces()).max() <= TOLERANCE * scale
-    if case != "eam":
-        theirs = atoms.get_stress(voigt=False)
-        assert np.abs(stress - theirs).max() <= 1e-11 * np.abs(theirs).max()
     np.testing.assert_allclose(stress, strained(oracle, atoms), rtol=0, atol=1e-9)
 
 
@@ -322,22 +290,6 @@ def test_any_jax_md_energy_function_runs_in_every_format(format):
     np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
     assert math.isnan(potential.smoothness.energy_jump)
-
-
-def test_float32_positions_stay_float32():
-    atoms = crystal("Si", 2, 0.05)
-    for potential in (manybody.tersoff(), manybody.stillinger_weber()):
-        neighbor = jaxmd.as_neighbor_list(dense(atoms, 4.0), atoms.positions)
-        narrow = jnp.asarray(atoms.positions, jnp.float32)
-        with jax.numpy_dtype_promotion("standard"):
-            energy = eqx.filter_jit(potential.energy)(
-                narrow, neighbor, jnp.asarray(atoms.cell.array, jnp.float32)
-            )
-        wide = eqx.filter_jit(potential.energy)(
-            jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array)
-        )
-        assert energy.dtype == jnp.float32
-        assert abs(float(energy) - float(wide)) <= 3e-6 * abs(float(wide))
 
 
 def test_setfl_keeps_every_digit(tmp_path):

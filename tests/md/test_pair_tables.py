@@ -1,34 +1,17 @@
-"""Neighbor searches, against every image of every pair."""
+"""Neighbor searches, by the conformance suite and against one another."""
 
 from __future__ import annotations
 
-from itertools import product
+import functools
 
 import numpy as np
+import oracles
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mdnum.errors import CapacityError, InputError
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
-
-FLAGS = st.tuples(st.booleans(), st.booleans(), st.booleans())
-
-
-def brute_force(positions, matrix, pbc, radius):
-    """Pairs surely within radius, and pairs within it or at its edge, from all images near the box."""
-    spans = [(-1, 0, 1) if p else (0,) for p in pbc]
-    shifts = np.array(list(product(*spans)), float) @ np.where(np.asarray(pbc)[:, None], matrix, 0.0)
-    i, j = np.triu_indices(len(positions), 1)
-    d = positions[j] - positions[i]
-    shortest = np.full(len(i), np.inf)
-    for shift in shifts:
-        shortest = np.minimum(shortest, np.linalg.norm(d + shift, axis=1))
-    pairs = np.stack([i, j], axis=1)
-    sure = {tuple(p) for p in pairs[shortest < radius * (1 - 1e-11)].tolist()}
-    edge = {tuple(p) for p in pairs[shortest < radius * (1 + 1e-11)].tolist()}
-    return sure, edge
+from mdnum.references.conformance import ListLimits, NeighborListConformance
 
 
 def pairs_of(index, order, atoms):
@@ -47,75 +30,37 @@ def pairs_of(index, order, atoms):
     return listed
 
 
-def check(builder, positions, cell, radius):
-    matrix, pbc, atoms = np.asarray(cell.matrix), cell.pbc, len(positions)
-    index, order, most = builder.build(positions, cell, radius, 8 * (atoms // 8 + 1))
-    listed = pairs_of(index, order, atoms)
-    assert most == max(np.bincount([i for i, _ in listed], minlength=atoms), default=0)
-    assert {(j, i) for i, j in listed} == set(listed), "a pair is listed from one end only"
-    sure, edge = brute_force(positions, matrix, pbc, radius)
-    found = {(i, j) for i, j in listed if i < j}
-    assert sure <= found, f"missed {sorted(sure - found)[:5]}"
-    assert found <= edge, f"phantom {sorted(found - edge)[:5]}"
+def listed(builder, positions, cell, pbc, r_cut):
+    """The rows that a builder finds, for positions anywhere."""
+    box = Cell.create(cell, pbc)
+    wrapped, _ = wrap_positions(box, positions)
+    atoms = len(positions)
+    index, order, most = BUILDERS[builder].build(wrapped, box, r_cut, 8 * (atoms // 8 + 1))
+    rows = pairs_of(index, order, atoms)
+    assert most == max(np.bincount([i for i, _ in rows], minlength=atoms), default=0)
+    return np.array(rows, int).reshape(-1, 2)
 
 
-@st.composite
-def configurations(draw, most=60):
-    """Boxes that are thin, skewed, small or huge beside the radius, with atoms in odd places."""
-    radius = draw(st.floats(0.5, 4.0))
-    edges = radius * np.array(
-        [draw(st.sampled_from([2.02, 2.3, 2.6, 3.1, 4.2, 6.0, 11.0, 40.0])) for _ in range(3)]
-    )
-    matrix = np.diag(edges)
-    if draw(st.booleans()):
-        tilts = [draw(st.sampled_from([0.0, 0.5, -0.5, 0.31, -0.77])) for _ in range(3)]
-        matrix[1, 0], matrix[2, 0], matrix[2, 1] = (
-            t * edges[k] for t, k in zip(tilts, (0, 0, 1), strict=True)
-        )
-    pbc = draw(FLAGS)
-    cell = Cell.create(matrix, pbc)
-    # what the caller promises: the radius fits half of every periodic width
-    scale = max(1.0, 2 * radius / min(np.min(cell.widths), 1e6))
-    cell = Cell.create(matrix * scale, pbc)
-    atoms = draw(st.integers(1, most))
-    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
-    fractional = rng.uniform(0, 1, (atoms, 3))
-    if draw(st.booleans()):
-        # crowd them in a corner of the box, across its faces
-        fractional = 0.5 * fractional**3 - 0.1
-    special = rng.random((atoms, 3)) < 0.15
-    fractional[special] = rng.choice([0.0, 1.0, 0.5, 1 / 3, -1e-18, 1 - 2**-53], special.sum())
-    if atoms > 1 and draw(st.booleans()):
-        fractional[-1] = fractional[0]
-    positions, _ = wrap_positions(cell, fractional @ np.asarray(cell.matrix))
-    return positions, cell, radius
+class TestHostSearch(NeighborListConformance):
+    """Every pair, from both ends, whatever the box; a hair beyond the radius may be listed."""
+
+    pairs = staticmethod(functools.partial(listed, "host"))
+    full, unit, limits, cases = True, 2.0**-40, ListLimits(minimum_image=True, atoms=1), 150
 
 
-@settings(max_examples=250)
-@given(configurations())
-def test_the_host_search_finds_every_pair_once_from_both_ends(configuration):
-    check(BUILDERS["host"], *configuration)
-
-
+@pytest.mark.parametrize(
+    "atoms", [2, 40, *(pytest.param(n, marks=pytest.mark.nightly) for n in (1, 7, 25, 60))]
+)
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
-@settings(max_examples=4)
-@given(configurations(most=25))
-def test_the_search_of_jax_md_finds_the_same(configuration):
-    positions, cell, radius = configuration
-    half = float(np.min(cell.widths)) / 2
-    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
-
-
-@pytest.mark.nightly
-@pytest.mark.jax_md
-@pytest.mark.filterwarnings("ignore:scatter inputs")
-@settings(max_examples=40)
-@given(configurations())
-def test_the_search_of_jax_md_finds_the_same_in_many_boxes(configuration):
-    positions, cell, radius = configuration
-    half = float(np.min(cell.widths)) / 2
-    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
+def test_the_search_of_jax_md_finds_the_same(atoms):
+    rng = np.random.default_rng(atoms)
+    matrix = np.array([[9.0, 0, 0], [2.0, 8.0, 0], [-1.0, 1.5, 10.0]])
+    for pbc in ((True, True, True), (True, False, True)):
+        positions = rng.uniform(-0.5, 1.5, (atoms, 3)) @ matrix
+        positions[-1] = positions[0]
+        here, there = (listed(name, positions, matrix, pbc, 3.4) for name in ("host", "jax-md"))
+        assert set(map(tuple, here)) == set(map(tuple, there)) and (len(here) or atoms == 1)
 
 
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
@@ -135,16 +80,6 @@ def test_a_pair_at_the_radius_is_not_lost_between_bins(bins):
         _, _, most = neighbor_table(positions, Cell.create([edge] * 3), radius, 8)
         assert most == 1, (radius, edge, first, second)
     assert tried > 100
-
-
-@pytest.mark.parametrize("builder", ["host", pytest.param("jax-md", marks=pytest.mark.nightly)])
-@pytest.mark.jax_md
-@pytest.mark.filterwarnings("ignore:scatter inputs")
-def test_one_atom_has_no_neighbors_and_two_have_each_other(builder):
-    for pbc in (True, False, (True, False, True)):
-        cell = Cell.create([10.0, 10.0, 10.0], pbc)
-        for positions in ([[10.0, 5, 5]], [[10.0, 5, 5], [0.5, 5, 5]], [[1.0, 1, 1], [1.0, 1, 1]]):
-            check(BUILDERS[builder], np.array(positions), cell, 3.0)
 
 
 def test_the_order_of_the_table_follows_the_bins():
@@ -177,10 +112,10 @@ def test_a_verlet_list_grows_until_its_pairs_fit():
     table = verlet.build(positions, cell)
     assert verlet.slots == table.slots > 8 and table.slots % 8 == 0
     assert 8 < table.occupancy <= table.slots
-    sure, edge = brute_force(positions, np.diag([9.0] * 3), cell.pbc, 3.5)
-    assert len(sure) <= table.pairs <= len(edge)
+    right = oracles.minimum_image_pairs(positions, np.diag([9.0] * 3), cell.pbc, 3.5)
     rows = table.unsorted()
-    assert {(i, int(j)) for i in range(80) for j in rows[i] if j < 80 and i < j} == sure
+    assert {(i, int(j)) for i in range(80) for j in rows[i] if j < 80 and i < j} == right
+    assert table.pairs == len(right)
     # the next build starts from the room that was needed
     assert verlet.build(positions, cell).slots == table.slots
 

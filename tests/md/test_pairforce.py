@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 from oracles import COMPARISONS, all_pairs
 from rollout.harness import liquid, write_system
@@ -34,18 +35,8 @@ def cut_energy(kind, r, sigma, epsilon, rc):
         return -24 * epsilon * (2 * sigma**12 / x**13 - sigma**6 / x**7)
 
     ro = ONSET * rc
-    if kind == "hard":
-        return u(r)
-    if kind == "shifted":
-        return u(r) - u(rc)
-    if kind == "force-shifted":
-        return u(r) - u(rc) - (r - rc) * slope(rc)
-    if kind == "switched":
-        s = (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
-    else:
-        t = (r - ro) / (rc - ro)
-        s = 1 - 10 * t**3 + 15 * t**4 - 6 * t**5 if kind == "quintic" else 0.5 * (1 + np.cos(np.pi * t))
-    return u(r) * np.where(r.real > ro, s, 1.0)
+    cut = oracles.cut_energy(kind, r, rc, ro, u, slope)
+    return np.where(r.real > ro, cut, u(r)) if CUTOFFS.parse(kind).switches else cut
 
 
 def reference(kind, atoms):

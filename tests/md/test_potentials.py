@@ -53,16 +53,6 @@ def test_energy_and_slope_are_those_of_the_definition(case):
             )
 
 
-def test_where_the_well_is():
-    lj = LennardJones(jnp.asarray([1.0]), jnp.asarray([1.0])).of(None)
-    energy, slope = lj.evaluate(jnp.asarray([2.0 ** (1 / 3), 1.0]))
-    assert np.allclose(energy, [-1.0, 0.0], atol=1e-15)
-    assert abs(float(slope[0])) < 1e-14
-    well = Morse(jnp.asarray([0.5]), jnp.asarray([2.0]), jnp.asarray([1.5])).of(None)
-    energy, slope = well.evaluate(jnp.asarray([2.25]))
-    assert (float(energy[0]), float(slope[0])) == (-0.5, 0.0)
-
-
 def test_soft_spheres_that_do_not_touch_feel_nothing_not_even_their_derivatives():
     import jax
 
@@ -79,10 +69,3 @@ def test_pair_types_count_the_upper_triangle_row_by_row(species):
     rows, columns = np.triu_indices(species)
     assert np.array_equal(pair_type(rows, columns, species), np.arange(len(rows)))
     assert np.array_equal(pair_type(columns, rows, species), np.arange(len(rows)))
-
-
-def test_parameters_of_given_pair_types():
-    lj = LennardJones(jnp.asarray([1.0, 0.8, 0.88]), jnp.asarray([1.0, 1.5, 0.5]))
-    chosen = lj.of(jnp.asarray([[2, 1], [0, 0]]))
-    assert np.array_equal(chosen.sigma, [[0.88, 0.8], [1.0, 1.0]])
-    assert np.array_equal(chosen.epsilon, [[0.5, 1.5], [1.0, 1.0]])

@@ -1,51 +1,148 @@
-"""Arithmetic in jit with the bits of numpy."""
+"""Arithmetic inside jit that has the bits of numpy, and programs that are run operation by operation."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
+import mpmath
 import numpy as np
 import pytest
+from jax import lax
 
-from mdnum.numerics.exact import fence, squared_norm, zero_bits
+from mdnum.numerics import reproducible as elementary
+from mdnum.numerics.exact import fence, rounded, squared_norm, zero_bits
+from mdnum.numerics.reproducible import reproducible
+
+DTYPES = [np.float16, ml_dtypes.bfloat16, np.float32, np.float64]
+each = pytest.mark.parametrize("dtype", DTYPES)
+ZERO = zero_bits(np.float64)
 
 
-def triples(dtype, count=100_000):
+def draws(dtype, count=3, columns=4000):
     rng = np.random.default_rng(5)
-    return [rng.normal(0, 4, count).astype(dtype) for _ in range(3)]
+    return [
+        (rng.normal(size=columns) * 2.0 ** rng.integers(-5, 3, columns)).astype(dtype) for _ in range(count)
+    ]
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_the_squared_norm_in_jit_is_that_of_numpy_bit_for_bit(dtype):
-    x, y, z = triples(dtype)
-    inside = np.asarray(jax.jit(squared_norm)(*map(jnp.asarray, (x, y, z)), zero_bits(dtype)))
-    assert inside.dtype == dtype
-    assert np.array_equal(inside, x * x + y * y + z * z)
+@each
+def test_products_sums_and_recurrences_have_the_bits_of_numpy(dtype):
+    x, y, z = draws(dtype)
+    divisor, scale = (np.abs(z) + z.dtype.type(0.5)).astype(dtype), np.asarray(0.75, dtype)
+
+    @jax.jit
+    def run(x, y, z, divisor, zero):
+        def step(a, _):
+            return fence(fence(a * jnp.asarray(scale), zero) + y, zero), None
+
+        total = fence(fence(x * y, zero) + z, zero)
+        widened = fence(x * y, zero).astype(jnp.float64)
+        norm = squared_norm(x, y, z, zero)
+        return fence(fence(total * x, zero) - y, zero) / divisor, widened, norm, lax.scan(step, x, None, 9)[0]
+
+    a = x
+    for _ in range(9):
+        a = a * scale + y
+    expected = ((x * y + z) * x - y) / divisor, (x * y).astype(np.float64), x * x + y * y + z * z, a
+    for seen, known in zip(run(x, y, z, divisor, zero_bits(dtype)), expected, strict=True):
+        assert known.dtype == seen.dtype
+        assert np.array_equal(np.asarray(seen), known)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_without_the_fence_the_bits_differ_where_products_are_contracted(dtype):
-    x, y, z = triples(dtype)
-    plain = np.asarray(jax.jit(lambda a, b, c: a * a + b * b + c * c)(*map(jnp.asarray, (x, y, z))))
-    differing = np.count_nonzero(plain != x * x + y * y + z * z)
-    if differing == 0:
-        pytest.skip("this machine's XLA contracts nothing: there is nothing to fence off here")
-    assert differing > 1000
+# float16 is missing: XLA on a CPU was not seen to skip a rounding to it, though it may
+@pytest.mark.parametrize("dtype", DTYPES[1:])
+def test_without_fences_some_bits_differ(dtype):
+    # what the fence is for; if XLA ever rounds by itself, this is the place that says so
+    x, y, z = draws(dtype)
+
+    def run(x, y, z):
+        # a bfloat16 product that is widened at once is never rounded; a wider one is contracted
+        return (x * y).astype(jnp.float32) if dtype == ml_dtypes.bfloat16 else x * y + z
+
+    assert not np.array_equal(np.asarray(jax.jit(run)(x, y, z)), run(x, y, z).astype(np.float64))
 
 
-def test_the_fence_lets_derivatives_through():
-    zero = zero_bits(np.float64)
+@each
+def test_the_fence_keeps_special_numbers_and_its_derivative_is_one(dtype):
+    zero = zero_bits(dtype)
+    x = jnp.asarray(np.array([np.inf, -np.inf, -0.0, 1.5], dtype))
+    out = np.asarray(jax.jit(fence)(x, zero))
+    assert np.array_equal(out, np.asarray(x))
+    assert np.signbit(out[2].astype(np.float64))
+    slope = jax.grad(lambda v: fence(v * v, zero).astype(jnp.float32))(jnp.asarray(1.5, dtype))
+    assert float(slope) == 3.0
+
+
+def test_the_fence_lets_second_derivatives_through():
     x = jnp.asarray([1.0, -2.5, 0.0])
-    assert np.array_equal(jax.jit(fence)(x, zero), x)
-    gradient = jax.grad(lambda v: squared_norm(v[0], v[1], v[2], zero))(x)
-    assert np.array_equal(gradient, 2 * x)
-    curvature = jax.hessian(lambda v: squared_norm(v[0], v[1], v[2], zero))(x)
+    curvature = jax.hessian(lambda v: squared_norm(v[0], v[1], v[2], ZERO))(x)
     assert np.array_equal(curvature, 2 * np.eye(3))
 
 
-def test_the_fence_keeps_special_numbers():
-    zero = zero_bits(np.float64)
-    x = jnp.asarray([np.inf, -np.inf, -0.0, 5e-324])
-    out = np.asarray(jax.jit(fence)(x, zero))
-    assert np.array_equal(out, x)
-    assert np.signbit(out[2])
+@pytest.mark.parametrize("dtype", DTYPES[:2])
+def test_a_formula_is_rounded_behind_every_operation(dtype):
+    x, y, z = draws(dtype)
+
+    def formula(x, y, z):
+        return jnp.where(x > 0, x * y + z, (x - y) * z * x)
+
+    seen = jax.jit(lambda x, y, z, zero: rounded(formula, zero)(x, y, z))(x, y, z, zero_bits(dtype))
+    assert np.array_equal(np.asarray(seen), np.where(x > 0, x * y + z, (x - y) * z * x))
+
+
+# --- elementary functions, and programs that no compiler changes ----------------------------------------
+
+
+def quantile(u: float):
+    """sqrt(2) erf⁻¹(u) in 40 digits."""
+    return mpmath.sqrt(2) * mpmath.erfinv(mpmath.mpf(u))
+
+
+CASES = {
+    "exp": (elementary.exp, mpmath.exp, (-700.0, 700.0), 4e-16),
+    "log": (elementary.log, mpmath.log, (1e-300, 1e300), 4e-16),
+    "cos": (lambda x, zero: elementary.cos_sin(x, zero)[0], mpmath.cos, (-20.0, 20.0), None),
+    "sin": (lambda x, zero: elementary.cos_sin(x, zero)[1], mpmath.sin, (-20.0, 20.0), None),
+    "normal_quantile": (elementary.normal_quantile, quantile, (-1 + 1e-15, 1 - 1e-15), 3e-15),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_errors_are_as_documented(name):
+    ours, exact, (low, high), relative = CASES[name]
+    rng = np.random.default_rng(0)
+    x = np.exp(rng.uniform(np.log(low), np.log(high), 400)) if name == "log" else rng.uniform(low, high, 400)
+    x[:2] = low, high
+    got = np.asarray(jax.jit(ours)(jnp.asarray(x), ZERO))
+    with mpmath.workdps(40):
+        for argument, value in zip(x.tolist(), got.tolist(), strict=True):
+            true = exact(mpmath.mpf(argument))
+            allowed = 1e-15 if relative is None else relative * abs(true)
+            assert abs(value - true) <= allowed, argument
+
+
+def test_limits():
+    x = jnp.asarray([-800.0, 800.0, np.inf, -np.inf, np.nan])
+    seen = np.asarray(elementary.exp(x, ZERO))
+    assert np.array_equal(seen, np.array([0, np.inf, np.inf, 0, np.nan]), equal_nan=True)
+    assert np.isnan(np.asarray(elementary.log(jnp.asarray([0.0, -1.0]), ZERO))).all()
+
+
+def formula(x, y):
+    """Products that a compiler contracts into sums, and quotients that it turns into products."""
+    s = x * y
+    return s * (s + s - 1) / 3.7 - x * x * y / (y + 0.3), jnp.exp(-x) * y + jnp.cos(x * y) - x**y
+
+
+def test_compiled_and_operation_by_operation_agree_to_the_last_bit():
+    rng = np.random.default_rng(1)
+    x, y = (jnp.asarray(rng.uniform(0.1, 3, 4001)) for _ in range(2))
+    ours = jax.jit(lambda x, y, zero: reproducible(formula, zero)(x, y))
+    with jax.disable_jit():
+        eager = reproducible(formula, ZERO)(x, y)
+    for a, b in zip(ours(x, y, ZERO), eager, strict=True):
+        assert np.array_equal(np.asarray(a), np.asarray(b))
+    # the formula itself is one that compilers change
+    compiled, plain = jax.jit(formula)(x, y)[0], formula(x, y)[0]
+    assert not np.array_equal(np.asarray(compiled), np.asarray(plain))

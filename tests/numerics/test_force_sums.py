@@ -14,7 +14,7 @@ from rollout.harness import liquid, write_system
 
 from mdnum.md.cell import wrap_positions
 from mdnum.numerics.reductions import BY_NAME, Exact
-from mdnum.numerics.running import Tap, running_sum_table
+from mdnum.numerics.sums import Tap, running_sum_table
 from mdnum.systems import load
 from mdnum.systems.build import build
 

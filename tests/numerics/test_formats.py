@@ -1,4 +1,4 @@
-"""Formats, against numpy's own casts, exact fractions and known tables."""
+"""Formats and roles, against numpy's own casts, exact fractions and known tables; loss scaling."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from mdnum.errors import InputError
 from mdnum.numerics.formats import (
     FORMATS,
     cast,
+    check_scale,
     format_of,
     matmul,
     quantize,
     round_to,
+    scaled_gradient,
     stochastic_round,
 )
-from mdnum.numerics.roles import ALL
+from mdnum.numerics.roles import ALL, PrecisionPolicy, RolePrecision
 
 
 def test_the_table_says_what_the_dtypes_say():
@@ -44,19 +46,13 @@ FINITE = st.floats(-1e5, 1e5) | st.floats(-1e-4, 1e-4) | st.floats(-1e-7, 1e-7)
 ROUND = {name: jax.jit(lambda x, name=name: round_to(x, name)) for name in FORMATS}
 
 
-@given(st.lists(FINITE, min_size=20, max_size=20))
-def test_rounding_to_float16_is_numpys(values):
-    x = np.array(values)
-    with np.errstate(over="ignore"):
-        expected = x.astype(np.float16).astype(np.float64)
-    assert np.array_equal(np.asarray(ROUND["float16"](jnp.asarray(x))), expected)
-
-
-@given(st.lists(st.floats(width=32, min_value=-(2.0**127), max_value=2.0**127), min_size=20, max_size=20))
-def test_rounding_to_bfloat16_is_that_of_the_library(values):
+@pytest.mark.parametrize("name", ["float16", "bfloat16"])
+@given(values=st.lists(FINITE.map(np.float32), min_size=20, max_size=20))
+def test_rounding_is_that_of_the_libraries(name, values):
     x = np.array(values, np.float32)
-    expected = x.astype(ml_dtypes.bfloat16).astype(np.float64)
-    assert np.array_equal(np.asarray(ROUND["bfloat16"](jnp.asarray(x.astype(np.float64)))), expected)
+    with np.errstate(over="ignore"):
+        expected = x.astype(ALL[name]).astype(np.float64)
+    assert np.array_equal(np.asarray(ROUND[name](jnp.asarray(x.astype(np.float64)))), expected)
 
 
 @pytest.mark.parametrize("name", ["tf32", "float32", "bfloat16", "float16"])
@@ -159,3 +155,83 @@ def test_a_value_is_quantized_to_the_nearest_of_a_few():
     slope = jax.grad(lambda x: jnp.sum(few(x)))(values)
     # clamped where the nearest is beyond the ends
     assert np.array_equal(np.asarray(slope), [1, 1, 1, 0, 0, 1, 1])
+
+
+# --- loss scaling in float16 -----------------------------------------------------------------------------
+
+X = np.array([0.9, 1.1, 2.3])
+
+
+def loss(x):
+    """Small gradients: among the subnormals of float16, or below them."""
+    half = x.astype(jnp.float16)
+    return jnp.mean(half * half) * jnp.asarray(3e-7, jnp.float16)
+
+
+TRUE = 2 * X.astype(np.float16).astype(float) / 3 * float(np.float16(3e-7))
+
+
+def test_without_scaling_the_gradient_is_quantized_and_with_it_restored():
+    bare, scaled = (scaled_gradient(loss, scale, jnp.asarray(X)) for scale in (1.0, 2.0**12))
+    assert np.abs(np.asarray(bare.gradient) / TRUE - 1).max() > 0.1
+    assert np.abs(np.asarray(scaled.gradient) / TRUE - 1).max() < 2e-3
+    assert scaled.gradient.dtype == jnp.float64
+    assert float(bare.value) == float(scaled.value) == float(loss(jnp.asarray(X)))
+
+
+def test_scaling_by_a_power_of_two_changes_no_bit_of_a_wide_gradient():
+    def wide(x):
+        return jnp.sum(jnp.sin(x) ** 3)
+
+    plain = jax.grad(wide)(jnp.asarray(X))
+    assert np.array_equal(
+        np.asarray(scaled_gradient(wide, 2.0**15, jnp.asarray(X)).gradient), np.asarray(plain)
+    )
+
+
+@pytest.mark.parametrize(("exponent", "finite"), [(9, True), (10, False)])
+def test_a_scale_that_overflows_is_noticed(exponent, finite):
+    def steep(x):
+        return jnp.sum(x.astype(jnp.float16) * jnp.asarray(100.0, jnp.float16)).astype(jnp.float16)
+
+    # 100 * 2^10 overflows 65504, 100 * 2^9 does not
+    assert bool(scaled_gradient(steep, 2.0**exponent, jnp.asarray(X)).finite) is finite
+
+
+@pytest.mark.parametrize("scale", [1000.0, 0.0, -2.0, math.inf, math.nan])
+def test_factors_that_are_not_exact_are_refused(scale):
+    with pytest.raises(InputError, match="is not a power of two"):
+        check_scale(scale)
+    check_scale(2.0**-30)
+
+
+# --- which dtype a role has, and what is refused ----------------------------------------------------------
+
+
+def test_every_role_can_have_its_own_dtype():
+    policy = RolePrecision("float16", "bfloat16", "float32", "float64", "float16")
+    seen = [policy.dtype(role) for role in ("state", "arithmetic", "decision", "accumulate", "loss")]
+    assert seen == [np.float16, ml_dtypes.bfloat16, np.float32, np.float64, np.float16]
+    assert RolePrecision().dtype("state") == np.float64
+    assert RolePrecision.all("bfloat16").dtype("loss") == ml_dtypes.bfloat16
+
+
+def test_what_no_float_is_called_is_refused():
+    with pytest.raises(InputError, match=r"precision\.decision.*'half'.*known are.*bfloat16"):
+        RolePrecision(decision="half")
+    with pytest.raises(InputError, match=r"precision\.rounding.*'up'.*nearest, stochastic"):
+        RolePrecision(rounding="up")
+    with pytest.raises(InputError, match=r"precision\.seed"):
+        RolePrecision(seed=-1)
+
+
+def test_sixteen_bits_are_for_pair_forces_alone():
+    assert PrecisionPolicy(state="float32").dtype("state") == np.float32
+    short = PrecisionPolicy(decision="float32", force="bfloat16")
+    assert short.dtype("force") == ml_dtypes.bfloat16 and short.geometry == np.float32
+    assert PrecisionPolicy(decision="float64", force="float32").geometry == np.float32
+    for role in ("state", "decision", "accumulate"):
+        with pytest.raises(InputError, match=rf"precision\.{role}.*bfloat16 cannot be.*precision.force"):
+            PrecisionPolicy(**{role: "bfloat16"})
+    with pytest.raises(InputError, match=r"precision\.force.*'half'.*known are.*bfloat16"):
+        PrecisionPolicy(force="half")

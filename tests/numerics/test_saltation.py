@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mdnum.ball.exact import ExactImpact
-from mdnum.errors import NumericalError
-from mdnum.numerics.saltation import GRAZING, carry, grazing, saltation, saltation_flagged, time_shift
+from mdnum.numerics.saltation import GRAZING, carry, grazing, saltation_flagged, time_shift
 
 EPS = 2.0**-52
 
@@ -24,6 +23,13 @@ def impact(v, e, g):
         np.array([-e * v, -g]),
         np.array([1.0, 0.0]),
     )
+
+
+def saltation(*event):
+    """The matrix of an event that does not graze."""
+    matrix, touch = saltation_flagged(*event)
+    assert not np.any(touch)
+    return matrix
 
 
 def flight(t):
@@ -153,10 +159,8 @@ def test_batches_and_jax_give_what_single_events_give():
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5 * GRAZING, -0.5 * GRAZING, np.nan])
-def test_a_grazing_event_is_refused_on_the_host_and_flagged_in_jit(speed):
+def test_a_grazing_event_is_flagged(speed):
     reset, before, after, normal = impact(speed * 9.81, 0.8, 9.81)
-    with pytest.raises(NumericalError, match=r"grazes.*expected above.*Move the start"):
-        saltation(reset, before, after, normal)
     with jax.enable_x64(True):
         matrix, touch = jax.jit(saltation_flagged)(*map(jnp.asarray, (reset, before, after, normal)))
         assert bool(touch)
@@ -167,9 +171,8 @@ def test_a_grazing_event_is_refused_on_the_host_and_flagged_in_jit(speed):
             assert np.all(np.isfinite(np.asarray(slope(jnp.asarray(before)))))
 
 
-def test_the_event_that_grazes_is_named():
+def test_of_several_events_the_one_that_grazes_is_flagged():
     reset, before, after, normal = (np.stack([x] * 3) for x in impact(-2.0, 0.8, 9.81))
     before[1, 0] = 0.0
     assert grazing(before, normal).tolist() == [False, True, False]
-    with pytest.raises(NumericalError, match="event 1"):
-        saltation(reset, before, after, normal)
+    assert saltation_flagged(reset, before, after, normal)[1].tolist() == [False, True, False]

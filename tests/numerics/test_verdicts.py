@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.numerics.verdicts import Dates, Delay, expected, growth, judge, split_of
+from mdnum.numerics import verdicts
+from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, expected, growth, split_of
+from mdnum.verbs.fork_verdict import TEXTS
+
+
+def judge(*given, **options) -> ForkVerdict:
+    """The verdict, each of whose reasons has a sentence for its values."""
+    verdict = verdicts.judge(*given, **options)
+    for code, values in verdict.reasons:
+        assert TEXTS(f"reason_{code}", **values, unit="σ").endswith(".")
+    return verdict
 
 
 def grown(rate: float, steps: int, start: float = 1e-15, top: float = 3.0) -> np.ndarray:
@@ -137,8 +147,9 @@ def test_first_steps_predict_nothing():
 
 
 def test_an_end_of_one_run_is_a_fork_by_itself():
-    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended={"run": "B"})
-    assert verdict.word == "open" and verdict.reasons[0] == ("ended", {"run": "B", "steps": 0})
+    ended = {"run": "B", "word": "runaway", "step": 0, "other": "A"}
+    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended=ended)
+    assert verdict.word == "open" and verdict.reasons == (("ended", {**ended, "steps": 0}),)
 
 
 def test_a_split_under_the_others_decisions_alone_is_told(free):

@@ -67,17 +67,6 @@ def test_every_pair_potential_and_cutoff(kind: str, cutoff: str):
     np.testing.assert_allclose(form(r)[1], slope, rtol=1e-7, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("cutoff", "energy", "slope"),
-    [("hard", 1, 1), ("shifted", 0, 1), ("force-shifted", 0, 0), ("switched", 0, 0)],
-)
-def test_what_is_left_at_the_cutoff(cutoff: str, energy: int, slope: int):
-    form = pair_forms(make(crystal(2), LJ, {"kind": cutoff, "radius": 2.5}).spec, ("Ar",))["Ar", "Ar"]
-    bare, cut = form.bare(np.array([2.5])), form(np.array([2.5]))
-    np.testing.assert_allclose(cut[0], energy * bare[0], atol=1e-16)
-    np.testing.assert_allclose(cut[1], slope * bare[1], atol=1e-15)
-
-
 @pytest.mark.parametrize("cutoff", ["hard", "shifted", "switched"])
 def test_mixtures_as_sums_over_species(cutoff: str):
     """Kob-Andersen: three sets of constants out of a class that has one."""

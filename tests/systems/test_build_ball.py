@@ -9,8 +9,8 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from mdnum.ball import contacts, integrators, stopping
 from mdnum.ball import problem as losses
+from mdnum.ball import step, stopping
 from mdnum.errors import InputError
 from mdnum.numerics.reductions import Blocked, Permuted
 from mdnum.systems import build_ball, load
@@ -79,7 +79,7 @@ def test_controls():
 
 def test_contacts_and_integrators():
     spring = problem(spec({**SPRING, "damping": 2.0})).world
-    assert isinstance(spring.contact, contacts.Penalty)
+    assert isinstance(spring.contact, step.Penalty)
     assert (float(spring.contact.k), float(spring.contact.damping), spring.contact.smooth) == (
         100.0,
         2.0,
@@ -90,13 +90,13 @@ def test_contacts_and_integrators():
     assert float(soft.eps) == 0.1
     table = spec(SOLVED, stop={"rule": "sum", "tol": 1e-3, "max_iter": 7})
     solved = problem(table).world.contact
-    assert isinstance(solved, contacts.Projection)
+    assert isinstance(solved, step.Projection)
     assert (float(solved.k), float(solved.alpha), float(solved.restitution)) == (0.5, 0.25, 0.75)
     for kind, made in (
-        ("explicit-euler", integrators.ExplicitEuler),
-        ("semi-implicit-euler", integrators.SemiImplicitEuler),
-        ("velocity-verlet", integrators.BallVerlet),
-        ("event-located", integrators.EventLocated),
+        ("explicit-euler", step.ExplicitEuler),
+        ("semi-implicit-euler", step.SemiImplicitEuler),
+        ("velocity-verlet", step.BallVerlet),
+        ("event-located", step.EventLocated),
     ):
         world = problem(spec(IMPACT, integrator={**EULER, "kind": kind})).world
         assert type(world.integrator) is made
@@ -153,7 +153,7 @@ def test_build_makes_every_variant_and_takes_other_steps():
     names = [variant.name for variant in built.variants]
     assert names == ["float32", "velocity-verlet", "explicit-euler"]
     assert all(variant.problem.steps == 12 for variant in built.variants)
-    assert isinstance(built.variants[1].problem.world.integrator, integrators.BallVerlet)
+    assert isinstance(built.variants[1].problem.world.integrator, step.BallVerlet)
     assert built.problem.run().steps == 12
 
 

@@ -16,8 +16,8 @@ from command_line import call, printed
 import mdnum
 from mdnum.errors import FolderError, InputError
 from mdnum.forks import Twin, choices
-from mdnum.forks.screen import Screened
-from mdnum.forks.tangent import Lyapunov
+from mdnum.forks.linearized import Lyapunov
+from mdnum.forks.pair import Screened
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.verdicts import Dates, Delay, Growth
 from mdnum.provenance import hashes
@@ -295,7 +295,7 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         progress(0, 4, "early")
         return rows
 
-    monkeypatch.setattr("mdnum.forks.screen.screen", screen)
+    monkeypatch.setattr("mdnum.forks.pair.screen", screen)
     found = mdnum.fork(name, "all", steps=100, out=tmp_path / "x", progress=lambda *given: seen.append(given))
     assert found.result == rows
     assert [row["choice"] for row in found.summary["ranking"]] == ["early", "late", "never"]
@@ -382,7 +382,7 @@ def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, mo
 def test_an_exponent_that_is_none_says_why(crystal, monkeypatch, rate, chaotic):
     size = rate * np.arange(401.0)
     lyapunov = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
-    monkeypatch.setattr("mdnum.forks.tangent.lyapunov", lambda *given: lyapunov)
+    monkeypatch.setattr("mdnum.forks.linearized.lyapunov", lambda *given: lyapunov)
     found = fork_pair._exponent(crystal.result)
     assert (found["lyapunov_reason"] is None) == chaotic
     ratio = crystal.result.growth["B"].rate / rate

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import stat
-import subprocess
 import sys
 
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 from command_line import call, printed
 
 import mdnum
-from mdnum.forks import variants
+from mdnum.forks import processes
 from mdnum.forks.exact.certify import MD_POLICIES
 from mdnum.forks.exact.program import installed
-from mdnum.forks.variants import Ran, Variant
+from mdnum.forks.processes import Ran, Variant
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.verbs import frame
@@ -101,20 +100,21 @@ def test_who_leaves_first_is_the_headline(ball):
 LEAVES, FEW_STEPS = {"AVX": (3, 1e-15), "reversed": (2, 4e-15)}, 6
 
 
-def stand_in(variant: Variant, folder, k: int, steps: int):
+def stand_in(variant: Variant, question, file):
     """A process that takes no time: its positions leave the start's from a given step on."""
     if variant.name == "SSE4.2":
-        return Ran(variant, (), -1, None, float("nan"), 0.5, "took longer than 600 s"), None
+        return Ran(variant, (), "took longer than 600 s", 0.5), None
     first, rate = LEAVES.get(variant.name, (FEW_STEPS + 1, 0.0))
-    x = np.tile(load(folder / "system", world="md").atoms.positions.T, (steps, 1, 1))
+    steps = question["steps"]
+    x = np.tile(load(question["path"], world="md").atoms.positions.T, (steps, 1, 1))
     for step in range(first, steps + 1):
         x[step - 1, 0, 7] += rate * 2.0**step
-    return Ran(variant, tuple(row.tobytes().hex()[:4096] for row in x), -1, None, 0.0, 0.5), x
+    return Ran(variant, tuple(row.tobytes().hex()[:4096] for row in x), "", 0.5), x
 
 
 def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
-    monkeypatch.setattr(variants, "_process", stand_in)
-    which = [variants.REFERENCE, Variant("again"), Variant("AVX"), Variant("reversed"), Variant("SSE4.2")]
+    monkeypatch.setattr(processes, "_ran", stand_in)
+    which = [processes.REFERENCE, Variant("again"), Variant("AVX"), Variant("reversed"), Variant("SSE4.2")]
     compared = mdnum.fork_processes("argon/crystal-108", steps=FEW_STEPS, which=which, out=tmp_path / "x")
     folder, summary = RunFolder.open(compared.folder), compared.summary
     table = folder.read("variants")
@@ -133,27 +133,30 @@ def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
 
 def test_programs_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(variants, "_process", stand_in)
+    monkeypatch.setattr(processes, "_ran", stand_in)
     assert call("fork", "processes", "argon/crystal-108", "--steps", str(FEW_STEPS), "--no-report") == 1
     lines = printed(capsys)
     assert any("reversed" in line and " 2 6 " in line for line in lines)
     assert any("SSE4.2 took longer than 600 s" in line for line in lines)
 
 
+def python_that(does: str, tmp_path, monkeypatch) -> None:
+    """In place of Python, a script."""
+    script = tmp_path / "python"
+    script.write_text(f"#!/bin/sh\n{does}\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr(sys, "executable", str(script))
+
+
 def test_what_a_process_says_stays_out_of_the_output(tmp_path, monkeypatch, capfd):
-    talker = tmp_path / "python"
-    talker.write_text('#!/bin/sh\necho spam\necho "  it broke " >&2\nexit 3\n')
-    talker.chmod(talker.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setattr(sys, "executable", str(talker))
-    row, x = variants._process(variants.REFERENCE, tmp_path, 0, 3)
+    python_that('echo spam\necho "  it broke " >&2\nexit 3', tmp_path, monkeypatch)
+    row, x = processes._ran(processes.REFERENCE, {}, tmp_path / "0")
     assert x is None and row.failed == "it broke"
     assert capfd.readouterr().out == ""
 
 
 def test_a_process_that_takes_too_long_is_a_row(tmp_path, monkeypatch):
-    def never(command, timeout, **_):
-        raise subprocess.TimeoutExpired(command, timeout)
-
-    monkeypatch.setattr(subprocess, "run", never)
-    row, x = variants._process(variants.REFERENCE, tmp_path, 0, 3)
-    assert x is None and row.failed == f"took longer than {variants._TIMEOUT} s"
+    python_that("exec sleep 60", tmp_path, monkeypatch)
+    monkeypatch.setattr(processes, "_TIMEOUT", 0.2)
+    row, x = processes._ran(processes.REFERENCE, {}, tmp_path / "0")
+    assert x is None and row.failed == "took longer than 0.2 s"

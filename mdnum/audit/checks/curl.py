@@ -10,7 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import AuditCheck, CheckResult, Progress, Skipped, TimeUp, ask_each, finding
+from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
@@ -59,16 +59,16 @@ class CurlCheck(AuditCheck):
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         atoms, noise = settled(worker, rng, at_least=FEW)
-        skipped: list[Skipped] = []
+        ways = Ways()
         wanted = list(_planes(worker, atoms, rng))
 
-        def asked(plane: str, u: Displacement, v: Displacement) -> Loop:
-            return agreed([around(worker, atoms, u, v, radius, noise, plane) for radius in _RADII])
+        def asked(plane: tuple[str, Displacement, Displacement]) -> Loop:
+            name, u, v = plane
+            return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in _RADII])
 
-        ways = [(f"a loop of {one[0]}", lambda one=one: asked(*one)) for one in wanted]
-        loops = list(ask_each(worker, ways, progress, self.name, skipped, spread=True).values())
-        if not loops:
-            raise TimeUp
+        name = lambda plane: f"a loop of {plane[0]}"  # noqa: E731
+        found = ways.each(worker, wanted, name, asked, progress, self.name, spread=True, required=True)
+        loops = list(found.values())
         wrong = [one for one in loops if not one.conservative]
         worst = max(wrong, key=lambda one: one.share, default=None)
         limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
@@ -92,9 +92,7 @@ class CurlCheck(AuditCheck):
             findings=found,
             tables={"Work around closed loops": [_row(one) for one in loops]},
             numbers=numbers,
-            skipped=skipped,
-            asked=len(loops),
-            possible=len(wanted),
+            **vars(ways),
         )
 
 

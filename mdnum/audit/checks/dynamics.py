@@ -18,17 +18,7 @@ from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, Chart, CheckResult, Observed, Progress, finding
 from mdnum.audit.curve import SMOOTH
-from mdnum.audit.energy import (
-    Drift,
-    EnergyBalance,
-    NveRun,
-    at,
-    balance,
-    crossings,
-    drift,
-    ratio,
-    wandering,
-)  # fmt: skip
+from mdnum.audit.energy import Drift, EnergyBalance, NveRun, balance, crossings, drift, ratio, wandering
 from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, direction, displaced, roomy
 from mdnum.audit.structures import group
 from mdnum.audit.subject import CalculatorSubject, largest, rms
@@ -108,14 +98,14 @@ class DynamicsCheck(AuditCheck):
             )
         half, _ = run(subject.fresh(), start, step / 2, 2 * count, each(count + count // 4))
         probe = subject.fresh()
-        noise = along_a_line(probe, at(start, start.positions), rng)
+        noise = along_a_line(probe, whole.at(start.positions), rng)
         progress(0, 0, {"phase": "accounting for the energy"})
-        found = balance(probe, whole, start, limits, rng, noise.energy)
+        found = balance(probe, whole, limits, rng, noise.energy)
         # the other run's flips count only where they bring energy
-        finer = crossings(half, start, limits) if any(one.order == 0 for one in limits) else []
+        finer = crossings(half, limits) if any(one.order == 0 for one in limits) else []
         # largest difference of the run's energies from those of objects that saw nothing else
         places = np.unique(np.linspace(0, len(whole.potential) - 1, _COMPARED).astype(int))
-        again = [subject.fresh().energy(at(start, whole.positions[n])) for n in places]
+        again = [subject.fresh().energy(whole.at(whole.positions[n])) for n in places]
         stale = largest(np.array(again) - whole.potential[places])
         allowed = 40 * max(noise.energy, np.finfo(float).eps * largest(whole.potential))
         brought = found.by_means(finer, len(half.potential))
@@ -136,9 +126,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 def _only_molecules(subject: CalculatorSubject) -> bool:
     """Whether the calculator takes whole molecules alone, whose inner distances it does not know."""
-    return rigid(subject.atoms) is not None and isinstance(
-        subject.fresh().try_both(subject.atoms[:-1]), CalculatorError
-    )
+    return rigid(subject.atoms) is not None and not subject.fresh().answers(subject.atoms[:-1])
 
 
 @dataclass(frozen=True)
@@ -290,9 +278,9 @@ class TwoRuns:
     ) -> dict[str, list[dict[str, Any]]]:
         means, units = self.balance.means, self.subject.units
         flips = []
-        for place, limit in enumerate(self.limits):
-            mine = [one for one in self.balance.crossed if one.threshold == place]
-            entered, jump = sum(one.entered for one in mine), 1e3 * means.get(place, float("nan"))
+        for limit in self.limits:
+            mine = [one for one in self.balance.crossed if one.threshold == limit]
+            entered, jump = sum(one.entered for one in mine), 1e3 * means.get(limit, float("nan"))
             if mine:
                 flips.append({
                     "pair": "-".join(limit.species), "at (Å)": limit.radius, "entered": entered,
@@ -359,7 +347,7 @@ class TwoRuns:
         return {
             "run": ["run"] * len(crossed),
             **{name: [getattr(one, name) for one in crossed] for name in names},
-            "threshold": [self.limits[one.threshold].radius for one in crossed],
+            "threshold": [one.threshold.radius for one in crossed],
             "energy_jump": [measured.get(n, float("nan")) for n in range(len(crossed))],
         }
 
@@ -466,7 +454,7 @@ def run(
         np.array(column, np.float64) for column in zip(*rows, strict=True)
     )
     atoms.calc = None
-    return NveRun(timestep, potential, kinetics, positions, forces, blown_up), atoms
+    return NveRun(start, timestep, potential, kinetics, positions, forces, blown_up), atoms
 
 
 @dataclass

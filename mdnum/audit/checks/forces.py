@@ -18,14 +18,12 @@ from mdnum.audit.base import (
     CheckResult,
     Observed,
     Progress,
-    Skipped,
-    TimeUp,
-    ask_each,
+    Ways,
     finding,
-)  # fmt: skip
+)
 from mdnum.audit.checks import invariance
 from mdnum.audit.noise import FEW, NoiseFloor, direction, displaced, precision, settled, steps
-from mdnum.audit.subject import CalculatorSubject, no_rounding, only_trying, rms
+from mdnum.audit.subject import CalculatorSubject, no_rounding, rms
 
 #: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
 _LADDER = 0.064 * 0.25 ** np.arange(9)
@@ -90,15 +88,13 @@ class ForcesCheck(AuditCheck):
         atoms, noise = settled(worker, rng, at_least=FEW)
         forces = worker.forces(atoms)
         scale = rms(forces)
-        skipped: list[Skipped] = []
         wanted = list(_directions(atoms, rng))
-        ways = [
-            (f"moving {what}", lambda what=what, line=line: slope(worker, atoms, line, forces, noise, what))
-            for what, line in wanted
-        ]
-        found = ask_each(worker, ways, progress, self.name, skipped, spread=True)
-        if not found:
-            raise TimeUp
+        ways = Ways()
+        found = ways.each(
+            worker, wanted, lambda way: f"moving {way[0]}",
+            lambda way: slope(worker, atoms, way[1], forces, noise, way[0]),
+            progress, self.name, spread=True, required=True,
+        )  # fmt: skip
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = list(_judged_sums(sums, scale))
         if wrong_sums or not all(one.agrees for one in slopes):
@@ -146,9 +142,7 @@ class ForcesCheck(AuditCheck):
             },
             charts=[_chart(slopes)],
             numbers=numbers,
-            skipped=skipped,
-            asked=len(slopes),
-            possible=len(wanted),
+            **vars(ways),
         )
 
 
@@ -211,7 +205,7 @@ def slope(
     off = np.abs(2 * _LADDER * (central - better[best + 1]))
     odd = np.append(False, off[1:] > 0.25 * off[:-1])
     rung = int(np.argmax(np.where(odd, off, 0.0)))
-    if odd[rung] and no_rounding(off[rung], plus[rung], 0.0, None, subject.kT):
+    if odd[rung] and no_rounding(off[rung], 0.0, (plus[rung], None), subject.kT):
         for sign, energies in ((1, plus), (-1, minus)):
             subject.again(displaced(atoms, sign * _LADDER[rung] * line), float(energies[rung]))
     # a difference that grows like 1/h down to the smallest h shows a step of the energy
@@ -357,7 +351,7 @@ def _two_energies(
     changes: list[tuple[str, float]] = []
     for same in (one for kind in kinds for one in islice(kind(atoms, rng), 1)):
         try:
-            with only_trying(subject):
+            with subject.trying():
                 changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
         except CalculatorError:
             continue  # reported elsewhere

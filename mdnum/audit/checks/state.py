@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,19 +20,10 @@ from mdnum.audit.base import (
     Skipped,
     TimeUp,
     finding,
-)  # fmt: skip
+)
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.structures import Pair, molecules, pairs, whole
-from mdnum.audit.subject import (
-    Answered,
-    CalculatorSubject,
-    Forces,
-    differences,
-    largest,
-    not_repeatable,
-    only_trying,
-    rms,
-)  # fmt: skip
+from mdnum.audit.subject import Answered, CalculatorSubject, Forces, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -94,7 +86,6 @@ class StateCheck(AuditCheck):
         tolerance = _tolerance(subject, atoms)
         alone = Alone(subject, atoms, noise)
         self.structures |= alone.structures
-        broken = [row for row in rows if row.remembers and row.broken]
         stale = [row for row in rows if row.remembers and not row.broken]
         chance: dict[str, Any] = {}
         if stale and not _again(subject, sequences, stale):
@@ -120,7 +111,9 @@ class StateCheck(AuditCheck):
             says=([f"state_{says}", f"state_{how}"], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
-                *self._judged(stale, tolerance, atoms, broken, refused),
+                *self._memory(stale),
+                *_kept(tolerance, atoms),
+                *self._failures(rows),
                 *_changed_input(subject, atoms),
                 *alone.findings(),
             ],
@@ -132,21 +125,14 @@ class StateCheck(AuditCheck):
             numbers=numbers,
             skipped=[
                 *skipped,
-                *((row.what, row.refused.message) for row in refused if row.refused),
+                *((row.what, row.why) for row in refused),
                 *((what, error.message) for what, error in alone.refused),
             ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
 
-    def _judged(
-        self,
-        stale: list[Comparison],
-        tolerance: float,
-        atoms: Atoms,
-        broken: list[Comparison],
-        refused: list[Comparison],
-    ) -> Iterator[Observed]:
+    def _memory(self, stale: list[Comparison]) -> Iterator[Observed]:
         if stale:
             worst = max(stale, key=lambda row: row.energy)
             self.structures |= {"stale-before": worst.before, "stale-after": worst.atoms}
@@ -155,14 +141,14 @@ class StateCheck(AuditCheck):
                 energy=worst.energy, force=worst.force, allowed=worst.allowed, why=worst.why,
                 questions=len(stale), sequences=", ".join(sorted({row.sequence for row in stale})),
             )  # fmt: skip
-        if tolerance:
-            severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
-            yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
-        if broken:
-            yield finding("BROKEN_BY_FAILURE", "info", step=broken[0].what, why=broken[0].why)
-        if empty := [row for row in refused if row.refused and row.refused.cause is None]:
-            self.structures["not-finite"] = empty[0].atoms
-            yield finding("NOT_FINITE", "error", step=empty[0].what, why=empty[0].why)
+
+    def _failures(self, rows: list[Comparison]) -> Iterator[Observed]:
+        for row in [row for row in rows if row.remembers and row.broken][:1]:
+            yield finding("BROKEN_BY_FAILURE", "info", step=row.what, why=row.why)
+        empty = (row for row in rows if row.refused and not row.remembers and row.refused.cause is None)
+        if row := next(empty, None):
+            self.structures["not-finite"] = row.atoms
+            yield finding("NOT_FINITE", "error", step=row.what, why=row.why)
 
 
 @dataclass
@@ -207,15 +193,12 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
-        with only_trying(subject):
+        with subject.trying():
             found = pairs(subject)[0]
     except CalculatorError as error:
         return {}, [(what, error.message)]
-    for pair in found[:1]:
-        radii = [one.radius for one in thresholds if set(one.species) == set(pair.species)]
-        if radii:
-            return dict(approaches(pair, max(radii))), []
-    return {}, [(what, "no cutoff was found")]
+    radii = [one.radius for one in thresholds if found and set(one.species) == set(found[0].species)]
+    return (dict(approaches(found[0], max(radii))), []) if radii else ({}, [(what, "no cutoff was found")])
 
 
 def _through(
@@ -291,7 +274,7 @@ def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
             used.forget()
     objects = [within[0], *(subject.fresh().both(atoms) for _ in range(_NEW - 1))]
 
-    def spread(answers: list[tuple[float, Forces]]) -> tuple[bool, float, float]:
+    def spread(answers: list[tuple[float, np.ndarray]]) -> tuple[bool, float, float]:
         (energy, forces), *others = answers
         same = all(one[0] == energy and one[1].tobytes() == forces.tobytes() for one in others)
         force = np.max(np.ptp([one[1] for one in answers], axis=0), initial=0.0)
@@ -313,12 +296,12 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
     within = not repeats["bit-identical"]
     if not within and repeats["bit-identical between objects"] and not chance:
         return
-    sizes = [
+    energy, force = (
         max(repeats[f"{what} scatter by"], repeats[f"{what} between objects"], chance.get(one, 0.0))
         for what, one in (("energies", "energy"), ("forces", "force"))
-    ]
+    )
     how = "chance" if chance else "within" if within else "between"
-    yield not_repeatable(how, *sizes, repeats["typical force"], kT, answers=chance.get("answers", 0))
+    yield not_repeatable(how, energy, force, repeats["typical force"], kT, answers=chance.get("answers", 0))
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
@@ -371,13 +354,19 @@ def _grain(atoms: Atoms) -> float:
     return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
 
 
+def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
+    if tolerance:
+        severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
+        yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
+
+
 def _changed_input(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
     for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other = subject.fresh()
         try:
-            with only_trying(other):
+            with other.trying():
                 changed = other.writes(there)
         except CalculatorError:
             continue  # reported elsewhere
@@ -408,73 +397,70 @@ class Alone:
         self.rows: list[dict[str, Any]] = []
         self.refused: list[tuple[str, CalculatorError]] = []
         self.structures: dict[str, Atoms] = {}
-        self._ask, self._noise = lambda there: subject.fresh().try_both(there), noise
+        self._subject, self._noise = subject, noise
         species = list(dict.fromkeys(atoms.symbols))
         single: dict[str, float] = {}
-        for symbol in species:
-            for periodic in (False, True):
-                one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-                answer = self._ask(one)
-                if not isinstance(answer, CalculatorError):
-                    single.setdefault(symbol, answer[0])
-                what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
-                self._add(what, answer, single.get(symbol), one)
+        for symbol, periodic in product(species, (False, True)):
+            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
+            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
+            energy = self._ask(what, one, single.get(symbol))
+            if energy is not None:
+                single.setdefault(symbol, energy)
         two = (species[0], species[-1])
         pair = Atoms(two, positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]], cell=[_BOX] * 3)
         expected = single[two[0]] + single[two[1]] if set(two) <= set(single) else None
-        self._add(f"{two[0]} and {two[1]} {_FAR:g} Å apart", self._ask(pair), expected, pair)
+        self._ask(f"{two[0]} and {two[1]} {_FAR:g} Å apart", pair, expected)
         cluster = atoms[: min(len(atoms), _CLUSTER)]
         cluster.pbc = False
         cluster.positions += 1.0 - cluster.positions.min(axis=0)
         cluster.set_cell([_BOX + float(np.ptp(cluster.positions, axis=0).max())] * 3)
-        near = self._ask(cluster)
+        near = subject.fresh().try_both(cluster)
         failed = isinstance(near, CalculatorError)
         # one that knows whole molecules alone takes nothing of which an atom is gone; one that fails on an
         # atom without neighbors may fail on the cluster, and takes the structure with a vacancy
         fewer = (atoms[:-1],) if failed else (cluster[:-1], atoms[:-1])
-        self.takes_atoms = any(not isinstance(self._ask(one), CalculatorError) for one in fewer)
+        self.takes_atoms = any(subject.fresh().answers(one) for one in fewer)
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
-        elif not self.takes_atoms:
-            self._molecules(atoms)
-        else:
+        elif self.takes_atoms:
             symbol = str(atoms.symbols[0])
             far = cluster + Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-            both = self._ask(far)
-            if not isinstance(both, CalculatorError):
-                both = both[0], both[1][-1:]
             expected = near[0] + single[symbol] if symbol in single else None
-            self._add(f"a {symbol} atom {_FAR:g} Å from a cluster", both, expected, far)
+            what = f"a {symbol} atom {_FAR:g} Å from a cluster"
+            self._ask(what, far, expected, lambda forces: forces[-1:])
+        else:
+            one = whole(atoms, molecules(atoms)[0])
+            one.positions += [1.0, 2.0, 3.0]
+            one.set_cell([_BOX] * 3)
+            both, formula = one + displaced(one, np.array([_FAR, 0.0, 0.0])), one.get_chemical_formula()
+            # within a molecule there are forces, on it as a whole there is none
+            felt = lambda forces: forces.reshape(-1, len(one), 3).sum(axis=1)  # noqa: E731
+            energy = self._ask(f"one {formula}", one, None, felt)
+            self._ask(f"two {formula} {_FAR:g} Å apart", both, energy and 2 * energy, felt)
 
-    def _molecules(self, atoms: Atoms) -> None:
-        """One molecule alone, and two far apart."""
-        one = whole(atoms, molecules(atoms)[0])
-        one.positions += [1.0, 2.0, 3.0]
-        one.set_cell([_BOX] * 3)
-        other = displaced(one, np.array([_FAR, 0.0, 0.0]))
-        formula, energy = one.get_chemical_formula(), None
-        for what, there in ((f"one {formula}", one), (f"two {formula} {_FAR:g} Å apart", one + other)):
-            answer = self._ask(there)
-            if not isinstance(answer, CalculatorError):
-                # within a molecule there are forces, on it as a whole there is none
-                answer = answer[0], answer[1].reshape(-1, len(one), 3).sum(axis=1)
-                energy = answer[0] if energy is None else energy
-            self._add(what, answer, None if energy is None else energy * len(there) / len(one), there)
-
-    def _add(self, what: str, answer: Answered, expected: float | None, atoms: Atoms) -> None:
-        """Take note of an answer; without an expected energy, only of its force."""
+    def _ask(
+        self,
+        what: str,
+        atoms: Atoms,
+        expected: float | None,
+        felt: Callable[[Forces], np.ndarray] = np.asarray,
+    ) -> float | None:
+        """The energy of a structure, of which note is taken; without an expected one, only of its force."""
+        answer = self._subject.fresh().try_both(atoms)
         if isinstance(answer, CalculatorError):
             self.refused.append((what, answer))
             if answer.cause is None:
                 self.structures["alone-failed"] = atoms
-            return
-        force, expected = largest(answer[1]), answer[0] if expected is None else expected
+            return None
+        energy, force = answer[0], largest(felt(answer[1]))
+        expected = energy if expected is None else expected
         allowed = _ALLOWED * max(self._noise.energy, _EPS * abs(expected))
         self.rows.append({
-            "atoms": what, "energy (eV)": answer[0], "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(answer[0] - expected) <= allowed,
+            "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
+            "adds up": abs(energy - expected) <= allowed,
             "no force": force <= _ALLOWED * max(self._noise.force, _EPS),
         })  # fmt: skip
+        return energy
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""

@@ -27,17 +27,13 @@ from mdnum.forks.choices.base import (
     summing,
     world_of,
 )
-from mdnum.forks.worlds import program_of, twin, varied
+from mdnum.forks.worlds import ROLES, program_of, twin, varied
 from mdnum.numerics import reductions
 from mdnum.numerics.roles import ALL, WIDE, check_role
 from mdnum.program import Twin
 from mdnum.systems import System
 from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
 
-ROLES = {
-    "md": ("state", "force", "decision", "accumulate"),
-    "ball": ("state", "arithmetic", "decision", "accumulate"),
-}
 #: What "precision" without a role means: of molecular dynamics all but what is carried from step to step.
 _DEFAULT = {"md": ("force", "decision", "accumulate"), "ball": ROLES["ball"]}
 #: As jax-md names its formats.
@@ -148,11 +144,7 @@ class Summation(Choice):
 
 
 def sums_residuals(system: Any) -> None:
-    """Refuse a ball's system whose steps sum nothing over several balls.
-
-    Raises:
-        InputError: they sum nothing; the message is the reason.
-    """
+    """Refuse a ball's system whose steps sum nothing over several balls, with an `InputError`."""
     stop = system.spec.stop
     applies(stop is not None, "its steps solve nothing, so there is no residual to sum")
     reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
@@ -13,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
-from mdnum.registry import Registry
+from mdnum.registry import Registry, nearest
 from mdnum.systems import BallSystem, System
 from mdnum.systems.load import world_of
 
@@ -194,9 +193,8 @@ def parse(text: str, world: str | None = None) -> Choice:
             return kind.parse(argument, role, both or None)
     worlds = _WORLDS if world is None else (world,)
     families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
-    known = dict.fromkeys([*families, *(name for one in worlds for name in shipped(one))])
-    close = difflib.get_close_matches(text, known, n=3)
-    near = f"Did you mean {' or '.join(close)}? " if close else ""
+    close = nearest(text, [*families, *(name for one in worlds for name in shipped(one))])
+    near = f"Did you mean {close}? " if close else ""
     raise InputError(
         f"no choice {text!r}", remedy=f"{near}There are {', '.join(families)}; `mdnum fork` lists all"
     )
@@ -206,31 +204,19 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Refuse an argument.
-
-    Raises:
-        InputError: it is not good.
-    """
+    """Refuse an argument that is not good, with an `InputError`."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
 
 def applies(is_so: bool, reason: str) -> None:
-    """Say why a choice does not apply to a system, where it does not.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Say, with an `InputError`, why a choice does not apply to a system, where it does not."""
     if not is_so:
         raise InputError(reason)
 
 
 def number(text: str, kind: type, where: str) -> Any:
-    """A number from a choice's argument.
-
-    Raises:
-        InputError: it is none.
-    """
+    """A number from a choice's argument; an `InputError` where it is none."""
     try:
         return kind(text)
     except ValueError:
@@ -239,11 +225,7 @@ def number(text: str, kind: type, where: str) -> Any:
 
 
 def some(count: int, where: str) -> None:
-    """Refuse 0 ulps or iterations.
-
-    Raises:
-        InputError: it is 0.
-    """
+    """Refuse 0 ulps or iterations, with an `InputError`."""
     check(count != 0, "0 change nothing", where, "Write +1 or -1")
 
 
@@ -270,8 +252,7 @@ def summing(both: str | None) -> str:
 def built(system: System, both: str | None = None) -> Any:
     """A system's simulation, with another order of its force sums, such as "exact" or "permuted:3".
 
-    Raises:
-        InputError: a many-body potential, of which there is none.
+    A many-body potential has none: an `InputError`.
     """
     if both is not None:
         applies(is_pairwise(system), "the sums of a many-body potential have one order")

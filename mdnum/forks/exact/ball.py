@@ -8,16 +8,21 @@ from fractions import Fraction
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
-from mdnum.ball.contacts import Impact, Penalty, Projection
-from mdnum.ball.integrators import BallVerlet, ExplicitEuler, SemiImplicitEuler
 from mdnum.ball.rollout import BallRun
-from mdnum.ball.state import BallState
+from mdnum.ball.step import (
+    BallState,
+    BallVerlet,
+    ExplicitEuler,
+    Impact,
+    Penalty,
+    Projection,
+    SemiImplicitEuler,
+)
 from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.program import Decision
+from mdnum.numerics.events import Ledger
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,31 +94,10 @@ HALF = Dyadic(1, -1)
 Balls = list[Dyadic]
 
 
-@dataclass(frozen=True)
-class BallHistory:
-    """What a world does in exact arithmetic; row s of a decision belongs to the step that makes state s + 1.
-
-    Attributes:
-        steps, balls: of the rollout.
-        y, v: heights (m) and velocities (m/s) as doubles, shape (steps + 1, balls).
-        height: what each contact decision compared with zero, as doubles, shape (steps, balls).
-        contact: the decisions, shape (steps, balls).
-        iterations: of the step's solver, by ball (one count for all is repeated), shape (steps, balls).
-        bits: of the longest number in the end.
-    """
-
-    steps: int
-    balls: int
-    y: Float[np.ndarray, "rows balls"]
-    v: Float[np.ndarray, "rows balls"]
-    height: Float[np.ndarray, "steps balls"]
-    contact: Bool[np.ndarray, "steps balls"]
-    iterations: Int[np.ndarray, "steps balls"]
-    bits: int
-
-
-def ball_history(world: World, start: BallState, steps: int) -> BallHistory:
+def ball_history(world: World, start: BallState, steps: int) -> BallRun:
     """A world's rollout in exact rationals: constants and start are the numbers that it holds.
+
+    What no decision is read from (residuals, margins of stops, the ledger) is left out of the record.
 
     Error: none; only the doubles of the record are rounded.
 
@@ -123,61 +107,28 @@ def ball_history(world: World, start: BallState, steps: int) -> BallHistory:
     if steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")
     program = _ExactBall(world, start)
-    rows = [program.step(index) for index in range(steps)]
-    first = np.array([[float(c) for c in program.first[0]]]), np.array([[float(c) for c in program.first[1]]])
-    return BallHistory(
-        steps,
-        len(program.y),
-        np.concatenate([first[0], np.array([row[0] for row in rows])]),
-        np.concatenate([first[1], np.array([row[1] for row in rows])]),
-        np.array([row[2] for row in rows]),
-        np.array([row[3] for row in rows], bool),
-        np.array([row[4] for row in rows], np.int64),
-        max(c.mantissa.bit_length() for c in (*program.y, *program.v)),
+    first = [[float(c) for c in row] for row in (program.y, program.v)]
+    y, v, height, contact, counts = zip(*(program.step(index) for index in range(steps)), strict=True)
+    iterations = np.array(counts, np.int64)
+    unknown = np.full(iterations.shape, np.nan)
+    none, real = np.zeros(0, np.int64), np.zeros(0)
+    flips = Ledger("contact", none, none[:, None], real > 0, real, real, real)
+    return BallRun(
+        world=world,
+        steps=steps,
+        balls=len(program.y),
+        y=np.array([first[0], *y]),
+        v=np.array([first[1], *v]),
+        height=np.array(height),
+        contact=np.array(contact, bool),
+        iterations=iterations if program.each else iterations[:, 0],
+        reason=np.zeros(iterations.shape, np.int8),
+        residual=unknown,
+        margin=unknown,
+        before=unknown,
+        history=None,
+        contacts=flips,
     )
-
-
-def ball_horizon(history: BallHistory, run: BallRun) -> tuple[Decision | None, Float[np.ndarray, "rows"]]:
-    """The first decision of a run that is not the exact one, and its largest separation at each step, m.
-
-    The margin of the decision is minus the exact height.
-
-    Raises:
-        InputError: a run of another length or batch, or without its states.
-    """
-    if (run.steps, run.balls) != (history.steps, history.balls) or not run.kept:
-        raise InputError(
-            f"a run of {run.steps} steps of {run.balls} balls against {history.steps} of {history.balls}",
-            remedy="Compare runs of equal size with every state kept",
-        )
-    counts = run.iterations if run.iterations.ndim == 2 else run.iterations[:, None]
-    counts = np.broadcast_to(counts, history.iterations.shape)
-    stops = (counts != history.iterations) & isinstance(run.world.contact, Projection)
-    contact = run.contact != history.contact
-    separation = np.abs(run.y.astype(np.float64) - history.y).max(axis=1)
-    rows = np.flatnonzero((stops | contact).any(axis=1))
-    if not len(rows):
-        return None, separation
-    row = int(rows[0])
-    channel = "contact" if contact[row].any() else "stop"
-    differing = (contact if channel == "contact" else stops)[row]
-    ball = int(differing.argmax())
-    decided = (history.contact, run.contact) if channel == "contact" else (history.iterations, counts)
-    a, b = (int(one[row, ball]) for one in decided)
-    decision = Decision(
-        channel=channel,
-        step=row + 1,
-        subject=(ball,),
-        run="A" if (a > b) == (channel == "contact") else "B",
-        entered=True,
-        a=a,
-        b=b,
-        margins={"A": -float(history.height[row, ball])},
-        bounds={},
-        separation=float(separation[row]),
-        also=int(differing.sum()) - 1,
-    )
-    return decision, separation
 
 
 class _ExactBall:
@@ -200,7 +151,7 @@ class _ExactBall:
         self.half = HALF * self.h
         self.y = [Dyadic.of(c) for c in np.asarray(start.y)]
         self.v = [Dyadic.of(c) for c in np.asarray(start.v)]
-        self.first = list(self.y), list(self.v)
+        self.each = isinstance(contact, Projection) and isinstance(_Rule(world).rule, PerInstance)
         self.touching = self._judge(self.y, [False] * len(self.y))
         self.carried = self._pull(self.y, self.v, self._free(0), self.touching)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import program_of, varied
+from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.program import Decision, Program
 from mdnum.systems import BallSystem, System
@@ -18,9 +18,7 @@ from mdnum.systems import BallSystem, System
 Progress = Callable[[int, int, dict[str, Any]], None]
 Roles = Mapping[str, str]
 
-MD_ROLES = ("state", "force", "decision", "accumulate")
-BALL_ROLES = ("state", "arithmetic", "decision", "accumulate")
-_NARROW: Roles = dict.fromkeys(MD_ROLES, "float32")
+_NARROW: Roles = dict.fromkeys(ROLES["md"], "float32")
 
 #: Precisions that are ranked of molecular dynamics, from none to all in double; a role not named is float64.
 MD_POLICIES: Mapping[str, Roles] = {
@@ -35,8 +33,8 @@ MD_POLICIES: Mapping[str, Roles] = {
 }
 #: Of a ball: every role in one format, or one role alone in float32.
 BALL_POLICIES: Mapping[str, Roles] = {
-    **{name: dict.fromkeys(BALL_ROLES, name) for name in ("float64", "float32", "float16", "bfloat16")},
-    **{f"{role} in float32": {role: "float32"} for role in BALL_ROLES},
+    **{name: dict.fromkeys(ROLES["ball"], name) for name in ("float64", "float32", "float16", "bfloat16")},
+    **{f"{role} in float32": {role: "float32"} for role in ROLES["ball"]},
 }
 #: Separation from the exact run up to which its growth is fitted, as a share of the program's scale.
 _SATURATED = 0.04
@@ -51,8 +49,8 @@ class PolicyHorizon:
     Attributes:
         name: of the precision.
         roles: dtype by role.
-        horizon: first step with a decision other than the exact one; None where there is none.
-        decision: that decision, exact (A) and the run's (B), with the exact margin in the quantity's space.
+        decision: the first that is not the exact one, exact (A) and the run's (B), with the exact margin in
+            the quantity's space; None where there is none.
         separation: largest distance from the exact places at each step, length.
         growth: of that separation.
         failed: how the run ended, where badly.
@@ -65,7 +63,6 @@ class PolicyHorizon:
 
     name: str
     roles: Roles
-    horizon: int | None = None
     decision: Decision | None = None
     separation: Float[np.ndarray, "rows"] | None = None
     growth: Growth | None = None
@@ -73,6 +70,11 @@ class PolicyHorizon:
     gain: float = float("nan")
     closer: float = float("nan")
     reason_unavailable: str | None = None
+
+    @property
+    def horizon(self) -> int | None:
+        """First step with a decision other than the exact one; None where there is none."""
+        return None if self.decision is None else self.decision.step
 
     @property
     def margin(self) -> float:
@@ -91,7 +93,7 @@ class Certificate:
     Attributes:
         steps: last step.
         timestep: in the user's units of time.
-        exact: the history, a `program.ExactHistory` or a `ball.BallHistory`.
+        exact: the history, a `program.ExactHistory`, or a `BallRun`.
         ranking: precisions, longest horizon first; those that cannot run come last.
         steps_per_bit: by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the
             separation from the exact run; NaN where no growth was seen.
@@ -102,14 +104,6 @@ class Certificate:
     exact: Any
     ranking: tuple[PolicyHorizon, ...]
     steps_per_bit: float
-
-    def of(self, name: str) -> PolicyHorizon:
-        """The row of a policy.
-
-        Raises:
-            KeyError: it was not asked for.
-        """
-        return {row.name: row for row in self.ranking}[name]
 
 
 def certify(
@@ -141,42 +135,37 @@ def certify(
         raise InputError(f"steps = {last}; expected at least 1", remedy="Ask for one step or more")
     if policies is None:
         policies = BALL_POLICIES if is_ball else MD_POLICIES
-    wide = dict.fromkeys(BALL_ROLES if is_ball else MD_ROLES, "float64")
+    wide = dict.fromkeys(ROLES["ball" if is_ball else "md"], "float64")
     every = {name: {**wide, **roles} for name, roles in policies.items()}
     note = progress or (lambda done, total, info: None)
     certifier: Any = _certify_ball if is_ball else _certify_md
     program, exact, rows = certifier(system, last, every, note)
     rows = _with_gains(rows, last)
-    rows.sort(key=lambda row: (row.reason_unavailable is not None, -_or_beyond(row.horizon)))
+    # one that never left comes before all that did
+    horizons = {row.name: last + 1 if row.horizon is None else row.horizon for row in rows}
+    rows.sort(key=lambda row: (row.reason_unavailable is not None, -horizons[row.name]))
     return Certificate(last, program.timestep, exact, tuple(rows), _steps_per_bit(rows))
-
-
-def _or_beyond(horizon: int | None) -> float:
-    return float("inf") if horizon is None else horizon
 
 
 def _row(
     program: Program, name: str, roles: Roles, decision: Decision | None, separation: np.ndarray, failed: str
 ) -> PolicyHorizon:
-    horizon = None if decision is None else decision.step
     fit = growth(separation, _SATURATED * program.scale)
-    return PolicyHorizon(name, roles, horizon, decision, separation, fit, failed)
+    return PolicyHorizon(name, roles, decision, separation, fit, failed)
 
 
 def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: Progress):
-    from mdnum.forks.exact.bounds import taped
-    from mdnum.forks.exact.program import ExactProgram, unsupported, with_policy
-    from mdnum.forks.exact.tape import first_difference
+    from mdnum.forks.exact import program as exact_arithmetic
+    from mdnum.forks.exact.program import first_difference, with_policy
     from mdnum.md.cell import HostCell
     from mdnum.numerics import PrecisionPolicy
 
     program: Any = program_of(system)
     simulation = program.simulation
-    error = unsupported(simulation)
-    if error is not None:
-        raise error
     info = {"phase": "in exact arithmetic", "unit": "steps"}
-    exact = ExactProgram(simulation).run(last, progress=lambda done, total: note(done, total, info))
+    exact = exact_arithmetic.ExactProgram(simulation).run(
+        last, progress=lambda done, total: note(done, total, info)
+    )
     cell = HostCell(simulation.cell)
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
@@ -187,10 +176,10 @@ def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: 
     rows = []
     for done, (name, roles) in enumerate(policies.items()):
         note(done, len(policies), {"phase": name, "unit": "policies"})
-        run = taped(with_policy(simulation, PrecisionPolicy(**roles)), last)
-        decision = first_difference(exact.tape, run.tape)
-        common = min(len(exact.x), len(run.x))
-        d = cell.displacement(reduced(exact.x[:common]), np.moveaxis(run.x[:common], 1, 2))
+        tape, x, failed = exact_arithmetic.taped(with_policy(simulation, PrecisionPolicy(**roles)), last)
+        decision = first_difference(exact.tape, tape)
+        common = min(len(exact.x), len(x))
+        d = cell.displacement(reduced(exact.x[:common]), np.moveaxis(x[:common], 1, 2))
         separation = np.sqrt(np.max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, axis=1))
         if decision is not None:
             place = reduced(exact.x[decision.step])
@@ -199,12 +188,13 @@ def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: 
             kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
             margin = simulation.decider.r_cut[kind] ** 2 - float((dx * dx + dy * dy + dz * dz)[0])
             decision = replace(decision, margins={"A": margin})
-        rows.append(_row(program, name, roles, decision, separation, run.failed))
+        rows.append(_row(program, name, roles, decision, separation, failed))
     return program, exact, rows
 
 
 def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], note: Progress):
-    from mdnum.forks.exact.ball import ball_history, ball_horizon
+    from mdnum.ball.rollout import cross_decisions
+    from mdnum.forks.exact.ball import ball_history
 
     system = system.for_steps(last)
 
@@ -212,7 +202,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
         values = {f"precision.{role}": dtype for role, dtype in roles.items()}
         return program_of(varied(system, {**values, "precision.rounding": "nearest"}, name))
 
-    exact = program_in("float64", dict.fromkeys(BALL_ROLES, "float64"))
+    exact = program_in("float64", dict.fromkeys(ROLES["ball"], "float64"))
     problem = exact.problem
     note(0, 0, {"phase": "the exact history"})
     history = ball_history(problem.world, problem.world.start(problem.y0, problem.v0), last)
@@ -225,7 +215,11 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
             reason = error.message.removeprefix(f"variant {name!r}: ")
             rows.append(PolicyHorizon(name, roles, reason_unavailable=reason))
             continue
-        decision, separation = ball_horizon(history, program.run(last))
+        run = program.run(last)
+        separation = np.abs(run.y.astype(np.float64) - history.y).max(axis=1)
+        flips = cross_decisions(history, run)
+        first = [flip for flip in flips if flip.step == flips[0].step]
+        decision = exact.decision(program, first, float(separation[first[0].step - 1])) if first else None
         rows.append(_row(exact, name, roles, decision, separation, ""))
     return exact, history, rows
 

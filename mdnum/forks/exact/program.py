@@ -20,14 +20,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.laws import pull_of
-from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import complete
-from mdnum.md.cutoffs import Undecided
+from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
 from mdnum.numerics import PrecisionPolicy, gamma
-from mdnum.rollout.engine import Start, first_state
+from mdnum.program import Decision
+from mdnum.rollout.compared import ReferenceFrame
+from mdnum.rollout.engine import FAILURES, Engine, first_state
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.tracks import rows_of
 from mdnum.systems.build import Simulation
 
 #: All pairs are looked at in every step.
@@ -39,6 +41,130 @@ _RESTARTS = 5
 #: Bits carried beyond those that the ball's radius leaves meaningful.
 _GUARD_BITS = 32
 _U = 2.0**-53
+
+
+# --- decisions of a run -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DecisionTape:
+    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
+
+    Attributes:
+        atoms: number of atoms.
+        steps: the last step that was decided.
+        first: keys i * atoms + j (i < j) of the pairs inside at step 0, sorted.
+        step, key, entered: the flips, sorted by step and key.
+    """
+
+    atoms: int
+    steps: int
+    first: Int[np.ndarray, "pairs"]
+    step: Int[np.ndarray, "flips"]
+    key: Int[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]
+
+    @property
+    def flips(self) -> int:
+        """Number of flips."""
+        return len(self.step)
+
+    def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
+        """Keys of the pairs inside at a step, sorted."""
+        members = set(self.first.tolist())
+        for _, key, entered in self.rows(step):
+            (members.add if entered else members.discard)(key)
+        return np.array(sorted(members), np.int64)
+
+    def rows(self, last: int) -> list[tuple[int, int, bool]]:
+        """Step, key and direction of the flips up to a step."""
+        columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
+        return list(zip(*columns, strict=True))
+
+
+def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
+    """The first step at which any pair is decided differently; None where there is none in both tapes.
+
+    Raises:
+        ValueError: tapes of different numbers of atoms.
+    """
+    if a.atoms != b.atoms:
+        raise ValueError(f"tapes of {a.atoms} and {b.atoms} atoms")
+    step, differing = 0, np.setxor1d(a.first, b.first)
+    if not len(differing):
+        last = min(a.steps, b.steps)
+        rows = set(a.rows(last)) ^ set(b.rows(last))
+        if not rows:
+            return None
+        step = min(row[0] for row in rows)
+        differing = np.unique([key for at, key, _ in rows if at == step])
+    first, second = (int(np.isin(differing[0], tape.inside(step))) for tape in (a, b))
+    return Decision(
+        channel="pair",
+        step=step,
+        subject=divmod(int(differing[0]), a.atoms),
+        run="A" if first else "B",
+        entered=True,
+        a=first,
+        b=second,
+        margins={},
+        bounds={},
+        separation=float("nan"),
+        also=len(differing) - 1,
+    )
+
+
+def taped(simulation: Simulation, steps: int) -> tuple[DecisionTape, Float[np.ndarray, "rows 3 atoms"], str]:
+    """A real run: every decision, wrapped positions (length), and "blow-up", "runaway" or "" at its end."""
+    recorder, frame = PairRecorder(simulation), ReferenceFrame.same(simulation.atoms)
+    first, failed, last = np.empty(0, np.int64), "", 0
+    x, ledgers = [], []
+    for segment in Engine(simulation, steps).segments():
+        if not x:
+            first = decided_pairs(simulation, segment, 0)
+        ledgers.append(recorder.flips(segment))
+        failed = segment.closes if segment.closes in FAILURES else ""
+        x.append(rows_of(segment, frame, failed).x)
+        last = segment.last
+    step = np.concatenate([ledger.step for ledger in ledgers]).astype(np.int64)
+    i, j = np.concatenate([ledger.subject for ledger in ledgers]).astype(np.int64).T
+    entered, key = np.concatenate([ledger.entered for ledger in ledgers]), i * simulation.atoms + j
+    order = np.lexsort((key, step))
+    tape = DecisionTape(simulation.atoms, last, first, step[order], key[order], entered[order])
+    return tape, np.concatenate(x), failed
+
+
+# --- the exact program --------------------------------------------------------------------------------
+
+
+def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: float) -> Callable[[Any], Any]:
+    """2 du/d(r²) of a pair inside its cutoff, as a function of the ball r².
+
+    The factor of the displacement x_j - x_i in the force on i. Constants are the given doubles, exactly;
+    what follows from them is enclosed at the precision in force when this is called.
+    """
+    from flint import arb
+
+    s2 = arb(sigma) * arb(sigma)
+    s6 = s2 * s2 * s2
+    # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
+    depth = 4 * arb(epsilon) * s6
+    repel, attract = 12 * depth * s6, 6 * depth
+    one = arb(1)
+
+    def bare(r2):
+        inverse = one / r2
+        cube = inverse * inverse * inverse
+        return (attract - repel * cube) * (cube * inverse)
+
+    def energy(r2):
+        inverse = one / r2
+        cube = inverse * inverse * inverse
+        return depth * cube * (s6 * cube - 1)
+
+    rc = arb(r_cut)
+    at = AtCutoff(rc, arb(r_onset), energy(rc * rc), rc * bare(rc * rc))
+    return CUTOFFS.parse(cutoff).enclose(bare, energy, at)
 
 
 @dataclass(frozen=True)
@@ -86,65 +212,68 @@ def installed() -> bool:
 
 def unsupported(simulation: Simulation) -> InputError | None:
     """What keeps a system from being certified, with a remedy; None where nothing does."""
-    where = "system"
-    if not simulation.pairwise or not isinstance(simulation.potential, LennardJones):
-        return InputError(
+    half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
+    lennard_jones = simulation.pairwise and isinstance(simulation.potential, LennardJones)
+    reasons = (
+        (
+            not lennard_jones,
             f"the exact program serves Lennard-Jones potentials, not {simulation.potential.name!r}",
-            remedy="Use a lennard-jones system",
-            where="potential.kind",
-        )
-    if simulation.lattice is not None:
-        return InputError(
-            "a run in whole numbers is exact already: its decisions and sums have no rounding",
-            remedy="Use --set precision.state=float64",
-            where="precision.state",
-        )
-    if not isinstance(simulation.integrator, VelocityVerlet):
-        return InputError(
+            "Use a lennard-jones system",
+            "potential.kind",
+        ),
+        (
+            simulation.lattice is not None,
+            "a run in fixed-point integers is exact already: its decisions and sums have no rounding",
+            "Use --set precision.state=float64",
+            "precision.state",
+        ),
+        (
+            not isinstance(simulation.integrator, VelocityVerlet),
             f"the exact program serves NVE dynamics, not {simulation.integrator.name!r}: its noise is "
             "defined by its rounding",
-            remedy="Use --set dynamics.kind=nve",
-            where="dynamics.kind",
-        )
-    if simulation.atoms > MOST_ATOMS:
-        return InputError(
-            f"{simulation.atoms} atoms; the exact program follows all pairs of at most {MOST_ATOMS}",
-            remedy="Use a smaller structure, e.g. argon/crystal-108",
-            where=where,
-        )
-    half = float(np.min(simulation.cell.widths)) / 2
-    if simulation.r_cut > half * (1 - 1e-5):
-        return InputError(
+            "Use --set dynamics.kind=nve",
+            "dynamics.kind",
+        ),
+        (
+            atoms > MOST_ATOMS,
+            f"{atoms} atoms; the exact program follows all pairs of at most {MOST_ATOMS}",
+            "Use a smaller structure, e.g. argon/crystal-108",
+            "system",
+        ),
+        (
+            lennard_jones and simulation.r_cut > half * (1 - 1e-5),
             f"r_cut = {simulation.r_cut:g} is half the box ({half:g}): the nearest image cannot be proven",
-            remedy="Use a slightly smaller cutoff or a larger box",
-            where="cutoff.radius",
-        )
-    if not installed():
-        return InputError(
+            "Use a slightly smaller cutoff or a larger box",
+            "cutoff.radius",
+        ),
+        (
+            not installed(),
             "exact runs need python-flint, which is not installed",
-            remedy="Install the extra `exact`: pip install 'mdnum[exact]', or python-flint alone",
-        )
-    return None
+            "Install the extra `exact`: pip install 'mdnum[exact]', or python-flint alone",
+            None,
+        ),
+    )
+    errors = (
+        InputError(message, remedy=remedy, where=key) for is_so, message, remedy, key in reasons if is_so
+    )
+    return next(errors, None)
 
 
 class ExactProgram:
-    """A simulation's map in ball arithmetic.
+    """A simulation's map in ball arithmetic, from its start in double precision.
 
     Args:
         simulation: its constants are taken as doubles, whatever the precision policy.
-        start: where it begins; default the system's own start in double precision.
 
     Raises:
         InputError: the system cannot be certified.
     """
 
-    def __init__(self, simulation: Simulation, start: Start | None = None):
+    def __init__(self, simulation: Simulation):
         error = unsupported(simulation)
         if error is not None:
             raise error
-        begin = start or first_state(_wide(simulation))
-        if int(begin.state.step) != 0:
-            raise InputError(f"the start is at step {int(begin.state.step)}; an exact run begins at step 0")
+        begin = first_state(_wide(simulation))
         self._x = np.asarray(begin.state.x, np.float64).T.copy()
         self._v = np.asarray(begin.state.v, np.float64).T.copy()
         self.simulation = simulation

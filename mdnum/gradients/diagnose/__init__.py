@@ -1,16 +1,380 @@
-"""Whether a gradient through a rollout can be trusted, how far, and what it is made of."""
+"""Whether a gradient through a rollout can be trusted, how far, and what it is made of.
 
-from mdnum.gradients.diagnose.agreement import agreement
-from mdnum.gradients.diagnose.detective import detective
-from mdnum.gradients.diagnose.diagnose import PARTS, GradientDiagnosis, diagnose
-from mdnum.gradients.diagnose.edges import edges
-from mdnum.gradients.diagnose.flips import flips
-from mdnum.gradients.diagnose.growth import GradientGrowth, growth
-from mdnum.gradients.diagnose.horizons import horizons
-from mdnum.gradients.diagnose.spectrum import Spectrum, spectrum
-from mdnum.gradients.diagnose.trust import Trust, trust
+Methods answer different questions: the derivative of the steps that ran, the derivative of the flow with the
+times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
+another program. Two numbers that differ need not contradict one another: the agreement names which it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError, MdnumError
+from mdnum.gradients import parameters
+from mdnum.gradients.diagnose.detective import NotFinite, detective
+from mdnum.gradients.diagnose.flips import DecisionEdges, FlipTerms, edges, flips
+from mdnum.gradients.diagnose.growth import (
+    GradientGrowth,
+    GrowthWatch,
+    Scaling,
+    ScalingWatch,
+    Spectrum,
+    growth,
+    spectrum,
+)
+from mdnum.gradients.diagnose.near import Near
+from mdnum.gradients.diagnose.trust import TOLERANCE, Trust, trust
+from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, Progress
+from mdnum.gradients.problem import method as by_name
+from mdnum.gradients.recorded import EventAware, ReversePass, Symmetric, passed
+from mdnum.gradients.tape import pace_of
+from mdnum.numerics import unit_roundoff
 
 __all__ = [
-    "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective",
-    "diagnose", "edges", "flips", "growth", "horizons", "spectrum", "trust",
+    "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
+    "edges", "flips", "growth", "spectrum", "trust",
 ]  # fmt: skip
+#: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
+PARTS = ("growth", "agreement", "flips", "trust", "spectrum", "detective", "scaling")
+#: Below this number of rounding errors, times what they grew by, two derivatives agree.
+_ROUNDINGS = 1e4
+#: A difference of values is believed within this multiple of its own error estimate.
+_ERRORS = 5.0
+
+
+# --- all methods that apply, side by side -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What one method gives.
+
+    Attributes:
+        method: its name. description: which derivative it gives, one sentence.
+        found: the gradient; None where there is none. missing: why: it does not apply, or it failed.
+        seconds: wall time, compiling included.
+    """
+
+    method: str
+    description: str
+    found: Gradient | None
+    missing: str = ""
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class GradientDifference:
+    """The derivatives of two methods by one parameter.
+
+    Attributes:
+        name: full name of the parameter. method, reference: names of the two methods.
+        size: Euclidean norm of the reference's derivative (a scalar's magnitude).
+        difference: norm of the difference; signed (method minus reference) for a scalar.
+        relative: |difference| over `size`; infinite where only the reference is 0.
+        meaning: "agree", "missing saltation", "rounding", "truncation and noise", "events between shifts",
+            "another program", "an average", "statistical" or "unexplained".
+        values: the numbers that this rests on.
+    """
+
+    name: str
+    method: str
+    reference: str
+    size: float
+    difference: float
+    relative: float
+    meaning: str
+    values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """All methods that apply, at one horizon.
+
+    Attributes:
+        horizon: steps.
+        reference: name of the method that the others are compared with.
+        opinions: one for each method asked for.
+        comparisons: of every method that gave a gradient with the reference, by parameter.
+    """
+
+    horizon: int
+    reference: str
+    opinions: tuple[Opinion, ...]
+    comparisons: tuple[GradientDifference, ...]
+
+    def gradient(self, method: str) -> Gradient | None:
+        """What a method found."""
+        return next((one.found for one in self.opinions if one.method == method), None)
+
+
+def agreement(
+    problem: Problem,
+    names: Sequence[str],
+    methods: Sequence[str | Method] | None = None,
+    *,
+    known: Mapping[str, Gradient] | None = None,
+    growth: float = 1.0,
+    progress: Progress | None = None,
+) -> Agreement:
+    """The gradient by several methods, and what their differences mean.
+
+    Args:
+        names: parameters; a method that cannot have some is asked for the others.
+        methods: names or methods; default all there are. One that does not apply is listed with the reason.
+        known: gradients that have been worked out already, by name of the method.
+        growth: how much the gradient by the state grew over the run (`GradientGrowth.gain`).
+
+    Raises:
+        InputError: no such parameter or method, or no method applies.
+    """
+    full = parameters.resolve(problem.simulation, names)
+    known = dict(known or {})
+    asked = list(METHODS) if methods is None else methods
+    chosen = [by_name(one) if isinstance(one, str) else one for one in asked]
+    opinions = [
+        Opinion(one.name, one.description, known[one.name])
+        if one.name in known
+        else _asked(one, problem, full, progress)
+        for one in chosen
+    ]
+    given = [one.found for one in opinions if one.found is not None]
+    if not given:
+        reasons = "; ".join(f"{one.method}: {one.missing}" for one in opinions)
+        raise InputError(f"no method applies: {reasons}")
+    # the method that leaves nothing out, where it is there
+    order = ("event-aware", "symmetric") if problem.jumps else ("symmetric", "event-aware")
+    there = {one.method: one for one in given}
+    reference = next((word for word in (*order, "unrolled", "forward") if word in there), given[0].method)
+    roundings = [unit_roundoff(problem.simulation.policy.dtype(role)) for role in ("state", "force")]
+    rows = [
+        compare(name, one, there[reference], max(roundings), growth, jumps=problem.jumps)
+        for one in given
+        if one.method != reference
+        for name in full
+        if name in one.gradient and name in there[reference].gradient
+    ]
+    return Agreement(problem.steps, reference, tuple(opinions), tuple(rows))
+
+
+def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Progress | None) -> Opinion:
+    """What a method gives, by all names or by those that it can have."""
+    began = time.perf_counter()
+
+    def report(done: int, steps: int, phase: str) -> None:
+        if progress is not None:
+            progress(done, steps, f"{method.name}: {phase}")
+
+    why, found = method.reason_unavailable(problem, names), None
+    left = [name for name in names if why is None or method.reason_unavailable(problem, [name]) is None]
+    if left:
+        try:
+            found, why = method(problem, left, report), None
+        except MdnumError as error:
+            why = str(error)
+    return Opinion(method.name, method.description, found, why or "", time.perf_counter() - began)
+
+
+def compare(
+    name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
+) -> GradientDifference:
+    """Two derivatives by one parameter, which both have.
+
+    Args:
+        unit: unit roundoff of the run's state or forces, whichever is coarser.
+        growth: how much the gradient by the state grew over the run; 1 where that is not known.
+        jumps: whether the force jumps at the cutoff.
+    """
+    a, b = (np.asarray(found.gradient[name], np.float64) for found in (one, reference))
+    difference = float(a - b) if a.ndim == 0 else float(np.linalg.norm(a - b))
+    size, right = float(np.maximum(np.linalg.norm(a), np.linalg.norm(b))), float(np.linalg.norm(b))
+    relative = 0.0 if size == 0 else abs(difference) / size
+    # of one run in other orders of evaluation, and where the forward passes differ by a rounding, too
+    rounding = _ROUNDINGS * unit
+    grown = min(rounding * max(growth, 1.0), 1.0)
+    meaning, values = _meaning(name, one, reference, abs(difference), relative, rounding, grown, jumps)
+    off = abs(difference) / right if right else float("inf") if difference else 0.0
+    words = (name, one.method, reference.method)
+    values = {"grown": growth, "explained": grown} if values is None else values
+    return GradientDifference(*words, right, difference, off, meaning, values)
+
+
+def _meaning(
+    name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
+    grown: float, jumps: bool,
+) -> tuple[str, dict[str, float] | None]:  # fmt: skip
+    """What a difference means, and the numbers that it rests on; None: what rounding explains."""
+    kinds = {one.kind: one, reference.kind: reference}
+    if not np.isfinite(relative):
+        return "unexplained", {}
+    if relative <= rounding:
+        return "agree", {}
+    if "other program" in kinds:
+        return "another program", {}
+    for kind, within in (("average", "statistical"), ("values", "truncation and noise")):
+        if kind not in kinds or (kind == "values" and len(kinds) == 1):
+            continue
+        error = kinds[kind].details.get("error", {}).get(name)
+        estimate = 0.0 if error is None else float(np.linalg.norm(np.asarray(error, np.float64)))
+        if error is not None and size <= _ERRORS * estimate:
+            return within, {"error": estimate}
+        if kind == "average":
+            return "an average", {}
+    if "flow" in kinds and "steps" in kinds:
+        if any(found.details.get("crossings") == 0 for found in (one, reference)):
+            return "rounding", {}
+        if jumps:
+            return "missing saltation", {"share": relative}
+    if relative <= grown:
+        return "rounding", None
+    if "values" in kinds and len(kinds) == 2 and jumps:
+        return "events between shifts", {}
+    return "unexplained", None
+
+
+# --- everything there is to know about one gradient, from as few runs as it takes ---------------------
+
+
+@dataclass(frozen=True)
+class GradientDiagnosis:
+    """Whether a gradient can be trusted, and how far. A part that was not asked for is None.
+
+    Attributes:
+        horizon: steps. names: full names of the parameters. value: the loss.
+        agreement, growth, spectrum, trust, flips, detective, scaling: see there. edges: by parameter.
+        notes: what a reader must know about single parameters: no dependence, a missing term.
+        failed: parts that were asked for and are not available, with the reason.
+    """
+
+    horizon: int
+    names: tuple[str, ...]
+    value: float
+    agreement: Agreement | None = None
+    growth: GradientGrowth | None = None
+    spectrum: Spectrum | None = None
+    trust: Trust | None = None
+    flips: FlipTerms | None = None
+    detective: NotFinite | None = None
+    scaling: Scaling | None = None
+    edges: dict[str, DecisionEdges] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def diagnose(
+    problem: Problem,
+    names: Sequence[str],
+    *,
+    parts: Sequence[str] = PARTS,
+    methods: Sequence[str | Method] | None = None,
+    edges_of: Sequence[str] = (),
+    replicas: int = 0,
+    half_step: bool = True,
+    tolerance: float = TOLERANCE,
+    format: str = "float16",
+    progress: Progress | None = None,
+) -> GradientDiagnosis:
+    """Whether a gradient can be trusted, how far, and what it is made of.
+
+    Args:
+        names: parameters, full or short names. parts: which of PARTS.
+        methods: for the agreement; default all that apply. The other parts are read off the reverse pass of
+            event-aware, or of symmetric where only that applies or is asked for.
+        edges_of: parameters whose nearest boundaries of decisions are searched for.
+        replicas, half_step, tolerance: as for `trust`.
+        format: narrow type that the cotangents are compared with.
+
+    Returns:
+        the parts that are available; `failed` has why others are not.
+
+    Raises:
+        InputError: no such parameter, part or method. NumericalError: the run blew up.
+    """
+    full = parameters.resolve(problem.simulation, names)
+    unknown = [part for part in parts if part not in PARTS]
+    if unknown:
+        raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(PARTS)}")
+    searched = parameters.resolve(problem.simulation, edges_of) if edges_of else ()
+    chosen = [
+        by_name(one) if isinstance(one, str) else one for one in (METHODS if methods is None else methods)
+    ]
+    plain, why = _first(chosen, Symmetric), ""
+    base: EventAware | Symmetric | None = None
+    for one in filter(None, (_first(chosen, EventAware), plain)):
+        reason = one.reason_unavailable(problem, full)
+        if reason is None:
+            base = one
+            break
+        why = why or reason
+    made: ReversePass | None = None
+    found: dict[str, Any] = {}
+    failed: dict[str, str] = {}
+    known: dict[str, Gradient] = {}
+    growing: GradientGrowth | None = None
+    near: Near | None = None
+    saltation = isinstance(base, EventAware)
+    if base is None:
+        why = why or "it is read off a reverse pass, event-aware or symmetric, and neither was asked for"
+        failed = {part: why for part in parts if part != "agreement"}
+    else:
+        growth_watch = GrowthWatch(problem.simulation, full, problem.steps)
+        # its counts grow with the steps
+        scaling = ScalingWatch(problem.steps, format) if "scaling" in parts else None
+        if saltation and "trust" in parts:
+            near = Near(problem.simulation, pace_of(problem.loss, problem.steps))
+        watches: list[Any] = [growth_watch, scaling, near and near.reverse]
+        options: dict[str, Any] = {"guard": base.guard} if isinstance(base, EventAware) else {}
+        made = passed(
+            problem, full, saltation=saltation, budget=base.budget, watches=list(filter(None, watches)),
+            progress=progress, **options,
+        )  # fmt: skip
+        known[base.name] = base.of(problem, made)
+        if saltation and "agreement" in parts and plain is not None:
+            # the same run, so that it need not be made twice
+            again = passed(problem, full, saltation=False, tape=made.tape, progress=progress)
+            known[plain.name] = plain.of(problem, again)
+        growing = growth_watch.result(made.gradient)
+        if "growth" in parts:
+            found["growth"] = growing
+        if scaling is not None:
+            found["scaling"] = scaling.result()
+        if not saltation and "flips" in parts:
+            failed["flips"] = f"only event-aware has what flips add{f': {why}' if why else ''}"
+    tape = None if made is None else made.tape
+    grown = 1.0 if growing is None else growing.gain
+    attempts: dict[str, Callable[[], Any]] = {
+        "agreement": lambda: agreement(problem, full, chosen, known=known, growth=grown, progress=progress),
+        "flips": lambda: flips(problem, full, made=made, progress=progress),
+        "trust": lambda: trust(
+            problem, full, tolerance=tolerance, saltation=saltation, replicas=replicas, half_step=half_step,
+            made=made, near=near, growth=growing, progress=progress,
+        ),
+        "spectrum": lambda: spectrum(problem, tape=tape, progress=progress),
+        "detective": lambda: detective(problem, full, saltation=saltation, tape=tape, progress=progress),
+    }  # fmt: skip
+    around: dict[str, DecisionEdges] = {}
+
+    def attempt(label: str, make: Callable[[], Any], into: dict[str, Any], name: str) -> None:
+        try:
+            into[name] = make()
+        except MdnumError as error:
+            failed[label] = str(error)
+
+    for part, make in attempts.items():
+        if part in parts and part not in failed:
+            attempt(part, make, found, part)
+    for name in searched:
+        attempt(f"edges of {name}", lambda name=name: edges(problem, name, progress=progress), around, name)
+    opinions = found["agreement"].opinions if "agreement" in found else ()
+    values = [one.found.value for one in opinions if one.found is not None]
+    whole = tape.value if tape is not None else values[0] if values else problem.value()
+    notes = {} if base is None else known[base.name].notes
+    return GradientDiagnosis(problem.steps, full, whole, edges=around, notes=notes, failed=failed, **found)
+
+
+def _first(methods: Sequence[Method], kind: type) -> Any:
+    return next((one for one in methods if isinstance(one, kind)), None)

@@ -2,9 +2,8 @@
 
 A force can be finite where its derivative is not, a loss can have a root at zero, a sum can leave the range
 of its format on the way back. The pass is repeated up to the step at which that happens, and that step is
-run operation by operation, loops and branches included. An operation is at fault where its inputs are finite
-and its result is not, and where the program's own result is mended when that result is: a number that is
-masked away later does no harm.
+run operation by operation. An operation is at fault where its inputs are finite and its result is not, and
+where mending it mends the program's own result: a number that is masked away later does no harm.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import StretchReversal, Trace, transposed
+from mdnum.gradients.adjoint import AdjointCarry, StretchReversal, transposed
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
@@ -43,7 +42,6 @@ _PARTS = (
     ("_of_energy", "forces"),
     ("drift", "drift"),
 )
-_NOWHERE = (-1, -1, float("nan"))
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,7 @@ class NotFinite:
     """Where a reverse pass stops being finite.
 
     Attributes:
-        found: whether it does at all.
-        forward: whether the forward run, its loss included, is finite.
+        found: whether it does at all. forward: whether the forward run, its loss included, is finite.
         step: the first step, in the order of the reverse pass (last in time); -1 where all is finite.
         operation: the first operation there whose inputs are finite and whose result is not; empty where no
             single operation is. inputs: its numbers at that place.
@@ -82,8 +79,7 @@ class Operation:
         name: of the primitive, such as "div".
         source: file:line:function that wrote it, innermost one outside of JAX; empty where it is not known.
         functions: all functions on the way to it, outermost first.
-        index: of the first number that is not finite, in the result.
-        shape: of the result.
+        index: of the first number that is not finite, in the result. shape: of the result.
         rounds: rounds of the loops around it, outermost first.
         inputs: the numbers at that place of inputs that have the shape of the result, or no shape.
         count: how many operations ran before it.
@@ -100,49 +96,43 @@ class Operation:
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """The operation that makes the result of a function not finite.
+    """The operation that makes the result of a function of arrays not finite; it is not compiled.
 
     Args:
-        function: of arrays; it is traced, and not compiled.
         args: pytrees of arrays.
 
     Returns:
         None where every number of the result is finite, or one of the arguments is not.
     """
     leaves, tree = jax.tree.flatten(args)
-    if not _finite(leaves):
+    if _bad(leaves):
         return None
     program = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))(*leaves)
+
+    def run(mended: list[int]) -> tuple[int, Operation | None]:
+        interpreter = _Interpreter(mended)
+        return _bad(interpreter.closed(program, leaves)), interpreter.found
+
     mended: list[int] = []
-    before = _not_finite(_Interpreter(mended).outputs(program, leaves))
-    if not before:
-        return None
-    found: Operation | None = None
-    for _ in range(_MOST):
-        run = _Interpreter(mended)
-        run.outputs(program, leaves)
-        if run.found is None:
-            return found
-        after = _not_finite(_Interpreter([*mended, run.found.count]).outputs(program, leaves))
-        if after < before:
-            return run.found
+    before, candidate = run(mended)
+    first = candidate
+    for _ in range(_MOST if before else 0):
+        if candidate is None or run([*mended, candidate.count])[0] < before:
+            return candidate or first
         # one that is masked away: made finite, so that the search goes on behind it
-        found = found or run.found
-        mended.append(run.found.count)
-    return found
+        mended.append(candidate.count)
+        _, candidate = run(mended)
+    return first if before else None
 
 
-def _finite(leaves: Sequence[Any]) -> bool:
-    return all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in leaves if _inexact(leaf))
-
-
-def _not_finite(leaves: Sequence[Any]) -> int:
-    return sum(int((~np.isfinite(np.asarray(leaf, np.float64))).sum()) for leaf in leaves if _inexact(leaf))
+def _bad(tree: Any) -> int:
+    """How many numbers are not finite."""
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(tree) if _inexact(leaf)]
+    return sum(int((~np.isfinite(leaf)).sum()) for leaf in leaves)
 
 
 def _inexact(leaf: Any) -> bool:
-    dtype = getattr(leaf, "dtype", None)
-    return dtype is not None and jnp.issubdtype(dtype, jnp.floating)
+    return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
 
 
 @dataclass
@@ -160,21 +150,20 @@ class _Interpreter:
     count: int = 0
     rounds: list[int] = field(default_factory=list)
 
-    def outputs(self, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
+    def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
         """The results of a program."""
-        return self._program(program.jaxpr, program.consts, inputs)
-
-    def _program(self, program: Any, constants: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-        known = dict(zip(program.constvars, constants, strict=True))
-        known.update(zip(program.invars, inputs, strict=True))
+        jaxpr, constants = program, ()
+        if isinstance(program, ClosedJaxpr):
+            jaxpr, constants = program.jaxpr, program.consts
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def value(atom: Any) -> Any:
             return atom.val if isinstance(atom, Literal) else known[atom]
 
-        for equation in program.eqns:
+        for equation in jaxpr.eqns:
             results = self._equation(equation, [value(atom) for atom in equation.invars])
             known.update(zip(equation.outvars, results, strict=True))
-        return [value(atom) for atom in program.outvars]
+        return [value(atom) for atom in jaxpr.outvars]
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
         name, params = equation.primitive.name, equation.params
@@ -184,25 +173,20 @@ class _Interpreter:
             return self._while(params, inputs)
         if name == "cond":
             chosen = int(np.clip(int(inputs[0]), 0, len(params["branches"]) - 1))
-            return self._closed(params["branches"][chosen], inputs[1:])
+            return self.closed(params["branches"][chosen], inputs[1:])
         inner = next((params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params), None)
         if name in _CALLS and isinstance(inner, Jaxpr | ClosedJaxpr):
-            return self._closed(inner, inputs)
+            return self.closed(inner, inputs)
         made = equation.primitive.bind(*inputs, **params)
         results = list(made) if equation.primitive.multiple_results else [made]
         self.count += 1
-        if _finite(results):
+        if not _bad(results):
             return results
         if self.count in self.mended:
-            return [_made_finite(one) for one in results]
-        if self.found is None and _finite(inputs):
+            return [jnp.nan_to_num(one, posinf=0, neginf=0) if _inexact(one) else one for one in results]
+        if self.found is None and not _bad(inputs):
             self.found = self._operation(equation, inputs, results)
         return results
-
-    def _closed(self, inner: Any, inputs: Sequence[Any]) -> list[Any]:
-        if isinstance(inner, ClosedJaxpr):
-            return self._program(inner.jaxpr, inner.consts, inputs)
-        return self._program(inner, (), inputs)
 
     def _scan(self, params: Any, inputs: list[Any]) -> list[Any]:
         body, length = params["jaxpr"], params["length"]
@@ -212,7 +196,7 @@ class _Interpreter:
         out: dict[int, list[Any]] = {}
         for k in reversed(range(length)) if params["reverse"] else range(length):
             self.rounds.append(k)
-            made = self._closed(body, [*fixed, *carry, *(row[k] for row in rows)])
+            made = self.closed(body, [*fixed, *carry, *(row[k] for row in rows)])
             self.rounds.pop()
             carry, out[k] = made[:carries], made[carries:]
         shapes = [atom.aval for atom in body.jaxpr.outvars[carries:]]
@@ -225,57 +209,38 @@ class _Interpreter:
     def _while(self, params: Any, inputs: list[Any]) -> list[Any]:
         first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         carry, k = list(inputs[second:]), 0
-        while bool(self._closed(params["cond_jaxpr"], [*inputs[:first], *carry])[0]):
+        while bool(self.closed(params["cond_jaxpr"], [*inputs[:first], *carry])[0]):
             self.rounds.append(k)
-            carry = self._closed(params["body_jaxpr"], [*inputs[first:second], *carry])
+            carry = self.closed(params["body_jaxpr"], [*inputs[first:second], *carry])
             self.rounds.pop()
             k += 1
         return carry
 
     def _operation(self, equation: Any, inputs: list[Any], results: list[Any]) -> Operation:
-        bad = next(one for one in results if _inexact(one) and not _finite([one]))
-        values = np.asarray(bad, np.float64)
+        values = np.asarray(next(one for one in results if _bad(one)), np.float64)
         index = tuple(int(k) for k in np.argwhere(~np.isfinite(values))[0])
         given = tuple(
             float(np.asarray(one, np.float64)[index if np.shape(one) else ()])
             for one in inputs
             if _inexact(one) and np.shape(one) in ((), values.shape)
         )
-        source, functions = _written(equation)
-        return Operation(
-            equation.primitive.name,
-            source,
-            functions,
-            index,
-            values.shape,
-            tuple(self.rounds),
-            given,
-            self.count,
-        )
-
-
-def _made_finite(one: Any) -> Any:
-    return jnp.where(jnp.isfinite(one), one, jnp.zeros((), one.dtype)) if _inexact(one) else one
+        where = (index, values.shape, tuple(self.rounds), given, self.count)
+        return Operation(equation.primitive.name, *_written(equation), *where)
 
 
 def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
     """Where an operation was written, and the functions on the way there, outermost first."""
-    traceback = equation.source_info.traceback
-    if traceback is None:
-        return "", ()
-    inside = str(Path(jax.__file__).parent)
+    traceback, inside = equation.source_info.traceback, str(Path(jax.__file__).parent)
     frames = [
         one
-        for one in traceback.frames
-        if not one.file_name.startswith(inside) and f"{Path(one.file_name).name}" != Path(__file__).name
+        for one in (traceback.frames if traceback is not None else ())
+        if not one.file_name.startswith(inside) and Path(one.file_name).name != Path(__file__).name
     ]
     if not frames:
         return "", ()
+    names = [name for one in reversed(frames) for name in one.function_name.split(".") if name != "<locals>"]
     here = frames[0]
-    functions = tuple(
-        name for one in reversed(frames) for name in one.function_name.split(".") if name != "<locals>"
-    )
-    return f"{Path(here.file_name).name}:{here.line_num}:{here.function_name}", functions
+    return f"{Path(here.file_name).name}:{here.line_num}:{here.function_name}", tuple(names)
 
 
 def detective(
@@ -290,10 +255,8 @@ def detective(
 
     Args:
         problem: the loss of a rollout of a pair potential.
-        names: parameters, full or short names.
-        saltation: whether flips count.
+        names: parameters, full or short names. saltation: whether flips count.
         tape: the run, where it has been made (with flips, if saltation is asked for).
-        progress: called with the steps done, all steps, and a phase in words.
 
     Raises:
         InputError: no such parameter, or no pair potential. NumericalError: the run blew up.
@@ -305,7 +268,7 @@ def detective(
     if not np.isfinite(tape.value):
         return _in_forward(tape)
     back = StretchReversal(tape, wanted(full), GUARD * radial_speed(simulation) if saltation else None)
-    if not _all_finite(back.onto_total):
+    if _bad(back.onto_total):
         made = first_not_finite(jax.grad(lambda total: tape.loss.value(total, tape.frames)), tape.total)
         return _blamed(tape.steps, "loss", made)
     for stretch in tape.backward():
@@ -313,7 +276,7 @@ def detective(
         _, trace = back.through(stretch, traced=True)
         assert trace is not None
         row = _last_bad(trace, stretch.rows)
-        if row is None and not _all_finite(back.carry):
+        if row is None and _bad(back.carry):
             # what a crossing before the first row of a stretch adds is seen in the carry alone
             row = 0
         if row is not None:
@@ -324,19 +287,10 @@ def detective(
     return NotFinite()
 
 
-def _all_finite(tree: Any) -> bool:
-    leaves = (np.asarray(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
-    return all(np.isfinite(leaf).all() for leaf in leaves)
-
-
-def _last_bad(trace: Trace, rows: int) -> int | None:
+def _last_bad(trace: AdjointCarry, rows: int) -> int | None:
     """The latest row whose carry is not finite."""
-    bad = np.zeros(rows, bool)
-    for leaf in jax.tree.leaves(trace):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            values = np.asarray(leaf)[:rows].reshape(rows, -1)
-            bad |= ~np.isfinite(values).all(axis=1)
-    return int(np.flatnonzero(bad)[-1]) if bad.any() else None
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if _inexact(leaf)]
+    return next((row for row in reversed(range(rows)) if _bad([leaf[row] for leaf in leaves])), None)
 
 
 def _in_forward(tape: RunTape) -> NotFinite:
@@ -361,15 +315,10 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
     zero = jnp.zeros_like(origin.potential)
     whole = (*whole[:8], (loss, origin._replace(potential=zero, virial=zero), *rest), *whole[9:])
     # the rows behind it first, for what it gets
-    if row + 1 < stretch.rows:
-        behind = _rows(whole, row + 1, stretch.rows)
-        carry, _ = transposed(*behind)
-    else:
-        carry = whole[10]
-    here = _rows(whole, row, row + 1)
-    here = (*here[:10], carry, *here[11:])
-    dynamic, fixed = here[:11], here[11:]
-    made = first_not_finite(lambda *args: transposed(*args, *fixed), *dynamic)
+    behind = row + 1 < stretch.rows
+    carry = transposed(*_rows(whole, row + 1, stretch.rows))[0] if behind else whole[10]
+    here, fixed = _rows(whole, row, row + 1), whole[11:]
+    made = first_not_finite(lambda *args: transposed(*args, *fixed), *here[:10], carry)
     part = "parameters"
     if made is not None:
         part = next((word for name, word in _PARTS if name in made.functions), part)
@@ -379,12 +328,8 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
     """The arguments of a reverse pass over some of the rows."""
     out = list(arguments)
-
-    def cut(tree):
-        return jax.tree.map(lambda leaf: leaf[first:end], tree)
-
     for k in (4, 5, 7, 9):
-        out[k] = cut(out[k])
+        out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
     out[6] = end - first
     return tuple(out)
 
@@ -392,9 +337,10 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Labels of the pair whose number it is, and its distance."""
+    """Labels of the pair whose number it is, and its distance; -1, -1 and NaN where it is no pair's."""
+    nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
-        return _NOWHERE
+        return nowhere
     table, atoms = stretch.table, len(stretch.table.order)
     ends: tuple[int, int] | None = None
     if part == "forces" and made.shape[-2:] == (GROUP, atoms) and made.rounds:
@@ -407,9 +353,7 @@ def _pair(
             k = inside[made.index[-1]]
             ends = int(back.met.i[k]), int(back.met.j[k])
     if ends is None:
-        if made.shape[-1] == atoms:
-            return int(table.order[made.index[-1]]), -1, float("nan")
-        return _NOWHERE
+        return (int(table.order[made.index[-1]]), *nowhere[1:]) if made.shape[-1] == atoms else nowhere
     cell = HostCell(back.tape.simulation.cell)
     x = stretch.x[row].astype(np.float64)
     displacement = cell.displacement(x[:, [ends[0]]].T, x[:, [ends[1]]].T)
@@ -417,8 +361,6 @@ def _pair(
     return low, high, float(np.sqrt(sum(float(c[0]) ** 2 for c in displacement)))
 
 
-def _blamed(
-    step: int, part: str, made: Operation | None, where: tuple[int, int, float] = _NOWHERE
-) -> NotFinite:
+def _blamed(step: int, part: str, made: Operation | None, where: tuple[Any, ...] = ()) -> NotFinite:
     name, source, inputs = ("", "", ()) if made is None else (made.name, made.source, made.inputs)
     return NotFinite(True, True, step, name, inputs, source, part, *where)

@@ -1,28 +1,40 @@
-"""What each flip on the way adds to a gradient.
+"""What each flip on the way adds to a gradient, and its jump at the nearest boundaries of decisions.
 
 A crossing adds the derivative of the loss by its own cutoff, times how far the cutoff moves ahead of the
 pair. The first factor is a weight of the reverse pass, in which all later flips count; the second comes from
-tangents in which no earlier one does. Taken so, the terms of all flips sum to what the flips add, exactly:
-the difference of two products is the sum over their factors, later ones from one and earlier ones from the
-other.
+tangents in which no earlier one does. So the terms of all flips sum to what the flips add, exactly.
+
+Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
+At a boundary one pair is decided otherwise between two adjacent floats: a longer step of an optimizer crosses
+into another program, and what the gradient does there says what that is worth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, NumericalError
+from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
 from mdnum.gradients.parameters import columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
-from mdnum.gradients.recorded import GUARD, MOST, ReversePass, passed
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, tape_of
 from mdnum.gradients.tangents import by_column, tangents
+from mdnum.gradients.tape import listed
+from mdnum.md.cell import HostCell
+from mdnum.program import Number
+from mdnum.rollout.program import MdProgram
+from mdnum.systems.build import Simulation
 
 SMOOTH, ENTERS, LEAVES = "smooth", "pair enters", "pair leaves"
+#: How far from the parameter a boundary is looked for, as a share of its value.
+REACH = 0.01
+#: First shift where no forecast is to be had, as a share of the parameter, and how it grows.
+_FIRST, _FACTOR = 1e-12, 8.0
 
 
 @dataclass(frozen=True)
@@ -34,13 +46,11 @@ class FlipTerms:
     Attributes:
         table: a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the
             decision, `radial_speed` (negative where the pair enters), `weight` (derivative of the loss by the
-            cutoff of this one crossing), `grazing` (slower than the guard and left out: it contributes 0, and
-            its weight is what it would have been) and `contribution.<number>`, which sum to the event-aware
-            gradient minus the symmetric one.
+            cutoff of this one crossing), `grazing` (slower than the guard and left out: its weight is what it
+            would have been) and `contribution.<number>`, which sum to event-aware minus symmetric.
         flips, grazing: how many.
-        smooth: the gradient between the flips (their decisions held fixed), by number. total: with the flips.
-        share: share of the total that each channel adds, by number, then channel: "smooth", "pair enters",
-            "pair leaves".
+        smooth: the gradient with decisions held fixed, by number. total: with the flips.
+        share: of the total, by number, then SMOOTH, ENTERS and LEAVES.
         half: number of flips, heaviest first, that have half of the weight of all, by number.
         skipped: number of entries of parameters that have too many of them for contributions.
     """
@@ -54,10 +64,6 @@ class FlipTerms:
     half: dict[str, int]
     skipped: dict[str, int]
 
-    def contribution(self, number: str) -> np.ndarray:
-        """What each flip adds to the derivative by a number."""
-        return self.table[f"contribution.{number}"]
-
 
 def flips(
     problem: Problem,
@@ -70,11 +76,9 @@ def flips(
     """Contributions of all flips, heaviest first.
 
     Args:
-        problem: the loss of a rollout of a pair potential.
-        names: parameters, full or short names.
+        problem: of a pair potential. names: parameters, full or short names.
         guard: radial speed below which a crossing grazes, as a share of the rms radial speed of a pair.
         made: the event-aware reverse pass, where it has been made; its guard counts then.
-        progress: called with the steps done, all steps, and the name of the phase.
 
     Raises:
         InputError: no such parameter, no pair potential, or only parameters of too many entries.
@@ -102,29 +106,22 @@ def flips(
         assert part.dr is not None and part.dr_cut is not None
         moved.append(part.dr_cut - part.dr)
         total = part.total
-    crossings = made.crossings[::-1]
-
-    def column(name: str, dtype: Any = np.float64, of_ledger: bool = False) -> np.ndarray:
-        parts = [getattr(one.ledger if of_ledger else one, name) for one in crossings]
-        return np.concatenate(parts) if parts else np.zeros(0, dtype)
-
-    weight, grazing, speed = column("weight"), column("grazing", bool), column("speed")
+    met = made.crossings[::-1]
+    weight, grazing, speed = (joined(met, name) for name in ("weight", "grazing", "speed"))
+    step, subject, entered, margin, bound = (
+        joined(met, name, ledger=True) for name in ("step", "subject", "entered", "margin", "bound")
+    )
     each = np.where(grazing[:, None], 0.0, weight[:, None] * np.concatenate(moved))
     # the largest share of what flips add to any of the numbers, so that numbers in other units do not vanish
     sums = np.abs(each).sum(axis=0)
     order = np.argsort(-np.max(np.abs(each) / np.where(sums > 0, sums, 1), axis=1), kind="stable")
-    entered, margin = column("entered", bool, True), column("margin", of_ledger=True)
-    bound = column("bound", of_ledger=True)
-    subject = column("subject", np.int64, True).reshape(-1, 2)
     table = {
-        "step": column("step", np.int64, True), "i": subject[:, 0], "j": subject[:, 1], "entered": entered,
+        "step": step, "i": subject[:, 0], "j": subject[:, 1], "entered": entered,
         "margin": margin, "bound": bound, "ambiguous": np.abs(margin) <= bound,
         "radial_speed": np.where(np.isinf(speed), 0.0, speed), "weight": weight, "grazing": grazing,
     }  # fmt: skip
     table |= {f"contribution.{number}": each[:, k] for k, number in enumerate(numbers)}
-    smooth = {
-        number: float(slope) for number, slope in zip(numbers, by_column(made.tape, total), strict=True)
-    }
+    smooth = dict(zip(numbers, by_column(made.tape, total).tolist(), strict=True))
     # a scalar has the empty index
     whole = {str(one): float(np.asarray(made.gradient[one.name])[one.index]) for one in columns}
     share, half = {}, {}
@@ -138,3 +135,166 @@ def flips(
         {name: values[order] for name, values in table.items()},
         len(order), int(grazing.sum()), smooth, whole, share, half, skipped,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DecisionEdge:
+    """The nearest boundary of decisions on one side of a parameter, and the gradient across it.
+
+    Attributes:
+        side: "below" or "above". runs: that the search took. found: whether there is one within reach.
+        inside, beyond: adjacent floats; the run at `inside` decides as the one asked about, that at `beyond`
+            does not. distance: from the parameter's value to `inside`, in its units.
+        step, i, j: the first decision that differs.
+        value_inside, value_beyond: the loss on either side. gradient_inside, gradient_beyond: derivative by
+            this parameter, by method.
+    """
+
+    side: str
+    runs: int
+    found: bool = False
+    inside: float = float("nan")
+    beyond: float = float("nan")
+    distance: float = float("nan")
+    step: int = -1
+    i: int = -1
+    j: int = -1
+    value_inside: float = float("nan")
+    value_beyond: float = float("nan")
+    gradient_inside: dict[str, float] = field(default_factory=dict)
+    gradient_beyond: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DecisionEdges:
+    """The nearest boundaries of decisions below and above the value of one parameter."""
+
+    name: str
+    value: float
+    below: DecisionEdge
+    above: DecisionEdge
+
+
+def edges(
+    problem: Problem, name: str, *, reach: float = REACH, progress: Progress | None = None
+) -> DecisionEdges:
+    """The nearest boundary below and above a parameter, and the gradients across them.
+
+    Where a pair first crosses otherwise is forecast with tangents; then runs are compared, on either side,
+    until two adjacent floats differ.
+
+    Args:
+        problem: of a pair potential. name: a parameter of one entry.
+        reach: how far to look, as a share of the parameter's value.
+
+    Raises:
+        InputError: no such parameter, several entries, or a value of 0. NumericalError: the run blew up.
+
+    Error: none in a boundary. That no other one lies between it and the parameter is as sure as the forecast:
+    pairs of boundaries that undo one another can hide between two runs that decide alike.
+    """
+    (full,) = parameters.resolve(problem.simulation, [name])
+    here = parameters.value(problem.simulation, full)
+    if here.shape:
+        raise InputError(
+            f"{full} has {here.size} entries; boundaries lie along one number",
+            remedy="Search along a parameter of one entry",
+        )
+    value = float(here)
+    if value == 0 or not 0 < reach < 1:
+        raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
+    program = MdProgram(problem.simulation)
+
+    def at(q: float) -> MdProgram:
+        return MdProgram(parameters.with_values(program.simulation, {full: q}))
+
+    # of a radius there is a program that it is an argument of
+    number = program.number(full) if full == "cutoff.radius" else Number(full, value, "", at, at, True)
+    line = NumberLine(program, number, problem.steps, lambda *_: 0.0)
+    ahead = _forecast(problem, full, progress)
+    below, above = (_edge(problem, line, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
+    return DecisionEdges(full, value, below, above)
+
+
+def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
+    """Shifts of the parameter, by sign, at which tangents see the first pair cross; infinite where none."""
+    if name == "box.scale":
+        # the images move too, which these differences of positions leave out
+        return {-1: np.inf, 1: np.inf}
+    simulation = problem.simulation
+    tape = tape_of(problem, True)
+    cell, radii = HostCell(simulation.cell), np.asarray(simulation.decider.r_cut)
+    nearest = {-1: np.inf, 1: np.inf}
+    along = 1.0 if name == "cutoff.radius" else 0.0
+    followed = tangents(tape, [name], states=True, progress=in_phase(progress, "tangents"))
+    for part in followed:
+        stretch, moved = part.stretch, part.x
+        assert moved is not None
+        first, second, kind = listed(simulation, stretch.table)
+        radius = radii[kind]
+        for row in range(stretch.rows):
+            x, dx = stretch.x[row].astype(np.float64), moved[row, 0].astype(np.float64)
+            apart = np.stack(cell.displacement(x[:, first].T, x[:, second].T))
+            r = np.sqrt(np.sum(apart * apart, axis=0))
+            rate = along - np.sum(apart * (dx[:, second] - dx[:, first]), axis=0) / r
+            with np.errstate(divide="ignore", invalid="ignore"):
+                shift = -(radius - r) / rate
+            for sign in nearest:
+                ahead = shift[(shift * sign > 0) & np.isfinite(shift)] * sign
+                if len(ahead):
+                    nearest[sign] = min(nearest[sign], float(ahead.min()))
+    return nearest
+
+
+def _edge(
+    problem: Problem, line: NumberLine, value: float, sign: int, ahead: float, reach: float,
+    progress: Progress | None,
+) -> DecisionEdge:  # fmt: skip
+    side, name = "above" if sign > 0 else "below", line.number.key
+    before, end = len(line.known), reach * abs(value)
+
+    def digest(place: int) -> str:
+        if progress is not None:
+            done = len(line.known) - before
+            progress(done, max(done + 1, 40), f"{name}: boundary {side}")
+        return line.digest(place)
+
+    (home,) = line.places([value])
+    own = digest(home)
+    shift = 1.25 * ahead if np.isfinite(ahead) and ahead < end else _FIRST * abs(value)
+    inside, beyond = home, home
+    while beyond == home:
+        shift = min(shift, end)
+        (place,) = line.places([value + sign * shift])
+        place = home + sign if place == home else place
+        if digest(place) != own:
+            beyond = place
+        elif shift >= end:
+            return DecisionEdge(side, len(line.known) - before)
+        else:
+            inside, shift = place, shift * _FACTOR
+    while abs(beyond - inside) > 1:
+        middle = (inside + beyond) // 2
+        inside, beyond = (middle, beyond) if digest(middle) == own else (inside, middle)
+    # the first decision that differs: of the pair that is nearest to its threshold on both sides
+    found = line.boundary(inside, beyond)
+    near, far = (line.value(place) for place in (inside, beyond))
+    if found is None:
+        raise NumericalError(f"{name} = {far!r}: the run blew up")
+    value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
+    value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
+    return DecisionEdge(
+        side, len(line.known) - before, True, near, far, abs(near - value), found.step, *found.subject,
+        value_near, value_far, gradient_near, gradient_far,
+    )  # fmt: skip
+
+
+def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
+    """Loss and derivatives by one parameter of another simulation."""
+    there = Problem(simulation, problem.loss, problem.steps)
+    tape = tape_of(there, True)
+    found = {
+        word: float(passed(there, [name], saltation=saltation, tape=tape).gradient[name])
+        for word, saltation in (("symmetric", False), ("event-aware", True))
+    }
+    return tape.value, found

@@ -1,29 +1,36 @@
-"""How a gradient grows with the horizon, and whether it would fit a narrow type, read off one reverse pass.
+"""How a gradient grows with the horizon, whether it would fit a narrow type, and how changes stretch.
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps that starts there. So
 one reverse pass over T steps holds a gradient for every horizon up to T, each of another start of the same
-motion.
+motion. Cotangents of a chaotic run span many powers of two: one loss scale helps where they are small
+everywhere, and cannot help where they span more than the narrow format does.
 
-Cotangents of a chaotic run span many powers of two between the last step and the first. A loss scale moves
-all of them together: it helps where they are small everywhere, and cannot help where they span more than the
-format does. The pass is watched in the type that it runs in and compared with the narrow one.
+The largest singular values of a run's Jacobian bound every gradient of a loss of the last state. They come
+from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), made orthonormal again after
+every stretch, so that neither does a length overflow nor do all vectors turn into one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
+from mdnum.errors import InputError, NumericalError
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import Trace
+from mdnum.gradients.adjoint import AdjointCarry, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Problem, Progress
-from mdnum.gradients.recorded import passed
-from mdnum.gradients.tape import TapeStretch
+from mdnum.gradients.recorded import passed, tape_of
+from mdnum.gradients.tape import RunTape, TapeStretch, over_rows, unsorted
+from mdnum.md.decide import Tables
+from mdnum.md.integrators import Integrator
+from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
 from mdnum.systems.build import Simulation
 
@@ -39,6 +46,8 @@ WORDS = ("both bounded", "forward bounded, gradient not", "forward not bounded")
 _LOWEST, _HIGHEST = -200, 200
 #: Share of the numbers of a step that may be lost where one scale is said to fit.
 LOST = 0.01
+#: Beyond this many e-foldings between vectors, the product of triangles is read off its diagonal.
+_RANGE = 30.0
 
 
 @dataclass(frozen=True)
@@ -48,12 +57,11 @@ class GradientGrowth:
     Attributes:
         table: a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`,
             `step`, `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size`
-            (norm of both, with velocities measured by `clock`), `speed` (rms of the atoms: the forward run),
-            and `gradient.<name>`: the derivative by each parameter, were it changed over the last `horizon`
-            steps alone (its norm by the start); the last row is the gradient of the whole run.
-        clock: internal time that turns velocities into lengths. timestep: in the units of the system's file.
-        rate: growth of log(size) per step, from a straight line through the later part.
-        error: its standard error, from blocks. time: for a factor of e, in the units of the system's file.
+            (norm of both, with velocities measured by `clock`), `speed` (rms of the atoms), and
+            `gradient.<name>`: the derivative by each parameter, were it changed over the last `horizon` steps
+            alone (its norm by the start); the last row is the gradient of the whole run.
+        clock: internal time that turns velocities into lengths. timestep, time: in units of the file.
+        rate, error: growth of log(size) per step and its standard error. time: for a factor of e.
         gain: largest size over the first that is not 0; 1 where all are.
         word: one of WORDS.
     """
@@ -67,20 +75,9 @@ class GradientGrowth:
     gain: float
     word: str
 
-    @property
-    def size(self) -> Float[np.ndarray, "rows"]:
-        """Norm of the derivative by the state."""
-        return self.table["size"]
-
 
 class GrowthWatch:
-    """Collects what `Growth` shows while a reverse pass goes on.
-
-    Args:
-        simulation: the system as objects.
-        names: full names of the parameters.
-        steps: last step.
-    """
+    """Collects what `GradientGrowth` shows, by full names of parameters, while a reverse pass goes on."""
 
     def __init__(self, simulation: Simulation, names: Sequence[str], steps: int):
         self.simulation, self.names, self.steps = simulation, tuple(names), steps
@@ -89,7 +86,7 @@ class GrowthWatch:
         # by the start itself a derivative has the entries of the start: its norm is shown for it
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
-    def __call__(self, stretch: TapeStretch, trace: Trace) -> None:
+    def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
         """One stretch of the reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
@@ -105,9 +102,8 @@ class GrowthWatch:
         for row in range(rows if self._scalars else 0):
             model, integrator = jax.tree.unflatten(structure, [leaf[row] for leaf in leaves])
             turned = float(np.sum(onto_v[row] * v[row]))
-            parts = Cotangents(
-                model, integrator, onto_x[row], onto_v[row], float(scale[row]) - turned, r_cut[row]
-            )
+            own_scale = float(scale[row]) - turned
+            parts = Cotangents(model, integrator, onto_x[row], onto_v[row], own_scale, r_cut[row])
             # a temperature scales the velocities that the run has here
             here = replace(self.simulation, velocities=v[row].T)
             for name in self._scalars:
@@ -117,24 +113,17 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """The growth.
-
-        Args:
-            whole: the gradient of the whole run, which is the last row: a loss may compare with the start,
-                and that is no part of what is carried from step to step.
-        """
+        """The growth; its last row is the gradient of the whole run, since a loss may compare with the start,
+        and that is no part of what is carried from step to step."""
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
         clock, backward = CLOCK_STEPS * timestep, self.norms[::-1]
         size = np.sqrt(backward[:, 0] ** 2 + (backward[:, 1] / clock) ** 2)
         table = {
-            "horizon": np.arange(self.steps + 1),
-            "step": np.arange(self.steps, -1, -1),
-            "onto_positions": backward[:, 0].copy(),
-            "onto_velocities": backward[:, 1].copy(),
-            "size": size,
+            "horizon": np.arange(self.steps + 1), "step": np.arange(self.steps, -1, -1),
+            "onto_positions": backward[:, 0].copy(), "onto_velocities": backward[:, 1].copy(), "size": size,
             "speed": backward[:, 2].copy(),
-        }
+        }  # fmt: skip
         for name in self.names:
             if name in self.gradient:
                 values = self.gradient[name][::-1].copy()
@@ -145,27 +134,21 @@ class GrowthWatch:
             columns = values.reshape(len(values), -1).T
             several = len(columns) > 1
             table |= {f"gradient.{name}{f'.{k}' * several}": column for k, column in enumerate(columns)}
-        rate, error, grows = growth_rate(size)
-        bounded = forward_bounded(self.norms[:, 2])
-        word = WORDS[2] if not bounded else WORDS[1] if grows else WORDS[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rate, error, grows = growth_rate(np.log(size))
+        word = _word(self.norms[:, 2], grows)
         there = size[np.isfinite(size) & (size > 0)]
         gain = float(there.max() / there[0]) if len(there) else 1.0
         step = timestep / units.time_factor
         return GradientGrowth(table, clock, step, rate, error, step / rate if rate else np.inf, gain, word)
 
 
-def growth_rate(size: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Growth of log(size) per row, its standard error, and whether it is more than linear growth gives.
+def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
+    """Growth of a logarithm per row, its standard error, and whether it is more than linear growth gives.
 
     From the later part of the rows, in blocks. NaN and no where there are too few rows, or they are not
     finite.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return log_rate(np.log(size))
-
-
-def log_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """As `growth_rate`, of a size that is given by its logarithm."""
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
         return float("nan"), float("nan"), False
@@ -181,22 +164,18 @@ def log_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     return rate, error, bool(rate > 2 * linear and rate > _SIGNIFICANT * error)
 
 
-def forward_bounded(speed: Float[np.ndarray, "rows"]) -> bool:
-    """Whether the rms speeds of a run stay within a factor of the usual one."""
+def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
+    """One of WORDS; a run is bounded where its rms speeds stay within a factor of the usual one."""
     usual = float(np.median(speed))
-    return bool(np.isfinite(speed).all() and speed.max() <= _WILD * usual) if usual > 0 else True
+    if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
+        return WORDS[2]
+    return WORDS[1] if grows else WORDS[0]
 
 
 def growth(
     problem: Problem, names: Sequence[str], *, saltation: bool = True, progress: Progress | None = None
 ) -> GradientGrowth:
     """The gradient against the horizon, from one reverse pass.
-
-    Args:
-        problem: the loss of a rollout.
-        names: parameters, full or short names.
-        saltation: whether flips count.
-        progress: called with the steps done, all steps, and the name of the phase.
 
     Raises:
         InputError: no such parameter, or flips of no pair potential. NumericalError: the run blew up.
@@ -214,17 +193,14 @@ class Scaling:
     """Whether the cotangents of a reverse pass fit a narrow type, step by step.
 
     Attributes:
-        format: the type, one of precision.formats.
-        numbers: in each step.
+        format: the type, one of numerics.formats. numbers: in each step.
         table: by `horizon`, numbers of the step that are beyond the largest of the format (`overflow`), lost
             below half the smallest (`underflow`), have lost digits (`subnormal`), the `largest` and
             `smallest` magnitude (zeros left out), and the counts with the scale (`scaled_...`).
-        scale: a power of two by which the loss is multiplied so that the fewest numbers are lost and none
-            overflows; NaN where no scale keeps the largest in range and more than half of the others.
-        power: its exponent, of the largest scale that overflows nowhere.
-        usable: whether there is anything finite to scale.
-        fits: whether one scale serves all steps: nothing overflows, and no step loses more than 1 % of its
-            numbers. worst: largest share of its numbers that a step loses.
+        scale, power: a power of two by which the loss is multiplied so that the fewest numbers are lost and
+            none overflows, NaN where more than half are lost with any; and its exponent.
+        usable: whether there is anything finite to scale. fits: whether no step loses more than 1 % of its
+            numbers with it. worst: largest share that a step loses.
     """
 
     format: str
@@ -238,22 +214,17 @@ class Scaling:
 
 
 class ScalingWatch:
-    """Counts what would overflow and underflow while a reverse pass goes on.
-
-    Args:
-        steps: last step.
-        format: one of precision.formats.
-    """
+    """Counts what would overflow and underflow while a reverse pass goes on."""
 
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)
         self.steps, self.numbers = steps, 0
-        self.largest, self.smallest = np.zeros(steps + 1), np.full(steps + 1, np.inf)
-        self.overflow, self.underflow, self.subnormal = (np.zeros(steps + 1, np.int64) for _ in range(3))
+        self.table = {name: np.zeros(steps + 1, np.int64) for name in ("overflow", "underflow", "subnormal")}
+        self.table |= {"largest": np.zeros(steps + 1), "smallest": np.full(steps + 1, np.inf)}
         # how many numbers of each step have each binary exponent
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
-    def __call__(self, stretch: TapeStretch, trace: Trace) -> None:
+    def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
         """One stretch of the reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))
@@ -261,25 +232,25 @@ class ScalingWatch:
 
     def put(self, step: int, values: Float[np.ndarray, "numbers"]) -> None:
         """The cotangents of one step."""
-        form, size = self.format, np.abs(values)
+        form, size, table = self.format, np.abs(values), self.table
         self.numbers = len(values)
         there = size[np.isfinite(size) & (size > 0)]
         # half a unit in the last place beyond the largest rounds to infinity
         too_large = form.largest * (1 + 2.0 ** -(form.significand + 1))
-        self.overflow[step] = np.count_nonzero(~(size <= too_large))
-        self.underflow[step] = np.count_nonzero(there <= form.smallest_subnormal / 2)
-        self.subnormal[step] = np.count_nonzero(there < form.smallest_normal) - self.underflow[step]
+        table["overflow"][step] = np.count_nonzero(~(size <= too_large))
+        table["underflow"][step] = lost = np.count_nonzero(there <= form.smallest_subnormal / 2)
+        table["subnormal"][step] = np.count_nonzero(there < form.smallest_normal) - lost
         if len(there):
-            self.largest[step], self.smallest[step] = there.max(), there.min()
+            table["largest"][step], table["smallest"][step] = there.max(), there.min()
             place = np.clip(np.frexp(there)[1], _LOWEST, _HIGHEST) - _LOWEST
             self.exponents[step] = np.bincount(place, minlength=_HIGHEST - _LOWEST + 1)
         if not np.isfinite(size).all():
-            self.largest[step] = np.inf
+            table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
         """The counts, with and without the best scale; exact but for numbers on an edge of a power of two."""
         form = self.format
-        largest = float(self.largest.max())
+        largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
         usable = 0 < largest < np.inf
         # the more is multiplied the less is lost, so the best scale is the largest that overflows nowhere
@@ -290,15 +261,256 @@ class ScalingWatch:
         lost = self.exponents[:, :end].sum(axis=1, dtype=np.int64)
         kept = 1 - lost.sum() / max(there.sum(), 1)
         worst = float(np.max(lost / np.maximum(there, 1)))
-        columns = {
-            "overflow": self.overflow, "underflow": self.underflow, "subnormal": self.subnormal,
-            "largest": self.largest, "smallest": self.smallest,
-            "scaled_overflow": np.zeros_like(self.overflow) if usable else self.overflow,
+        overflow = self.table["overflow"]
+        scaled = {
+            "scaled_overflow": np.zeros_like(overflow) if usable else overflow,
             "scaled_underflow": lost,
-        }  # fmt: skip
-        table = {name: column[::-1].copy() for name, column in columns.items()}
+        }
+        table = {name: column[::-1].copy() for name, column in (self.table | scaled).items()}
         scale = 2.0**power if usable and kept > 0.5 else float("nan")
         return Scaling(
             form.name, self.numbers, {"horizon": np.arange(self.steps + 1)} | table, scale, power, usable,
             bool(usable and worst <= LOST), worst,
         )  # fmt: skip
+
+
+# --- singular values of the run's Jacobian -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """How small changes of the start stretch: singular values of the product of all step Jacobians.
+
+    Lengths of changes are those of positions, and of velocities times `clock`.
+
+    Attributes:
+        steps: of the run. clock: internal time.
+        log_singular: natural logarithm of the largest singular values, largest first.
+        residual: |Phi^T u - s v| / s of each with its vectors u and v: how exact it is.
+        exponents, exponents_time: finite-time Lyapunov exponents per step, and per unit of time of the file.
+        horizon, curve: steps, and log stretch of the k-th direction of an orthonormal frame carried forward.
+        transposed: relative defect of <w, Phi v> = <Phi^T w, v>: a rounding error.
+        word: one of WORDS.
+    """
+
+    steps: int
+    clock: float
+    log_singular: Float[np.ndarray, "values"]
+    residual: Float[np.ndarray, "values"]
+    exponents: Float[np.ndarray, "values"]
+    exponents_time: Float[np.ndarray, "values"]
+    horizon: Int[np.ndarray, "points"]
+    curve: Float[np.ndarray, "points values"]
+    transposed: float
+    word: str
+
+
+@dataclass(frozen=True)
+class TangentImage:
+    """Where a block of orthonormal vectors went: basis @ exp(log_scale) mixing.
+
+    Attributes:
+        basis: orthonormal, shape (coordinates, vectors).
+        mixing: upper triangular, of size one, shape (vectors, vectors). log_scale: log of what was taken out.
+        steps: number of steps after which `stretches` was noted, shape (points,).
+        stretches: log of the diagonal of the mixing so far, shape (points, vectors).
+    """
+
+    basis: Float[np.ndarray, "coordinates vectors"]
+    mixing: Float[np.ndarray, "vectors vectors"]
+    log_scale: float
+    steps: np.ndarray
+    stretches: Float[np.ndarray, "points vectors"]
+
+
+class Jacobian:
+    """The derivative of the state at the last step by that at step 0, decisions held fixed.
+
+    A state is positions and velocities times `clock`, an internal time, flat.
+
+    Raises:
+        InputError: a many-body potential.
+    """
+
+    def __init__(self, tape: RunTape, clock: float):
+        if not isinstance(tape.simulation.force, PairForce):
+            raise InputError(
+                "the Jacobian of a step is one of pair potentials", where=tape.simulation.system.name
+            )
+        self.tape, self.clock = tape, clock
+        self.force: PairForce = tape.simulation.force
+        self.coordinates = 6 * tape.simulation.atoms
+
+    def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
+        """The image of an orthonormal block, or under the transpose."""
+        stretches = self.tape.backward() if backward else self.tape.forward()
+        vectors, steps = block.shape[1], self.tape.steps
+        mixing, log_scale = np.eye(vectors), 0.0
+        noted, curve, done = [0], [np.zeros(vectors)], 0
+        for stretch in stretches:
+            # the last row is a state that no step leaves
+            used = min(stretch.rows, steps - stretch.first)
+            if used <= 0:
+                continue
+            block, r = _orthonormal(self._through(stretch, used, block, backward))
+            mixing = r @ mixing
+            size = float(np.abs(mixing).max())
+            if not np.isfinite(size) or size == 0:
+                raise FloatingPointError("a tangent is not finite")
+            mixing, log_scale, done = mixing / size, log_scale + float(np.log(size)), done + used
+            noted.append(done)
+            with np.errstate(divide="ignore"):
+                curve.append(curve[-1] + np.log(np.abs(np.diag(r))))
+        return TangentImage(block, mixing, log_scale, np.array(noted), np.array(curve))
+
+    def _through(self, stretch: TapeStretch, used: int, block, backward: bool):
+        simulation, order = self.tape.simulation, stretch.table.order
+        dtype, clocks = simulation.policy.dtype("state"), (1 / self.clock, self.clock)
+        into, back = reversed(clocks) if backward else clocks
+        x, v = (part.T.reshape(-1, 3, simulation.atoms)[..., order] for part in np.split(block, 2))
+        x, v = _carried(
+            self.force, simulation.integrator, jnp.asarray(simulation.masses[order]),
+            simulation.tables(stretch.table), (stretch.steps, stretch.x, stretch.v, stretch.bits), used,
+            (jnp.asarray(x.astype(dtype)), jnp.asarray((into * v).astype(dtype))), backward,
+        )  # fmt: skip
+        v = back * np.asarray(v, np.float64)
+        moved = (unsorted(jnp.asarray(part, jnp.float64), order) for part in (x, v))
+        return np.concatenate([np.asarray(part).reshape(block.shape[1], -1).T for part in moved])
+
+
+def _orthonormal(block):
+    """Its QR factors, with a diagonal that is not negative."""
+    q, r = np.linalg.qr(block)
+    signs = np.where(np.diag(r) < 0, -1.0, 1.0)
+    return q * signs, signs[:, None] * r
+
+
+@partial(jax.jit, static_argnames=("backward",))
+def _carried(
+    force: PairForce,
+    integrator: Integrator,
+    masses: Float[Array, "atoms"],
+    tables: Tables,
+    rows,
+    used,
+    block: tuple[Float[Array, "vectors 3 atoms"], Float[Array, "vectors 3 atoms"]],
+    backward: bool,
+):
+    dynamics = PairDynamics(force, integrator, masses, tables)
+    dtype = block[0].dtype
+    half = (0.5 * integrator.timestep).astype(dtype)
+    nothing = jnp.zeros((), jnp.float64)
+
+    def push(row, dx, dv):
+        number, x, v, told = row
+
+        def step(x, v):
+            after = dynamics.step(MdState(number, x, v), told)
+            return after.x, after.v
+
+        return jax.jvp(step, (x, v), (dx, dv))[1]
+
+    def pull(row, onto_x, onto_v):
+        number, x, v, told = row
+        _, back = jax.vjp(lambda x, v: integrator.drift(x, v, masses, number, tables.order)[:2], x, v)
+        onto_x, onto_v = back((onto_x, onto_v))
+        kicks = half + jnp.where(number == 0, jnp.zeros((), dtype), half)
+        w = kicks * onto_v / masses.astype(dtype)
+        made = pull_back(force, x, tables, told, w, nothing, nothing)
+        return onto_x + made.x, onto_v
+
+    def body(carry, row):
+        each = jax.vmap(partial(pull if backward else push, row))
+        return each(*carry), jnp.zeros(())
+
+    return over_rows(body, block, rows, used, backward=backward)[0]
+
+
+def spectrum(
+    problem: Problem,
+    *,
+    values: int = 3,
+    extra: int = 4,
+    rounds: int = 4,
+    seed: int = 0,
+    tape: RunTape | None = None,
+    progress: Progress | None = None,
+) -> Spectrum:
+    """Singular values and finite-time Lyapunov exponents of the product of all step Jacobians.
+
+    Decisions are held fixed: what flips do to a change is not in it.
+
+    Args:
+        values: how many singular values. extra: vectors that are carried along for faster convergence.
+        rounds: forward and backward passes of the block. seed: of the random block.
+        tape: the run, where it has been made.
+
+    Raises:
+        InputError: no pair potential, or fewer coordinates than values. NumericalError: the run blew up.
+
+    Error: within `residual` of each there is a singular value, relatively.
+    """
+    simulation = problem.simulation
+    if tape is None:
+        tape = tape_of(problem, False, progress=progress)
+    timestep = float(simulation.integrator.timestep)
+    jacobian = Jacobian(tape, CLOCK_STEPS * timestep)
+    if not 1 <= values <= jacobian.coordinates or rounds < 1:
+        raise InputError(f"{values} singular values of {jacobian.coordinates} coordinates, {rounds} rounds")
+    vectors = min(values + extra, jacobian.coordinates)
+    rng = np.random.default_rng(seed)
+    start, _ = np.linalg.qr(rng.standard_normal((jacobian.coordinates, vectors)))
+    defect = float("nan")
+    try:
+        there = jacobian.image(start)
+        for k in range(rounds):
+            back = jacobian.image(there.basis, backward=True)
+            if k == 0:
+                defect = _defect(start, there, back)
+            if progress is not None:
+                progress(k + 1, rounds, "singular values")
+            start = back.basis
+            there = jacobian.image(start)
+        log_s, left, right = _svd(there)
+        residual = _residual(jacobian, there.basis @ left, start @ right, log_s)
+    except FloatingPointError as error:
+        raise NumericalError(f"singular values: {error}", remedy="Ask the detective why") from error
+    exponents = log_s[:values] / tape.steps
+    steps, curve = np.arange(tape.steps + 1), there.stretches[:, :values]
+    *_, grows = growth_rate(np.interp(steps, there.steps, curve[:, 0]))
+    speeds = [
+        np.sum(one.v[: one.rows].astype(np.float64) ** 2, axis=1).mean(axis=1) for one in tape.forward()
+    ]
+    return Spectrum(
+        tape.steps, jacobian.clock, log_s[:values], residual[:values], exponents,
+        exponents / (timestep / simulation.units.time_factor), there.steps, curve, defect,
+        _word(np.sqrt(np.concatenate(speeds)), grows),
+    )  # fmt: skip
+
+
+def _defect(start, there: TangentImage, back: TangentImage) -> float:
+    """Of Q' (Phi q) = (Phi' Q)' q, relative."""
+    forward = there.mixing
+    factor = np.exp(np.clip(back.log_scale - there.log_scale, -600, 600))
+    backward = factor * (back.basis @ back.mixing).T @ start
+    return float(np.abs(forward - backward).max() / np.abs(forward).max())
+
+
+def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log of the singular values of the map on the block, and both sets of vectors in its bases."""
+    diagonal = image.stretches[-1]
+    if diagonal.max() - diagonal.min() > _RANGE:
+        # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them
+        order = np.argsort(-diagonal)
+        identity = np.eye(len(diagonal))[:, order]
+        return diagonal[order], identity, identity
+    left, sizes, right = np.linalg.svd(image.mixing)
+    return np.log(sizes) + image.log_scale, left, right.T
+
+
+def _residual(jacobian: Jacobian, left, right, log_s) -> np.ndarray:
+    """|Phi' u - s v| / s of each pair of singular vectors."""
+    back = jacobian.image(left, backward=True)
+    with np.errstate(over="ignore"):
+        image = (back.basis @ back.mixing) * np.exp(back.log_scale - log_s)
+    return np.linalg.norm(image - right, axis=0)

@@ -2,9 +2,8 @@
 
 Where a pair turns back just outside its cutoff it leaves no flip; had it come a little further it would have
 entered and left, at a radial speed near zero, and both crossings would have added terms that go with one
-over that speed. A gradient that hangs on such a pair is another one at another time step. So every turning
-point within reach of the cutoff counts, on either side of it and between two steps too: those beyond the
-cutoff have their term in the gradient, and would lose it.
+over that speed. So every turning point within reach of the cutoff counts, on either side of it and between
+two steps too: those beyond the cutoff have their term in the gradient, and would lose it.
 
 Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that comes a depth d beyond the cutoff crosses it
 twice with the speed sqrt(2 a d), and the two crossings add 2 w / sqrt(2 a d), where w is what a crossing adds
@@ -13,17 +12,17 @@ at unit speed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from mdnum.gradients.adjoint import Trace
+from mdnum.gradients.adjoint import AdjointCarry
 from mdnum.gradients.parameters import directions
 from mdnum.gradients.tangents import StretchTangents
-from mdnum.gradients.tape import Pace, TapeStretch
+from mdnum.gradients.tape import Pace, TapeStretch, listed
 from mdnum.md.cell import HostCell
 from mdnum.systems.build import Simulation
 
@@ -39,84 +38,87 @@ REACH = 2.0
 _NEIGHBORS = 20
 
 
-@dataclass
+#: Columns of integers, of vectors, and those that the reverse pass, tangents and other runs put in.
+_WHOLE, _VECTORS = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
+_LATER = ("weight", "moved", "shift")
+_COLUMNS = (*_WHOLE, *_VECTORS, *_LATER, "gap", "bend", "unseen", "part", "before", "after")
+
+
 class Turns:
-    """Turning points of pairs near their cutoff; a row for each, in the order of steps.
+    """Turning points of pairs near their cutoff.
 
     Attributes:
-        step: it lies between this step and the one before. row: of that step in its stretch.
-        i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
-        gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
-        bend: magnitude of the second derivative of the distance there, length per internal time².
-        unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
-        weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
-        moved: how far the cutoff moves ahead of the pair, by number that is differentiated by; NaN before
+        table: a row for each, in the order of steps:
+            step: it lies between this step and the one before. row: of that step in its stretch.
+            i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
+            gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
+            bend: magnitude of the second derivative of the distance there, length per internal time².
+            unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
+            weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
+            moved: how far the cutoff moves ahead of the pair, by number that is differentiated by; NaN before
             the tangents have been there.
-        shift: how far the distance is from that of other runs (another time step, another rounding), the
+            shift: how far the distance is from that of other runs (another time step, another rounding), the
             largest of them, length; 0 before any was compared.
-        normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
-        part: where between the two steps, 0 to 1. before, after: distances at the two steps.
+            normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
+            part: where between the two steps, 0 to 1. before, after: distances at the two steps.
     """
 
-    step: Int[np.ndarray, "turns"]
-    row: Int[np.ndarray, "turns"]
-    i: Int[np.ndarray, "turns"]
-    j: Int[np.ndarray, "turns"]
-    a: Int[np.ndarray, "turns"]
-    b: Int[np.ndarray, "turns"]
-    kind: Int[np.ndarray, "turns"]
-    gap: Float[np.ndarray, "turns"]
-    bend: Float[np.ndarray, "turns"]
-    unseen: Bool[np.ndarray, "turns"]
-    weight: Float[np.ndarray, "turns"]
-    moved: Float[np.ndarray, "turns columns"]
-    shift: Float[np.ndarray, "turns"]
-    normal: Float[np.ndarray, "turns 3"]
-    images: Float[np.ndarray, "turns 3"]
-    part: Float[np.ndarray, "turns"]
-    before: Float[np.ndarray, "turns"]
-    after: Float[np.ndarray, "turns"]
+    def __init__(self, rows: list[dict[str, np.ndarray]], columns: int = 0):
+        count = sum(len(row["step"]) for row in rows)
+        later = {
+            "weight": np.zeros(count), "moved": np.full((count, columns), np.nan), "shift": np.zeros(count)
+        }  # fmt: skip
+        self.table: dict[str, np.ndarray] = {}
+        for name in _COLUMNS:
+            given = bool(rows) and name in rows[0]
+            empty = np.zeros((0, 3) if name in _VECTORS else 0, np.int64 if name in _WHOLE else np.float64)
+            self.table[name] = (
+                np.concatenate([row[name] for row in rows]) if given else later.get(name, empty)
+            )
+        self.table["unseen"] = self.table["unseen"].astype(bool)
 
     def __len__(self) -> int:
-        return len(self.step)
+        return len(self.table["step"])
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
         """How far the distance may move: from its own shift and from those of the turning points around."""
         if not len(self):
             return np.zeros(0)
-        sums = np.concatenate([[0.0], np.cumsum(np.square(self.shift))])
+        shift = self.table["shift"]
+        sums = np.concatenate([[0.0], np.cumsum(np.square(shift))])
         last = np.clip(np.arange(len(self)) + _NEIGHBORS // 2, min(_NEIGHBORS, len(self)), len(self))
         first = np.maximum(last - _NEIGHBORS, 0)
         typical = np.sqrt((sums[last] - sums[first]) / (last - first))
-        return REACH * np.maximum(self.shift, typical)
+        return REACH * np.maximum(shift, typical)
 
     @property
     def within(self) -> np.ndarray:
         """Which of them may be on the other side of their cutoff, or are and left no flip."""
-        return (np.abs(self.gap) <= self.reach) | self.unseen
+        return (np.abs(self.table["gap"]) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
         """What the two crossings add, magnitude: in the mean over depths up to the reach, or at the depth of
         those that no step saw; 0 out of reach."""
+        bend, gap, reach = self.table["bend"], np.abs(self.table["gap"]), self.reach
         with np.errstate(divide="ignore", invalid="ignore"):
-            mean = 2 / np.sqrt(2 * self.bend * self.reach)
-            there = 1 / np.sqrt(2 * self.bend * np.abs(self.gap))
-            times = np.where(self.unseen & ~(np.abs(self.gap) <= self.reach), there, mean)
-            terms = np.abs(2 * self.weight[:, None] * self.moved) * times[:, None]
+            mean = 2 / np.sqrt(2 * bend * reach)
+            there = 1 / np.sqrt(2 * bend * gap)
+            times = np.where(self.table["unseen"] & ~(gap <= reach), there, mean)
+            terms = np.abs(2 * self.table["weight"][:, None] * self.table["moved"]) * times[:, None]
         return np.where(self.within[:, None], terms, 0.0)
 
     def heaviest(self, words: tuple[str, ...], most: int = 10) -> list[dict[str, Any]]:
-        """Those within reach with the largest terms, as plain rows."""
+        """Those within reach as plain rows, terms by word, those with the largest first."""
         kept = np.flatnonzero(self.within)
-        term, reach = self.term, self.reach
+        term, reach, table = self.term, self.reach, self.table
         share = term[kept] / np.maximum(term.max(axis=0, initial=0.0), 1e-300)
         order = kept[np.argsort(-share.max(axis=1, initial=0.0), kind="stable")][:most]
         return [
             {
-                "step": int(self.step[k]), "i": int(self.i[k]), "j": int(self.j[k]),
-                "gap": float(self.gap[k]), "reach": float(reach[k]),
+                "step": int(table["step"][k]), "i": int(table["i"][k]), "j": int(table["j"][k]),
+                "gap": float(table["gap"][k]), "reach": float(reach[k]),
                 "term": {word: float(value) for word, value in zip(words, term[k], strict=True)},
             }
             for k in order
@@ -128,30 +130,28 @@ class Near:
     """Collects turning points while a reverse pass, tangents and other runs go by.
 
     Attributes:
-        simulation: the system as objects.
-        pace: how often the loss looks.
-        rows: of the longest stretch.
+        pace: how often the loss looks. rows: of the longest stretch.
     """
 
     simulation: Simulation
     pace: Pace
     rows: int = 0
-    _found: list[Turns] = field(default_factory=list)
-    _at: dict[int, Turns] = field(default_factory=dict)
+    #: Tables by the first step of their stretch, last one first.
+    _found: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
 
     @property
     def jumps(self) -> bool:
         """Whether a crossing adds anything at all: force or energy of a pair jump."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
-    def reverse(self, stretch: TapeStretch, trace: Trace) -> None:
+    def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
         """One stretch of the event-aware reverse pass, last first: its turning points and their weights."""
         if not self.jumps:
             return
         simulation = self.simulation
         self.rows = max(self.rows, len(stretch.x))
-        found = turning(simulation, stretch)
-        row, a, b = found.row, found.a, found.b
+        self._found[stretch.first] = found = turning(simulation, stretch).table
+        row, a, b = found["row"], found["a"], found["b"]
         half = 0.5 * float(simulation.integrator.timestep)
         masses = simulation.masses[stretch.table.order]
         onto_x, onto_v = (np.asarray(part) for part in (trace.x, trace.v))
@@ -159,64 +159,63 @@ class Near:
         def impulse(atom):
             return (onto_v[row, :, atom] + half * onto_x[row, :, atom]) / masses[atom][:, None]
 
-        along = np.sum(found.normal * (impulse(b) - impulse(a)), axis=1)
+        along = np.sum(found["normal"] * (impulse(b) - impulse(a)), axis=1)
         by_energy, by_virial = (np.asarray(part)[row] for part in trace.frame)
         timestep, share = simulation.integrator.timestep, np.zeros(len(row))
-        for step in np.unique(found.step[(by_energy != 0) | (by_virial != 0)]):
-            share[found.step == step] = float(self.pace.share(jnp.asarray(step), timestep))
-        energy, force = (np.asarray(jump)[found.kind] for jump in simulation.jumps())
-        radius = np.asarray(simulation.decider.r_cut)[found.kind]
+        for step in np.unique(found["step"][(by_energy != 0) | (by_virial != 0)]):
+            share[found["step"] == step] = float(self.pace.share(jnp.asarray(step), timestep))
+        energy, force = (np.asarray(jump)[found["kind"]] for jump in simulation.jumps())
+        radius = np.asarray(simulation.decider.r_cut)[found["kind"]]
         seen = share * (by_energy * energy + by_virial * force * radius)
-        found.weight = force * along + seen
-        self._found.append(found)
-        self._at[stretch.first] = found
+        found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
         """One stretch of the tangents: how far each distance moves."""
-        found = self._at.get(part.stretch.first)
+        simulation, stretch = self.simulation, part.stretch
+        found = self._found.get(stretch.first)
         if found is None:
             return
-        simulation, stretch = self.simulation, part.stretch
         along = directions(simulation, part.columns)
+        matrix, row = np.asarray(along.matrix), found["row"]
         x, v = part.x, part.v
         assert x is not None and v is not None
-        late = (1 - found.part) * float(simulation.integrator.timestep)
+        late = (1 - found["part"]) * float(simulation.integrator.timestep)
 
         def moved(atom):
-            rows = x[found.row, :, :, atom] - late[:, None, None] * v[found.row, :, :, atom]
-            images = stretch.images[found.row, :, atom].astype(np.float64)
-            return rows - np.einsum("cab,ra->rcb", np.asarray(along.matrix), images)
+            rows = x[row, :, :, atom] - late[:, None, None] * v[row, :, :, atom]
+            images = stretch.images[row, :, atom].astype(np.float64)
+            return rows - np.einsum("cab,ra->rcb", matrix, images)
 
-        apart = moved(found.b) - moved(found.a)
-        apart = apart + np.einsum("cab,ra->rcb", np.asarray(along.matrix), found.images)
-        dr = np.einsum("rcb,rb->rc", apart, found.normal)
-        found.moved = np.asarray(along.r_cut).T[found.kind] - dr
+        apart = moved(found["b"]) - moved(found["a"])
+        apart = apart + np.einsum("cab,ra->rcb", matrix, found["images"])
+        dr = np.einsum("rcb,rb->rc", apart, found["normal"])
+        found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
         """One stretch of another run, which makes `per` steps where this one makes one."""
         cell, place = HostCell(self.simulation.cell), np.argsort(stretch.table.order)
-        for found in self._found:
-            for before, distance in ((1, found.before), (0, found.after)):
-                row = per * (found.step - before) - stretch.first
+        for found in self._found.values():
+            for earlier, name in ((1, "before"), (0, "after")):
+                row = per * (found["step"] - earlier) - stretch.first
                 here = np.flatnonzero((row >= 0) & (row < stretch.rows))
                 if not len(here):
                     continue
                 a, b = (
-                    stretch.x[row[here], :, place[label[here]]].astype(np.float64)
-                    for label in (found.i, found.j)
+                    stretch.x[row[here], :, place[found[label][here]]].astype(np.float64) for label in "ij"
                 )
                 r = np.linalg.norm(np.stack(cell.displacement(a, b), axis=1), axis=1)
-                found.shift[here] = np.maximum(found.shift[here], np.abs(r - distance[here]))
+                found["shift"][here] = np.maximum(found["shift"][here], np.abs(r - found[name][here]))
 
     def turns(self, columns: int) -> Turns:
         """All of them, in the order of their steps."""
-        found = [
-            replace(one, moved=np.full((len(one), columns), np.nan)) if one.moved.shape[1] != columns else one
-            for one in self._found[::-1]
-        ] or [_turns([], self.simulation, columns)]
-        parts = {each.name: [getattr(one, each.name) for one in found] for each in fields(Turns)}
-        order = np.argsort(np.concatenate(parts["step"]), kind="stable")
-        return Turns(**{name: np.concatenate(part)[order] for name, part in parts.items()})
+        rows = [dict(found) for found in reversed(self._found.values())]
+        for row in rows:
+            if row["moved"].shape[1] != columns:
+                row["moved"] = np.full((len(row["step"]), columns), np.nan)
+        made = Turns(rows, columns)
+        order = np.argsort(made.table["step"], kind="stable")
+        made.table = {name: column[order] for name, column in made.table.items()}
+        return made
 
 
 def hermite(
@@ -225,8 +224,7 @@ def hermite(
     """Where the cubic through two distances with their rates turns, between rates of unlike signs.
 
     Args:
-        r0, s0, r1, s1: distance and its rate at the two ends.
-        time: between them.
+        r0, s0, r1, s1: distance and its rate at the two ends. time: between them.
 
     Returns:
         where between the ends (0 to 1), the distance there, and its second derivative by time.
@@ -245,12 +243,8 @@ def hermite(
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
     """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
-    order, index = stretch.table.order, stretch.table.index
-    slots, i = np.nonzero(index < simulation.atoms)
-    j = index[slots, i]
-    once = order[i] < order[j]
-    i, j = i[once], j[once]
-    kind = np.asarray(simulation.type_of(order[i], order[j]), np.int64)
+    order = stretch.table.order
+    i, j, kind = listed(simulation, stretch.table)
     radius = np.asarray(simulation.decider.r_cut, np.float64)[kind]
     time = float(simulation.integrator.timestep)
     cell = HostCell(simulation.cell)
@@ -304,25 +298,6 @@ def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
                         }
                     )  # fmt: skip
             before = (r, rate, d)
-    return _turns(rows, simulation)
-
-
-def _turns(rows: list[dict[str, np.ndarray]], simulation: Simulation, columns: int = 0) -> Turns:
-    """Rows as columns; what the reverse pass, tangents and other runs put in is not there yet."""
-    whole, three = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
-
-    def column(name: str) -> np.ndarray:
-        empty = np.zeros((0, 3) if name in three else 0, np.int64 if name in whole else np.float64)
-        parts = [row[name] for row in rows]
-        return np.concatenate(parts) if parts else empty.astype(bool) if name == "unseen" else empty
-
-    found = {
-        each.name: column(each.name)
-        for each in fields(Turns)
-        if each.name not in ("weight", "moved", "shift")
-    }
-    found["images"] = np.rint(found["images"] @ np.asarray(simulation.cell.inverse, np.float64))
-    count = len(found["step"])
-    return Turns(
-        **found, weight=np.zeros(count), moved=np.full((count, columns), np.nan), shift=np.zeros(count)
-    )
+    made = Turns(rows)
+    made.table["images"] = np.rint(made.table["images"] @ np.asarray(simulation.cell.inverse, np.float64))
+    return made

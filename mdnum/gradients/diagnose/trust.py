@@ -6,41 +6,42 @@ would make it flip, or not, and its term weighs; a decision was so close to its 
 it; the gradients of other starts of the same system scatter by more than their mean. Each is a limit by
 itself, and one that was not examined leaves the verdict undecided: no flip shows what did not flip, and no
 rounding the time step.
+
+The gradients of all shorter runs come from one run and one pass of tangents.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, GradientGrowth, GrowthWatch
-from mdnum.gradients.diagnose.horizons import (
-    TIMESTEP,
-    Horizons,
-    first_difference,
-    halved,
-    horizons,
-    spread,
-)
 from mdnum.gradients.diagnose.near import Near, Turns
-from mdnum.gradients.differences import in_float64
-from mdnum.gradients.ensemble import replica
-from mdnum.gradients.problem import Problem, Progress
-from mdnum.gradients.recorded import MOST, ReversePass, passed
-from mdnum.gradients.tape import pace_of
+from mdnum.gradients.differences import in_float64, replica
+from mdnum.gradients.losses import Loss
+from mdnum.gradients.parameters import ParameterEntry, columns_of
+from mdnum.gradients.problem import Problem, Progress, in_phase
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, radial_speed, weights
+from mdnum.gradients.tangents import StretchTangents, tangents
+from mdnum.gradients.tape import RunTape, TapeStretch, pace_of
 from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
 
+#: The parameter by which derivatives at half the time step are twice as large.
+TIMESTEP = "dynamics.timestep"
 #: Relative difference of two precisions above which a gradient is not trusted.
 TOLERANCE = 1e-2
 #: Horizons that are compared.
@@ -60,13 +61,172 @@ _MEMORY = 2**30
 TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
+class Shorter(Loss):
+    """One loss for several runs that are the first steps of one run: its sums have an axis of horizons.
+
+    Attributes:
+        inner: the loss.
+        table: whether the loss of a run of each horizon looks at each step.
+    """
+
+    name = "shorter"
+    inner: Loss = eqx.field(kw_only=True)
+    table: Bool[Array, "rows horizons"] = eqx.field(kw_only=True)
+
+    def looks_at(self, steps, last):
+        return np.asarray(self.table).max(axis=1)[np.minimum(steps, len(self.table) - 1)]
+
+    def observe(self, frame, origin, around):
+        seen = self.inner.observe(frame, origin, around)
+        wanted = jnp.asarray(self.table)[frame.step]
+
+        def spread(leaf):
+            leaf = jnp.asarray(leaf)
+            where = wanted.reshape(-1, *(1,) * leaf.ndim)
+            return jnp.where(where, leaf[None], jnp.zeros((), leaf.dtype))
+
+        return jax.tree.map(spread, seen)
+
+    def value(self, total, frames):
+        """That of the longest."""
+        return self.of(total, self.table.shape[1] - 1)
+
+    def of(self, total: Any, k: int) -> Float[Array, ""]:
+        """The loss of one horizon."""
+        frames = int(np.asarray(self.table)[:, k].sum())
+        return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
+
+
+class Halved(Loss):
+    """A loss of a run at half the time step: it looks at the same times, every other step."""
+
+    name = "halved"
+    inner: Loss = eqx.field(kw_only=True)
+
+    def looks_at(self, steps, last):
+        return (steps % 2 == 0) & self.inner.looks_at(steps // 2, last // 2)
+
+    def observe(self, frame, origin, around):
+        return self.inner.observe(
+            frame._replace(step=frame.step // 2), origin, around._replace(timestep=2 * around.timestep)
+        )
+
+    def value(self, total, frames):
+        return self.inner.value(total, frames)
+
+    def reason_unavailable(self, around):
+        return self.inner.reason_unavailable(around)
+
+
+def halved(problem: Problem) -> Problem:
+    """The same loss over the same time, in twice the steps of half the length."""
+    timestep = parameters.value(problem.simulation, TIMESTEP) / 2
+    simulation = parameters.with_values(problem.simulation, {TIMESTEP: timestep})
+    return Problem(simulation, Halved(inner=problem.loss), 2 * problem.steps)
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """Losses and gradients of runs of several lengths.
+
+    Attributes:
+        at: horizons, steps. columns: the numbers that are differentiated by.
+        value: the loss, by horizon. gradient: by horizon and column.
+        flips: step, pair and whether it entered, of each flip of the run, in order.
+    """
+
+    at: Int[np.ndarray, "points"]
+    columns: tuple[ParameterEntry, ...]
+    value: Float[np.ndarray, "points"]
+    gradient: Float[np.ndarray, "points columns"]
+    flips: Int[np.ndarray, "flips 4"]
+
+    def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
+        """The gradient by parameter."""
+        names = [column.name for column in self.columns]
+        return {
+            name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
+            for name in dict.fromkeys(names)
+        }
+
+
+def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
+    """Horizons at which the loss of a run this long looks at something, evenly spread, T the last."""
+    steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
+
+    def looks(h: int) -> bool:
+        try:
+            return bool(problem.loss.looks_at(np.arange(h + 1), h).any())
+        except InputError:
+            # a slope or an integral that needs a longer run
+            return False
+
+    return np.array([h for h in steps if looks(int(h))], np.int64)
+
+
+def horizons(
+    problem: Problem,
+    names: Sequence[str],
+    at: Int[np.ndarray, "points"],
+    *,
+    saltation: bool = True,
+    each: Callable[[TapeStretch], None] | None = None,
+    watch: Callable[[StretchTangents], None] | None = None,
+    progress: Progress | None = None,
+) -> Horizons:
+    """The gradient of the loss of every shorter run from the same start.
+
+    Args:
+        problem: of a pair potential. names: full names of the parameters; each entry is a tangent.
+        at: horizons, rising; the last one is how far it is run. saltation: whether flips count.
+        each: called with every stretch when it has been made.
+        watch: called with the tangents of every stretch, those of each step among them.
+
+    Raises:
+        InputError: no pair potential. NumericalError: the run blew up.
+
+    Error: that of tangents: a rounding error times their growth.
+    """
+    simulation, last = problem.simulation, int(at[-1])
+    rows = np.arange(last + 1)
+    table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
+    loss = Shorter(inner=problem.loss, table=jnp.asarray(table))
+    tape = RunTape(simulation, loss, last, flips=True, each=each, progress=in_phase(progress, "run"))
+    total: Any = None
+    flips = []
+    for part in tangents(
+        tape, names, saltation=saltation, guard=GUARD * radial_speed(simulation), states=watch is not None,
+        progress=in_phase(progress, "tangents"),
+    ):  # fmt: skip
+        total = part.total
+        if watch is not None:
+            watch(part)
+        ledger = part.stretch.ledger
+        assert ledger is not None
+        flips.append(np.column_stack([ledger.step, ledger.subject, ledger.entered]).astype(np.int64))
+    values, slopes = [], []
+    for k in range(len(at)):
+        value, push = jax.linearize(lambda total, k=k: loss.of(total, k), tape.total)
+        values.append(float(value))
+        slopes.append(np.asarray(jax.vmap(push)(total), np.float64))
+    columns = columns_of(simulation, names)
+    return Horizons(at, columns, np.array(values), np.stack(slopes), np.concatenate(flips))
+
+
+def first_difference(a: Horizons, b: Horizons) -> int | None:
+    """The first step at which two runs flip differently; None where they do not."""
+    common = min(len(a.flips), len(b.flips))
+    differ = np.flatnonzero((a.flips[:common] != b.flips[:common]).any(axis=1))
+    k = int(differ[0]) if len(differ) else common
+    return min((int(one.flips[k, 0]) for one in (a, b) if k < len(one.flips)), default=None)
+
+
 @dataclass(frozen=True)
 class Limit:
     """One of the things that end trust in a gradient.
 
     Attributes:
-        what: "rounding", "time step", "near miss", "flips left out", "ambiguous decision" or
-            "standard error".
+        what: ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER.
         horizon: the longest horizon, in steps, at which it did no harm; None where it was not examined.
         reached: whether it was met within the horizon asked for; else trust holds at least that far.
         code: what was seen, or why it was not examined. values: the numbers of it.
@@ -86,16 +246,15 @@ class Trust:
     Attributes:
         verdict: "trusted" where every limit was examined and none was met, "limited" where one was met, else
             "undecided".
-        horizon: the shortest of the limits that were examined, steps.
-        limited_by: which it is; empty where none was met.
+        horizon: the shortest of the limits that were examined, steps. limited_by: which it is; else empty.
         limits: all of them. unknown: what was not examined and is needed.
         tolerance: relative difference above which two precisions, or two time steps, disagree.
         table: by `horizon`, for each parameter the relative difference of two precisions (`relative.`), of
             the time step and its half (`step.`), and standard error over the mean (`error.`), where examined.
         half: the gradient at half the time step, by parameter.
-        digits: digits of the gradient that half the time step and another rounding leave, by parameter.
-        turns: pairs that turned around near their cutoff; None where that was not examined.
-        columns: the numbers whose terms these have.
+        digits: digits that half the time step and another rounding leave, by parameter.
+        turns: pairs that turned around near their cutoff, where that was examined. columns: the numbers
+            whose terms these have.
     """
 
     verdict: str
@@ -111,34 +270,19 @@ class Trust:
     columns: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Shadow:
-    """A run beside the run, whose rounding errors are others.
+def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
+    """The run that a run is compared with, and the formats that are narrower than float64.
 
-    Attributes:
-        simulation: the same system.
-        narrow: formats of the run that are narrower than the shadow's; empty where both are float64, and the
-            start is a rounding away: its errors are others of the same size.
-    """
-
-    simulation: Simulation
-    narrow: tuple[str, ...]
-
-
-def shadow_of(simulation: Simulation, seed: int = 0) -> Shadow:
-    """The run that a run is compared with.
-
-    Where any role of a number is narrower than float64, all roles are float64. There is no wider hardware
-    format than float64: such a run is compared with one whose start is moved by a rounding, which shows how
-    much of its gradient is made of roundings, up to a factor of order one.
+    Where any role of a number is narrower, all roles are float64. There is no wider hardware format than
+    float64: such a run is compared with one whose start is moved by a rounding, which shows how much of its
+    gradient is made of roundings, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
-        narrow = tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
-        return Shadow(in_float64(simulation), narrow)
+        return in_float64(simulation), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
     x = simulation.positions
     # of the largest coordinate: one of a coordinate near zero would be absorbed by the first step
     moved = x + np.spacing(np.abs(x).max()) * np.random.default_rng(seed).choice([-1.0, 1.0], x.shape)
-    return Shadow(replace(simulation, positions=moved), ())
+    return replace(simulation, positions=moved), ()
 
 
 def trust(
@@ -159,16 +303,13 @@ def trust(
 
     Args:
         problem: the loss of a rollout of a pair potential.
-        names: parameters, full or short names; those of many entries (the start) are left out.
+        names: parameters; those of many entries (the start) are left out.
         tolerance: relative difference of two precisions, or of a time step and its half, that is acceptable.
-        saltation: whether flips count.
-        replicas: starts for the standard error, this one and others with new velocities (`ensemble.replica`);
-            0 leaves it out. Each is a run and a tangent pass.
+        saltation: whether flips count. points: horizons that are compared, evenly spread.
+        replicas: starts for the standard error, each a run and a pass of tangents; 0 leaves it out.
         half_step: make the run and its gradient at half the time step too; else nothing is called trusted.
-        points: horizons that are compared, evenly spread.
         made, near, growth: the event-aware reverse pass with its turning points, and the growth of the
-            gradient, where they have been made; else they are made.
-        progress: called with the steps done, all steps, and the name of the phase.
+            gradient, where they have been made.
 
     Raises:
         InputError: no such parameter, no pair potential, or no parameter of few entries.
@@ -203,20 +344,17 @@ def trust(
 
     def follow(one: Problem, word: str, at=at, each=None, watch=None) -> Horizons:
         def report(done: int, steps: int, phase: str) -> None:
-            assert progress is not None
-            progress(done, steps, f"{word}: {phase}")
+            if progress is not None:
+                progress(done, steps, f"{word}: {phase}")
 
-        return horizons(
-            one, kept, at, saltation=saltation, each=each, watch=watch,
-            progress=None if progress is None else report,
-        )  # fmt: skip
+        return horizons(one, kept, at, saltation=saltation, each=each, watch=watch, progress=report)
 
     def beside(per: int):
         return None if near is None else partial(near.compared, per=per)
 
     own = follow(problem, "the run", watch=None if near is None else near.tangents)
-    shadow = shadow_of(simulation)
-    other = follow(replace(problem, simulation=shadow.simulation), "its shadow", each=beside(1))
+    shadow, narrow = shadow_of(simulation)
+    other = follow(replace(problem, simulation=shadow), "its shadow", each=beside(1))
     differing = relative(own, other)
     noisy = no_half_step(simulation)
     shorter = None
@@ -226,15 +364,14 @@ def trust(
     turns = None if near is None or shorter is None else near.turns(columns)
     first = first_difference(own, other)
     unseen = ("half-step", {}) if shorter is None else ("memory", {"bytes": needed})
-    roundings = {"narrow": " and ".join(shadow.narrow) or "float64", "first": first}
+    roundings = {"narrow": " and ".join(narrow) or "float64", "first": first}
+    halving = Limit(STEP, None, False, "noise" if noisy else "not asked")
+    if shorter is not None:
+        halving = _compared(STEP, last_agreeing(at, steps, tolerance), steps, tolerance, {})
     limits = [
-        _compared(ROUNDING, last_below(at, differing, tolerance), differing, tolerance, roundings),
-        Limit(STEP, None, False, "noise" if noisy else "not asked")
-        if shorter is None
-        else _compared(STEP, last_agreeing(at, steps, tolerance), steps, tolerance, {}),
-        _missed(problem, own, turns, unseen, made, tolerance, saltation),
-        ambiguity(problem),
-    ]
+        _compared(ROUNDING, last_below(at, differing, tolerance), differing, tolerance, roundings), halving,
+        _missed(problem, own, turns, unseen, made, tolerance, saltation), ambiguity(problem),
+    ]  # fmt: skip
     scatter: dict[str, np.ndarray] = {}
     if replicas:
         starts = [replace(problem, simulation=replica(simulation, k)) for k in range(1, replicas)]
@@ -308,9 +445,9 @@ def _missed(
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
-        first = min((int(one.step[0]) for one in own.ledgers if len(one)), default=None)
-        if first is None:
+        if not len(own.flips):
             return Limit(NEAR, None, False, "steps alone")
+        first = int(own.flips[0, 0])
         return Limit(FLIPS, max(first - 1, 0), True, "steps alone", {"first": first})
     left = _left_out(made)
     if left is not None:
@@ -323,34 +460,32 @@ def _missed(
     size = np.concatenate(
         [np.full(part.shape[1], np.linalg.norm(part[-1])) for part in own.by_name().values()]
     )
-    with np.errstate(divide="ignore", invalid="ignore"):
+    table, term = turns.table, turns.term
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
-        share = np.where(turns.term == 0, 0.0, np.nan_to_num(turns.term / size, nan=np.inf))
-    with np.errstate(over="ignore"):
+        share = np.where(term == 0, 0.0, np.nan_to_num(term / size, nan=np.inf))
         weighs = np.sqrt(np.cumsum(np.square(share), axis=0))
     over = np.flatnonzero(~(weighs <= tolerance).all(axis=1))
     k, column = np.unravel_index(int(np.argmax(share)), share.shape)
     values = {
-        "count": count, "i": int(turns.i[k]), "j": int(turns.j[k]), "step": int(turns.step[k]),
-        "gap": float(abs(turns.gap[k])), "reach": float(turns.reach[k]), "term": float(turns.term[k, column]),
+        "count": count, **{name: int(table[name][k]) for name in ("i", "j", "step")},
+        "gap": float(abs(table["gap"][k])), "reach": float(turns.reach[k]), "term": float(term[k, column]),
         "share": float(share[k, column]), "column": str(own.columns[column]),
     }  # fmt: skip
-    code = "short of" if turns.gap[k] > 0 else "between two steps" if turns.unseen[k] else "beyond"
-    if not len(over):
-        return Limit(NEAR, problem.steps, False, code, values)
-    return Limit(NEAR, max(int(turns.step[over[0]]) - 1, 0), True, code, values)
+    code = "short of" if table["gap"][k] > 0 else "between two steps" if table["unseen"][k] else "beyond"
+    horizon = max(int(table["step"][over[0]]) - 1, 0) if len(over) else problem.steps
+    return Limit(NEAR, horizon, bool(len(over)), code, values)
 
 
 def _left_out(made: ReversePass) -> Limit | None:
     """Flips slower than the guard, where they would have weighed."""
-    slow = [one for one in made.crossings if one.grazing.any()]
-    left = sum(float(np.nansum(np.abs(one.weight[one.grazing]))) for one in slow)
-    applied = sum(float(np.sum(np.abs(one.weight[~one.grazing]))) for one in made.crossings)
+    found = weights(made.crossings)
+    left, applied = found["weight left out"], found["weight applied"]
     if not left > LEFT_OUT * (left + applied):
         return None
-    first = min(int(one.ledger.step[one.grazing].min()) for one in slow)
-    count = sum(int(one.grazing.sum()) for one in slow)
-    values = {"count": count, "first": first, "share": left / (left + applied)}
+    grazing = joined(made.crossings, "grazing")
+    first = int(joined(made.crossings, "step", ledger=True)[grazing].min())
+    values = {"count": found["grazing"], "first": first, "share": left / (left + applied)}
     return Limit(FLIPS, max(first - 1, 0), True, "grazing", values)
 
 

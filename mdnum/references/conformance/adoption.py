@@ -76,14 +76,10 @@ class NeighborListConformance:
         if not report.asked:
             pytest.skip("; ".join(report.areas[area].why))
         if report.failed:
-            lines = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
+            lines = [f"{report.wrong} of {report.asked} cases about {AREAS[area]}"]
+            lines += [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
             text = script(tested, report.failed[0], report.how, report.superset)
-            pytest.fail(
-                f"{report.wrong} of {report.asked} cases about {AREAS[area]}\n"
-                + "\n".join(lines)
-                + f"\n\nThis reproduces the first:\n\n{text}",
-                pytrace=False,
-            )
+            pytest.fail("\n".join([*lines, "", "This reproduces the first:", "", text]), pytrace=False)
         if not report.conforms:
             why = "; ".join(report.areas[area].why)
             if not self._answers(tested):

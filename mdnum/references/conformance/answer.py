@@ -90,19 +90,13 @@ def parts(given: Any) -> dict[str, Any]:
         raise Malformed("it returned None")
     if isinstance(given, list) and all(isinstance(row, tuple) for row in given):
         return _one_by_one(given)
-    if isinstance(given, Mapping):
-        named = {
-            name: next((given[key] for key in keys if key in given), None) for name, keys in NAMES.items()
-        }
-    elif isinstance(given, Sequence) and not isinstance(given, str):
+    if isinstance(given, Sequence) and not isinstance(given, str):
         return _in_order([_array(part, f"part {n + 1}") for n, part in enumerate(given)])
-    elif hasattr(given, "i") and hasattr(given, "j"):
-        named = {
-            name: next((getattr(given, key) for key in keys if hasattr(given, key)), None)
-            for name, keys in NAMES.items()
-        }
-    else:
-        return _one_by_one(given)
+    if not isinstance(given, Mapping):
+        if not (hasattr(given, "i") and hasattr(given, "j")):
+            return _one_by_one(given)
+        given = {key: getattr(given, key) for keys in NAMES.values() for key in keys if hasattr(given, key)}
+    named = {name: next((given[key] for key in keys if key in given), None) for name, keys in NAMES.items()}
     if named["i"] is None or named["j"] is None:
         raise Malformed("it has no i and j")
     return named

@@ -40,20 +40,24 @@ Pbc = tuple[StrictBool, StrictBool, StrictBool]
 
 def _rows(value: Any) -> ndarray:
     rows = np.array(value, np.float64).reshape(-1, 3)
-    if not np.isfinite(rows).all():
+    rows.setflags(write=False)
+    return rows
+
+
+def _finite(value: Any) -> ndarray:
+    if not np.isfinite(rows := _rows(value)).all():
         raise ValueError("coordinates that are not finite")
     return rows
 
 
 def _vectors(value: Any) -> ndarray:
-    rows = _rows(value)
-    if rows.shape != (3, 3):
+    if (rows := _finite(value)).shape != (3, 3):
         raise ValueError("not three lattice vectors")
     return rows
 
 
 #: Arrays that JSON gives back: a double's shortest decimal is that double again.
-Rows = Annotated[ndarray, PlainValidator(_rows)]
+Rows = Annotated[ndarray, PlainValidator(_finite)]
 Vectors = Annotated[ndarray, PlainValidator(_vectors)]
 Length = Annotated[FiniteFloat, Ge(0)]
 
@@ -75,10 +79,8 @@ class Still:
     skin: Length | None = None
 
     def __post_init__(self) -> None:
-        for name in ("positions", "cell"):
-            value = np.array(getattr(self, name), np.float64).reshape(-1, 3)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "positions", _rows(self.positions))
+        object.__setattr__(self, "cell", _rows(self.cell))
 
 
 @dataclass(frozen=True)
@@ -131,14 +133,9 @@ class Case:
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
         """The same with a function of the positions, and one of the cell, applied at every step."""
-        stills = tuple(
-            replace(
-                still,
-                positions=positions(still.positions) if positions else still.positions,
-                cell=cell(still.cell) if cell else still.cell,
-            )
-            for still in self.stills
-        )
+        same = lambda rows: rows  # noqa: E731
+        x, box = positions or same, cell or same
+        stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
         return replace(self, **{"stills": stills, "known": None, **other})
 
     def equals(self, other: Case) -> bool:

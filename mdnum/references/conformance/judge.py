@@ -90,8 +90,8 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
     """What going through fractional coordinates and back can multiply a rounding error by; at least 1.
 
-    Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 7.1: the condition number
-    of the periodic lattice vectors, each scaled to length 1 because lengths alone cost nothing.
+    Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
+    vectors, each scaled to length 1 because lengths alone cost nothing.
     """
     if not pbc.any():
         return 1.0
@@ -102,9 +102,7 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
     """One whole number for each row, equal where rows are: of these rows and of others, (i, j, shift) each.
 
-    Args:
-        count: atoms.
-        shift: None to tell rows by their atoms alone.
+    Of `count` atoms; without shifts rows are told by their atoms alone.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
@@ -413,11 +411,7 @@ class CaseAnswers:
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """What became of a question; None where it was not asked yet.
-
-        Raises:
-            InputError: another question had that number.
-        """
+        """What became of a question; None where it was not asked yet. InputError where it was another one."""
         result = self.cases.get(str(number))
         if result is None:
             return None
@@ -569,22 +563,26 @@ class Report:
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
+    def total(self, count: str) -> int:
+        """Cases of all areas by an attribute of their tallies."""
+        return sum(getattr(tally, count) for tally in self.areas.values())
+
     @property
     def asked(self) -> int:
         """Cases that were asked."""
-        return sum(tally.asked for tally in self.areas.values())
+        return self.total("asked")
 
     @property
     def left(self) -> int:
         """Cases that were neither asked nor skipped."""
-        return self.questions - sum(tally.asked + tally.skipped for tally in self.areas.values())
+        return self.questions - self.asked - self.total("skipped")
 
     @property
     def wrong(self) -> int:
         """Cases that failed."""
-        return sum(tally.failed for tally in self.areas.values())
+        return self.total("failed")
 
     @property
     def conforms(self) -> bool:
         """Whether it was asked and no case failed."""
-        return self.wrong == 0 and self.asked > sum(tally.refused for tally in self.areas.values())
+        return self.wrong == 0 and self.asked > self.total("refused")

@@ -124,7 +124,7 @@ class ListLimits:
         yield self.lower_triangular and bool(np.triu(cell, 1).any()), "lower triangular cells only"
         width = widths(completed(cell, pbc))[pbc]
         yield self.minimum_image and reach >= 0.5 * width.min(), "minimum image only"
-        yield np.prod(width / reach) > self.roomy, f"no box of more than {self.roomy:.0e} cells"
+        yield bool(np.prod(width / reach) > self.roomy), f"no box of more than {self.roomy:.0e} cells"
 
 
 #: ListLimits that are declared by a word, such as "minimum-image".

@@ -115,8 +115,7 @@ def vesin_cells(positions, cell, pbc, r_cut, half=False):
     from vesin import NeighborList
 
     # half a list is found by the algorithm that vesin chooses
-    options = {"full_list": False} if half else {"full_list": True, "algorithm": "cell_list"}
-    listed = NeighborList(cutoff=r_cut, **options)
+    listed = NeighborList(cutoff=r_cut, full_list=not half, algorithm="auto" if half else "cell_list")
     i, j, shift, distance, vector = listed.compute(positions, cell, pbc, "ijSdD")
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 

@@ -305,15 +305,11 @@ def _sphere(count: int) -> ndarray:
 SHAPES = ("cube", "orthorhombic", "skewed", "strongly skewed", "turned", "left-handed")
 SIZES = ("ordinary", "wide", "thin", "two cutoffs", "narrow", "long", "huge")
 PLACES = (
-    "inside",
-    "outside",
-    "far outside",
-    "on walls",
-    "clustered",
-    "coincident",
-    "on a grid",
-    "at the cutoff",
-)
+    "inside", "outside", "far outside", "on walls", "clustered", "coincident", "on a grid", "at the cutoff"
+)  # fmt: skip
+#: Lengths of all edges, and of one that is drawn, in cutoffs.
+_EDGES = {"wide": (6.0, 15.0), "narrow": (0.6, 2.0), "huge": (20.0, 45.0)}
+_ONE_EDGE = {"thin": (0.5, 2.2), "long": (30.0, 120.0)}
 
 _FEW_IMAGES = 400  # lattice vectors that the oracle may have to try for a pair
 
@@ -355,20 +351,12 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
     """Lengths of the edges in units of the cutoff."""
     edges = rng.uniform(2.05, 6.0, 3)
     axis = rng.integers(3)
-    if size == "wide":
-        edges = rng.uniform(6.0, 15.0, 3)
-    elif size == "thin":
-        edges[axis] = rng.uniform(0.5, 2.2)
-    elif size == "two cutoffs":
+    if size == "two cutoffs":
         # where numbers of cells and of images change
-        edges = rng.integers(2, 6, 3) * (1.0 + rng.choice([-1e-9, -1e-15, 0.0, 1e-15, 1e-9], 3))
-    elif size == "narrow":
-        edges = rng.uniform(0.6, 2.0, 3)
-    elif size == "long":
-        edges[axis] = rng.uniform(30.0, 120.0)
-    elif size == "huge":
-        edges = rng.uniform(20.0, 45.0, 3)
-    return edges
+        return rng.integers(2, 6, 3) * (1.0 + rng.choice([-1e-9, -1e-15, 0.0, 1e-15, 1e-9], 3))
+    if size in _ONE_EDGE:
+        edges[axis] = rng.uniform(*_ONE_EDGE[size])
+    return rng.uniform(*_EDGES[size], 3) if size in _EDGES else edges
 
 
 @st.composite

@@ -96,32 +96,24 @@ def check(step, x, cell, given):
     return not bad
 '''
 
-_ONCE = """
-fine = True
-for step, (x, cell, *_) in enumerate(STEPS):
+#: A list is asked at each step; a line of what follows is how, for one made anew and for one that is kept.
+_STEPS = """
+fine = True{begin}
+for step, (x, cell, fresh, *skin) in enumerate(STEPS):
     before = x.copy(), cell.copy()
-    given = asked({call}, x, cell, PBC, R_CUT)
+    {given}
     if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
         print(f"step {{step}}: the call wrote to its input")
         fine = False
     fine = check(step, *before, given) and fine
 """
-
-_KEPT = """
-fine, kept, held = True, {call}(), None
-for step, (x, cell, fresh, *skin) in enumerate(STEPS):
-    before = x.copy(), cell.copy()
-    if not fresh and held is not None and held[0].shape == x.shape:
+_ONCE = "given = asked({call}, x, cell, PBC, R_CUT)"
+_KEPT = """if not fresh and held is not None and held[0].shape == x.shape:
         held[0][...], held[1][...] = x, cell  # atoms are moved where they are, as a program does it
         x, cell = held
     held = x, cell
     anew = fresh and (PBC, R_CUT, *(skin or [SKIN]))
-    given = asked(kept.allocate, x, cell, *anew) if fresh else asked(kept.update, x, cell)
-    if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
-        print(f"step {{step}}: the call wrote to its input")
-        fine = False
-    fine = check(step, *before, given) and fine
-"""
+    given = asked(kept.allocate, x, cell, *anew) if fresh else asked(kept.update, x, cell)"""
 
 _WAITS = 'print("it waits for an answer; Control-C ends it", flush=True)'
 
@@ -156,25 +148,21 @@ def script(
     case_words = f"Found by: {failed.case.name}, at its step {worst.step}."
     # an exception may quote code, whose strings must not end this one
     title = title.replace("\\", "/").replace('"""', "'''")
+    begin = f"\nkept, held = {tested.call}(), None" if tested.kept else ""
+    text = inspect.getsource(answer)
     parts = [
         '"""' + "\n".join(textwrap.wrap(title, 100)) + f'\n\n{case_words}\n"""',
         "from __future__ import annotations\n\nimport collections\nimport itertools\n\nimport numpy as np",
         tested.source.strip() or f"# import {tested.call} here: its lines could not be found",
         _numbers(failed, how, reach),
-        _answers(),
+        text[text.index("from collections.abc") :].strip(),
         _ASKED.strip(),
         _BRUTE_FORCE.strip(),
         *([_WAITS] if worst.code == "NO_ANSWER" else []),
-        (_KEPT if tested.kept else _ONCE).strip().format(call=tested.call),
+        _STEPS.strip().format(begin=begin, given=_KEPT if tested.kept else _ONCE.format(call=tested.call)),
         'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
     ]
     return "\n\n\n".join(parts) + "\n"
-
-
-def _answers() -> str:
-    """The lines that read what a list returns, which need numpy alone."""
-    text = inspect.getsource(answer)
-    return text[text.index("from collections.abc") :].strip()
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:

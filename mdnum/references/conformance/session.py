@@ -28,6 +28,7 @@ from numpy import ndarray
 from mdnum.errors import MdnumError
 from mdnum.references.conformance.answer import Answer, Malformed, parts, read
 from mdnum.references.conformance.case import Case
+from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import PairList
 from mdnum.safe_path import environment, python
 
@@ -47,34 +48,23 @@ class CallOutcome:
 
     Attributes:
         answer: the pairs, or None.
-        raised: the exception in words, or None.
-        refused: the exception states on purpose that this cannot be done (`meant`).
-        malformed: why the answer is none, or None.
+        failure: why there is no answer, or None: it crashed, came too late, raised or returned no pairs.
+        refused: the exception, in words, where it states on purpose that this cannot be done (`meant`).
         changed: the input that the call wrote to, or None.
-        crashed: how the process ended that made the call, or None.
-        late: that it did not answer in time, or None.
         aliased: the rows of the answer before this one were other ones after this call.
         skin: the padding that a list that is kept states, length; None where it states none.
     """
 
     answer: Answer | None = None
-    raised: str | None = None
-    refused: bool = False
-    malformed: str | None = None
+    failure: Failure | None = None
+    refused: str | None = None
     changed: str | None = None
-    crashed: str | None = None
-    late: str | None = None
     aliased: bool = False
     skin: float | None = None
 
 
 class Session:
-    """Calls of one list, a kept one through its life.
-
-    Args:
-        tested: the list.
-        reuse: ask the same object in all cases, as a program that runs for long does.
-    """
+    """Calls of one list, a kept one through its life; with `reuse` one object is asked in all cases."""
 
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
@@ -137,7 +127,7 @@ class Session:
                 np.asarray(part) for part in parts(given).values() if hasattr(part, "__array__")
             ]
         except Malformed as error:
-            return CallOutcome(malformed=str(error))
+            return CallOutcome(failure=Failure("MALFORMED", str(error)))
         same = (
             a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(returned, held, strict=True)
         )
@@ -156,15 +146,16 @@ class Session:
 
 def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> CallOutcome:
     if isinstance(error, SystemExit):  # it would have ended the process of whoever called it
-        return CallOutcome(crashed=f"it ends the process: SystemExit: {error}")
+        return CallOutcome(failure=Failure("CRASHED", f"it ends the process: SystemExit: {error}"))
     # what follows the first lines is where it was raised, in some libraries with the frames of compiled code
     text = str(error).partition("Exception raised from ")[0].strip()
     first, frames, rest = text.partition("Traceback of ")
     # TorchScript says what happened in the last line of a traceback
     text = " ".join((f"{first} {rest.splitlines()[-1]}" if frames else text).split())
+    words = f"{type(error).__name__}: {text[:300]}"
     # without atoms there is nothing that could not be done
     refused = case.atoms > 0 and meant(error, package)
-    return CallOutcome(raised=f"{type(error).__name__}: {text[:300]}", refused=refused)
+    return CallOutcome(refused=words) if refused else CallOutcome(failure=Failure("RAISED", words))
 
 
 def meant(error: Exception, package: str | None = None) -> bool:
@@ -257,11 +248,9 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 
 
 class RemoteSession:
-    """As `Session`, in another process; a new one after each that ended: a crash is a finding and not an end.
+    """As `Session`, of a list that `load` finds by its word, in another process.
 
-    Args:
-        tested: a list that `load` finds by its word.
-        reuse: ask one object in all cases.
+    A new one is started after each that ended: a crash is a finding and not an end.
     """
 
     def __init__(self, tested: PairList, reuse: bool = False):
@@ -286,8 +275,7 @@ class RemoteSession:
             return outcomes
         except _Ended as ended:
             self.close()
-            late = isinstance(ended, _Late)
-            return [*outcomes, CallOutcome(late=str(ended)) if late else CallOutcome(crashed=str(ended))]
+            return [*outcomes, CallOutcome(failure=ended.failure)]
 
     def close(self) -> None:
         """Ends the process."""
@@ -321,13 +309,13 @@ class RemoteSession:
             return _received(process.stdout)
         except EOFError as error:
             if late:
-                raise _Late(f"no answer within {seconds:.3g} s{late[0]}") from error
+                raise _Ended(Failure("NO_ANSWER", f"no answer within {seconds:.3g} s{late[0]}")) from error
             raise _Ended(self._how_it_ended(process)) from error
         finally:
             done.set()
             watch.join()
 
-    def _how_it_ended(self, process: subprocess.Popen[bytes]) -> str:
+    def _how_it_ended(self, process: subprocess.Popen[bytes]) -> Failure:
         code = process.wait()
         if code >= 0:
             how = f"the process ended with exit code {code}"
@@ -336,15 +324,15 @@ class RemoteSession:
             how = f"the process was ended by {name}"
         self._printed.seek(self._from)
         lines = self._printed.read().decode(errors="replace").strip().splitlines()
-        return f"{how}: {lines[-1].strip()[:200]}" if lines else how
+        return Failure("CRASHED", f"{how}: {lines[-1].strip()[:200]}" if lines else how)
 
 
 class _Ended(Exception):
-    """The other process is gone; the message says how."""
+    """The other process is gone; the failure says how."""
 
-
-class _Late(_Ended):
-    """It was ended, because it did not answer."""
+    def __init__(self, failure: Failure):
+        super().__init__(failure.text)
+        self.failure = failure
 
 
 def _watch(process: Any, seconds: float, done: threading.Event, late: list[str]) -> None:
@@ -386,11 +374,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str) -> None:
-    """Answers questions on stdin until there are no more: the other process of a `RemoteSession`.
-
-    Args:
-        word: what `load` finds the list by.
-    """
+    """Answers questions on stdin to the list of this word: the other process of a `RemoteSession`."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer
@@ -421,7 +405,7 @@ def serve(word: str) -> None:
             for outcome in session.outcomes(case):
                 _send(answers, outcome)
         except MemoryError as error:
-            _send(answers, CallOutcome(raised=f"MemoryError: {error}"))
+            _send(answers, CallOutcome(failure=Failure("RAISED", f"MemoryError: {error}")))
         _send(answers, None)
 
 

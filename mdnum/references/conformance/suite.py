@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.deadline import Deadline, fewest
+from mdnum.references.conformance.answer import Answer
 from mdnum.references.conformance.case import AREAS, Case, gas, once
 from mdnum.references.conformance.judge import (
     CODES,
@@ -17,7 +18,6 @@ from mdnum.references.conformance.judge import (
     SINGLE,
     CaseAnswers,
     CaseResult,
-    Code,
     Conventions,
     Failed,
     Failure,
@@ -28,7 +28,7 @@ from mdnum.references.conformance.judge import (
     measures_well,
     truth,
     without_numbers,
-)  # fmt: skip
+)
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.questions import alike, questions
 from mdnum.references.conformance.questions import large as large_questions
@@ -57,7 +57,6 @@ class Examiner:
     """Asks a list and judges its answers; finds out its conventions first.
 
     Args:
-        tested: the list.
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
 
@@ -142,22 +141,16 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
-
-        A refusal, a crash and a time without an answer are for the suite to report.
-        """
+        """Why no plain question had an answer that is one, but for what the suite reports; None otherwise."""
         reasons = [
-            f"asked about {case.name}, {outcome.malformed or f'it raised {outcome.raised}'}"
+            f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
-            if outcome.malformed or (outcome.raised and not outcome.refused)
+            if (why := outcome.failure) is not None and why.code in ("RAISED", "MALFORMED")
         ]
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing.
-
-        A case beyond the limits is not asked.
-        """
+        """What is wrong with the answers to a case within the limits, at the first step where anything is."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -168,15 +161,17 @@ class Examiner:
         how = self.report.how
         for step, outcome in enumerate(outcomes):
             result = replace(result, aliased=result.aliased or outcome.aliased)
-            failures, unit, ties = self._judge(case, step, outcome, how)
-            result = replace(
-                result, ties=ties if step == 0 else result.ties, single=result.single or unit != how.unit
-            )
-            how = replace(how, unit=unit)
-            if failures:
-                return replace(result, failures=tuple(replace(failure, step=step) for failure in failures))
-            if outcome.refused:
-                return replace(result, refused=(step, str(outcome.raised)))
+            if outcome.refused is not None:
+                return replace(result, refused=(step, outcome.refused))
+            found = [outcome.failure] if outcome.failure is not None else []
+            if outcome.answer is not None:
+                found, how, ties = self._judge(case, step, outcome.answer, how)
+                ties = ties if step == 0 else result.ties
+                result = replace(result, ties=ties, single=result.single or how.unit != self.report.how.unit)
+                if outcome.changed:
+                    found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
+            if found:
+                return replace(result, failures=tuple(replace(failure, step=step) for failure in found))
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
@@ -190,28 +185,15 @@ class Examiner:
                 self.refused[like] = RefusalKind(words, case)
 
     def _judge(
-        self, case: Case, step: int, outcome: CallOutcome, how: Conventions
-    ) -> tuple[list[Failure], float, tuple[int, int]]:
-        """(failures, roundoff that the answer was judged by, ties counted and not)."""
-        silent: tuple[tuple[Code, str | None], ...] = (
-            ("CRASHED", outcome.crashed),
-            ("NO_ANSWER", outcome.late),
-            ("RAISED", None if outcome.refused else outcome.raised),
-            ("MALFORMED", outcome.malformed),
-        )
-        for code, text in silent:
-            if text is not None:
-                return [Failure(code, text)], how.unit, (0, 0)
-        answer = outcome.answer
-        if answer is None:
-            return [], how.unit, (0, 0)
+        self, case: Case, step: int, answer: Answer, how: Conventions
+    ) -> tuple[list[Failure], Conventions, tuple[int, int]]:
+        """(failures, conventions that the answer was judged by, ties counted and not)."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
         if found and step and reach is not None and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
             found = judge(answer, _with_earlier(case, step, right, reach), how)
-        unit = how.unit
         # a list that is stale by a hair is not one in single precision, nor one that is wrong anyway; and
         # whoever measures in double and decides in single loses pairs that it knows to be inside
         if (
@@ -219,24 +201,19 @@ class Examiner:
             and self.report.wrong <= _MISTAKES * (self.report.asked + 1)
             and self.tested.unit is None and how.unit == DOUBLE and not measures_well(answer, right, how)
         ):  # fmt: skip
-            coarse = truth(case, step, reach=reach, unit=SINGLE)
-            if not judge(answer, coarse, replace(how, unit=SINGLE)):
-                unit, found = SINGLE, []
-        ties = (0, 0)
-        if not found and step == 0 and unit == DOUBLE and not self.report.superset:
-            ties = _ties(outcome, right)
-        if outcome.changed:
-            found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
-        return found, unit, ties
+            coarse, single = truth(case, step, reach=reach, unit=SINGLE), replace(how, unit=SINGLE)
+            if not judge(answer, coarse, single):
+                return [], single, (0, 0)
+        counts = not found and step == 0 and how.unit == DOUBLE and not self.report.superset
+        return found, how, _ties(answer, right) if counts else (0, 0)
 
 
-def _ties(outcome: CallOutcome, right: Truth) -> tuple[int, int]:
+def _ties(answer: Answer, right: Truth) -> tuple[int, int]:
     """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
-    assert outcome.answer is not None
-    rows = set(zip(outcome.answer.i.tolist(), outcome.answer.j.tolist(), strict=True))
+    rows = set(zip(answer.i.tolist(), answer.j.tolist(), strict=True))
     off = np.abs(right.distance - right.r_cut) > 1e-6
     listed = [
         (i, j) in rows or (j, i) in rows
@@ -304,19 +281,15 @@ def examine(
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report, session = examiner.report, examiner.session
-    deadline, answers, saved = (
-        deadline or Deadline(),
-        answers or CaseAnswers(),
-        saved or (lambda urgent: None),
-    )
+    deadline, answers = deadline or Deadline(), answers or CaseAnswers()
+    saved, progress = saved or (lambda urgent: None), progress or (lambda *_: None)
     far = apart and bool(tested.word)
     every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
     every += large_questions() if large and asked is None else ()
     report.questions = len(every)
     stopped = False
     for number, case in enumerate(every):
-        if progress is not None:
-            progress(number, len(every), {"phase": "asking", "unit": "cases"})
+        progress(number, len(every), {"phase": "asking", "unit": "cases"})
         result = answers.of(number, case)
         if stopped or (result is None and deadline.passed):
             continue
@@ -338,8 +311,7 @@ def examine(
         if not deadline.passed:
             report.refusals = _refusals(examiner)
         for number, failed in enumerate(report.failed):
-            if progress is not None:
-                progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
+            progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
             name = f"{failed.code} {failed.case.area} {failed.case.name}"
             smaller = answers.shrunk.get(name)
             if smaller is None and not deadline.passed:
@@ -436,12 +408,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """The smallest case found that fails with the same code.
+    """The smallest case found, before the deadline, that fails with the same code.
 
-    Args:
-        failures: asks the list; a new object of a kept list for each question.
-        failed: the case as it was met.
-        deadline: after which it is left as small as it is.
+    `failures` asks the list; a new object of a kept list for each question.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)

@@ -13,11 +13,11 @@ import small_systems
 from hypothesis import given, settings
 
 from mdnum.errors import InputError
-from mdnum.forks.exact import bounds as exact_bounds
-from mdnum.forks.exact.bounds import certified_horizon, exact_margin, taped
+from mdnum.forks import certified
+from mdnum.forks.certified import certified_horizon, exact_margin
+from mdnum.forks.exact import program as exact_program
 from mdnum.forks.exact.certify import BALL_POLICIES, MD_POLICIES, certify
-from mdnum.forks.exact.program import ExactProgram, with_policy
-from mdnum.forks.exact.tape import first_difference
+from mdnum.forks.exact.program import ExactProgram, first_difference, taped, with_policy
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import CONVENTIONS, PairDecider
 from mdnum.numerics import PrecisionPolicy
@@ -60,7 +60,8 @@ def test_single_precision_leaves_early_and_double_does_not(flint):
     names = ("float64", "float32", "float32, accumulate float64", "float64, force bfloat16")
     found = certify(liquid(), 400, {name: MD_POLICIES[name] for name in names})
     assert found.ranking[0].name == "float64"
-    wide, narrow = found.of("float64"), found.of("float32")
+    rows = {row.name: row for row in found.ranking}
+    wide, narrow = rows["float64"], rows["float32"]
     assert wide.horizon is None and wide.decision is None and np.isnan(wide.margin)
     assert wide.separation.max() < 1e-9 < narrow.separation.max()
     decision = narrow.decision
@@ -70,31 +71,29 @@ def test_single_precision_leaves_early_and_double_does_not(flint):
     assert (decision.a, decision.b) == (inside, not inside) and inside == (narrow.margin > 0)
     # a margin of the size of the separation by then
     assert abs(narrow.margin) < 10 * narrow.separation[narrow.horizon]
-    promoted = found.of("float32, accumulate float64")
+    promoted = rows["float32, accumulate float64"]
     assert narrow.gain == 0 and np.isnan(wide.gain) and narrow.closer == 0
     # 29 bits more, of which some are lost in rounding more than one number a step
     assert 24 < wide.closer < 34 and abs(promoted.closer) < 1
-    short = found.of("float64, force bfloat16")
+    short = rows["float64, force bfloat16"]
     assert found.ranking[-1] is short and short.horizon is not None
     # eight bits instead of twenty-four, in the pair forces alone
     assert 3 <= short.horizon < narrow.horizon / 5 and short.closer < -6
     assert found.steps_per_bit == pytest.approx(np.log(2) / 0.024, rel=0.3)
-    with pytest.raises(KeyError):
-        found.of("float16")
 
 
 @pytest.mark.slow
 def test_a_planted_wrong_decision_of_a_run_is_its_horizon(flint, monkeypatch):
-    run = taped(build(liquid()), 60)
-    for row in range(0, run.tape.flips, 7):
-        kept = np.arange(run.tape.flips) != row
-        columns = {name: getattr(run.tape, name)[kept] for name in ("step", "key", "entered")}
-        planted = replace(run, tape=replace(run.tape, **columns))
-        monkeypatch.setattr(exact_bounds, "taped", lambda *_, planted=planted: planted)
+    tape, x, _ = taped(build(liquid()), 60)
+    for row in range(0, tape.flips, 7):
+        kept = np.arange(tape.flips) != row
+        columns = {name: getattr(tape, name)[kept] for name in ("step", "key", "entered")}
+        planted = replace(tape, **columns), x, ""
+        monkeypatch.setattr(exact_program, "taped", lambda *_, planted=planted: planted)
         (found,) = certify(liquid(), 60, {"planted": {}}).ranking
-        assert found.horizon == run.tape.step[row]
+        assert found.horizon == tape.step[row]
         i, j = found.decision.subject
-        assert i * run.tape.atoms + j == run.tape.key[row]
+        assert i * tape.atoms + j == tape.key[row]
 
 
 @pytest.mark.slow
@@ -102,7 +101,7 @@ def test_two_precisions_prove_the_same_long_history(flint):
     exact = ExactProgram(build(liquid()))
     assert first_difference(exact.run(1200).tape, exact.run(1200, bits=900).tape) is None
     found = certify(liquid(), 1200, {"float32": MD_POLICIES["float32"], "float64": {}})
-    wide, narrow = found.of("float64").horizon, found.of("float32").horizon
+    wide, narrow = (row.horizon for row in sorted(found.ranking, key=lambda row: row.name, reverse=True))
     assert narrow is not None and wide is not None and wide > 3 * narrow
 
 
@@ -123,7 +122,7 @@ def test_narrow_balls_leave_and_wide_ones_stay():
     horizons = {row.name: row.horizon for row in found.ranking}
     assert horizons == {"float64": None, "float16": 170, "bfloat16": 66}
     assert list(horizons) == ["float64", "float16", "bfloat16"]
-    row = found.of("float16")
+    row = found.ranking[1]
     assert (row.decision.channel, row.decision.subject) == ("contact", (0,)) and abs(row.margin) < 0.05
     assert row.separation[0] == 0 and row.separation[-1] > 0 and found.exact.contact.sum() > 30
     (cannot,) = certify(load("ball/stiff", world="ball"), 2, {"float16": BALL_POLICIES["float16"]}).ranking
@@ -171,7 +170,6 @@ def test_horizons_of_a_narrow_run_and_a_wide_one():
     assert narrow.horizon is not None and narrow.total == len(narrow.decisions) > 0
     first = narrow.decisions[0]
     assert first.step == narrow.horizon and abs(first.margin) <= first.bound
-    assert narrow.closest[: narrow.horizon].min() > narrow.bounds[0]
     for one in narrow.decisions:
         assert abs(one.margin - one.exact) <= one.bound
         # r2 < : inside where the exact margin is above zero
@@ -182,7 +180,7 @@ def test_horizons_of_a_narrow_run_and_a_wide_one():
     recorder = PairRecorder(simulation(NARROW))
     segments = Engine(simulation(NARROW), 400).segments()
     assert sum(int(recorder.ambiguous(segment).sum()) for segment in segments) == narrow.total
-    assert narrow.bounds == simulation(NARROW).decider.bounds
+    assert {one.bound for one in narrow.decisions} == {*simulation(NARROW).decider.bounds}
 
 
 def test_a_wrong_decision_is_found(monkeypatch: pytest.MonkeyPatch):
@@ -194,7 +192,7 @@ def test_a_wrong_decision_is_found(monkeypatch: pytest.MonkeyPatch):
         margin, inside = exact_margin(*given)
         return -margin, not inside
 
-    monkeypatch.setattr(exact_bounds, "exact_margin", planted)
+    monkeypatch.setattr(certified, "exact_margin", planted)
     found = certified_horizon(simulation(NARROW), 400)
     assert [one.wrong for one in found.decisions] == [not one.wrong for one in honest.decisions]
 

@@ -12,8 +12,7 @@ import small_systems
 from ase import Atoms
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.program import ExactProgram, _Run, unsupported
-from mdnum.forks.exact.tape import DecisionTape, first_difference
+from mdnum.forks.exact.program import DecisionTape, ExactProgram, first_difference, taped, unsupported
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 
@@ -74,12 +73,7 @@ def rational_flips(simulation: Simulation, steps: int, digits: int = 400):
 
 
 def rows(tape: DecisionTape) -> list[tuple[int, int, int, bool]]:
-    return [
-        (step, *tape.pair(key), entered)
-        for step, key, entered in zip(
-            tape.step.tolist(), tape.key.tolist(), tape.entered.tolist(), strict=True
-        )
-    ]
+    return [(step, *divmod(key, tape.atoms), entered) for step, key, entered in tape.rows(tape.steps)]
 
 
 def test_twenty_steps_of_rationals():
@@ -152,13 +146,10 @@ def test_two_precisions_agree_and_a_small_one_is_raised():
 
 
 def test_a_real_run_starts_on_the_exact_history():
-    from mdnum.forks.exact.bounds import taped
-
     simulation = liquid()
-    exact = ExactProgram(simulation).run(60)
-    run = taped(simulation, 60)
-    assert first_difference(exact.tape, run.tape) is None
-    np.testing.assert_array_equal(exact.tape.inside(60), run.tape.inside(60))
+    exact, (tape, _, _) = ExactProgram(simulation).run(60), taped(simulation, 60)
+    assert first_difference(exact.tape, tape) is None
+    np.testing.assert_array_equal(exact.tape.inside(60), tape.inside(60))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -191,6 +182,10 @@ def test_a_planted_wrong_decision_is_found(seed: int):
     assert found is not None and (found.step, found.subject) == (250, divmod(extra_key, atoms))
     assert (found.a, found.b) == (0, 1)
     assert first_difference(tape, tape) is None
+    # a tape that ended before is not different
+    assert first_difference(replace(extra, steps=249), replace(tape, steps=249)) is None
+    with pytest.raises(ValueError, match="20 and 21 atoms"):
+        first_difference(tape, replace(tape, atoms=21))
     start = first_difference(tape, replace(tape, first=first[1:]))
     assert start is not None and start.step == 0 and start.subject == divmod(first[0], atoms)
 
@@ -219,16 +214,14 @@ def test_a_pair_exactly_at_the_cutoff_is_decided_by_the_convention():
 
 def test_species_masses_and_a_tilted_box():
     """Pair types, unequal masses and lattice vectors off the axes, against the real run."""
-    from mdnum.forks.exact.bounds import taped
-
     atoms = small_systems.mixture()
     matrix = np.array(atoms.cell)
     matrix[1, 0], matrix[2, 1] = 0.7, -0.4
     atoms.set_cell(matrix, scale_atoms=True)
     atoms.set_masses(np.linspace(0.8, 1.3, len(atoms)))
     simulation = build(small_systems.make(atoms, small_systems.KOB_ANDERSEN, {"kind": "hard", "radius": 1.6}))
-    exact, run = ExactProgram(simulation).run(12), taped(simulation, 12)
-    assert first_difference(exact.tape, run.tape) is None and exact.tape.flips > 5
+    exact, (tape, _, _) = ExactProgram(simulation).run(12), taped(simulation, 12)
+    assert first_difference(exact.tape, tape) is None and exact.tape.flips > 5
 
 
 def test_what_cannot_be_certified_is_error():
@@ -244,25 +237,3 @@ def test_what_cannot_be_certified_is_error():
     assert unsupported(liquid()) is None
     with pytest.raises(InputError, match="steps = -1"):
         ExactProgram(liquid()).run(-1)
-
-
-def test_bits_follow_the_growth_of_the_balls():
-    simulation = liquid()
-    run = _Run(ExactProgram(simulation), 100, 400)
-    run.all(None, 0)
-    rate = (run._radius[100] - run._radius[25]) / 75
-    assert run.bits_needed() == pytest.approx(1.1 * rate * 100 + 120, abs=1.5)
-
-
-def test_only_the_first_step_that_differs_is_reported():
-    tape = DecisionTape(
-        20, 50, np.array([9]), np.array([10, 10, 30]), np.array([45, 47, 3]), np.array([True, True, True])
-    )
-    bare = replace(tape, step=tape.step[:0], key=tape.key[:0], entered=tape.entered[:0])
-    found = first_difference(bare, tape)
-    assert found is not None
-    assert (found.step, found.subject, found.also, (found.a, found.b)) == (10, (2, 5), 1, (0, 1))
-    # a tape that ended before is not different
-    assert first_difference(replace(bare, steps=9), tape) is None
-    with pytest.raises(ValueError, match="20 and 21 atoms"):
-        first_difference(tape, replace(tape, atoms=21))

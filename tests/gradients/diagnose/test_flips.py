@@ -1,4 +1,5 @@
-"""Contributions of single flips, against the two gradients between which they stand."""
+"""Contributions of single flips, against the two gradients between which they stand; boundaries of decisions,
+against where free flight puts them."""
 
 from __future__ import annotations
 
@@ -6,13 +7,15 @@ import json
 
 import numpy as np
 import pytest
+from ase import Atoms
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose import GradientDiagnosis, diagnose, flips
+from mdnum.gradients.diagnose import GradientDiagnosis, diagnose, edges, flips
 from mdnum.gradients.diagnose.flips import FlipTerms
 from mdnum.gradients.losses import MeanSquaredDisplacement
+from mdnum.gradients.parameters import with_values
 from mdnum.plain import plain
 from mdnum.systems import build
 
@@ -59,14 +62,15 @@ def test_contributions_sum_to_what_event_aware_adds(whole, found):
     assert found.flips > 100
     for name in NAMES:
         added = float(aware[name] - plain[name])
-        assert found.contribution(name).sum() == pytest.approx(added, rel=1e-9), name
+        assert found.table[f"contribution.{name}"].sum() == pytest.approx(added, rel=1e-9), name
         assert found.smooth[name] == pytest.approx(float(plain[name]), rel=1e-9, abs=1e-12), name
         assert sum(found.share[name].values()) == pytest.approx(1.0, rel=1e-9), name
     assert found.smooth["cutoff.radius"] == 0.0 and found.half["cutoff.radius"] < found.flips
 
 
 def test_the_heaviest_come_first_and_the_start_is_skipped(found):
-    sizes = [np.abs(parts) / np.abs(parts).sum() for parts in map(found.contribution, found.total)]
+    parts = [np.abs(found.table[f"contribution.{name}"]) for name in found.total]
+    sizes = [part / part.sum() for part in parts]
     heaviest = np.max(sizes, axis=0)
     assert np.all(np.diff(heaviest) <= 0)
     assert found.skipped == {"initial.velocities": 324}
@@ -83,5 +87,73 @@ def test_what_grazes_contributes_nothing(problem, found):
     guarded = flips(problem, NAMES, guard=1.0)
     grazing, speed = guarded.table["grazing"], np.abs(guarded.table["radial_speed"])
     assert 0 < guarded.grazing == grazing.sum() < guarded.flips and not found.grazing
-    assert not guarded.contribution("cutoff.radius")[grazing].any()
+    assert not guarded.table["contribution.cutoff.radius"][grazing].any()
     assert np.all(speed[grazing] < speed[~grazing].min())
+
+
+# --- boundaries --------------------------------------------------------------------------------------
+
+APART, RADIUS, SPEED, STEPS = 2.3, 2.2, 1.0, 20
+
+
+@pytest.fixture(scope="module")
+def flying():
+    """Two atoms that fly toward one another and enter their cutoff at step 13, and do nothing else."""
+    atoms = Atoms("Ar2", positions=[[1, 3, 3], [1 + APART, 3, 3]], cell=[9, 9, 9], pbc=True)
+    atoms.set_array("masses", np.ones(2))
+    simulation = build(make(atoms, LENNARD_JONES, {"kind": "hard", "radius": RADIUS}))
+    velocities = np.array([[SPEED, 0, 0], [-SPEED, 0, 0]])
+    return Problem(
+        with_values(simulation, {"initial.velocities": velocities}), MeanSquaredDisplacement(), STEPS
+    )
+
+
+@pytest.fixture(scope="module")
+def near(flying):
+    return edges(flying, "temperature", reach=0.5)
+
+
+def test_boundaries_lie_where_free_flight_puts_them(flying, near):
+    """The pair enters at the first step k with APART - 2 v k dt < RADIUS, and v goes with the root of T."""
+    timestep = float(flying.simulation.integrator.timestep)
+    entered = int(np.ceil((APART - RADIUS) / (2 * SPEED * timestep)))
+    assert entered == 13
+    for edge, k in ((near.above, entered - 1), (near.below, entered)):
+        speed = (APART - RADIUS) / (2 * k * timestep)
+        expected = (speed / SPEED) ** 2 * near.value
+        assert edge.found and (edge.i, edge.j) == (0, 1)
+        assert edge.inside == pytest.approx(expected, rel=1e-12)
+        assert edge.beyond == np.nextafter(edge.inside, np.inf if edge.side == "above" else -np.inf)
+        assert edge.distance == abs(edge.inside - near.value)
+        # hotter, it is inside a step earlier
+        assert edge.step == k
+
+
+def test_the_gradient_jumps_where_the_kicks_do(near):
+    """One more or one fewer kick inside the cutoff."""
+    for edge in (near.below, near.above):
+        inside, beyond = edge.gradient_inside["symmetric"], edge.gradient_beyond["symmetric"]
+        assert abs(beyond - inside) > 1e-6 * abs(inside)
+        assert edge.value_beyond != edge.value_inside
+
+
+def test_where_nothing_changes_within_reach_that_is_said(flying):
+    found = edges(flying, "temperature", reach=1e-6)
+    assert not found.below.found and not found.above.found and np.isnan(found.above.inside)
+
+
+def test_along_the_radius_a_boundary_is_where_the_distance_is(flying):
+    found = edges(flying, "r_cut", reach=0.02)
+    timestep = float(flying.simulation.integrator.timestep)
+    # the pair is outside at step 12 and inside at step 13
+    outside, inside = (APART - 2 * SPEED * k * timestep for k in (12, 13))
+    assert found.above.beyond == pytest.approx(outside, rel=1e-12)
+    assert found.below.inside == pytest.approx(inside, rel=1e-12)
+    assert found.above.gradient_inside["symmetric"] == 0.0
+
+
+def test_several_entries_and_a_wide_reach_are_refused(flying):
+    with pytest.raises(InputError, match="6 entries"):
+        edges(flying, "v0")
+    with pytest.raises(InputError, match="reach"):
+        edges(flying, "sigma", reach=2.0)

@@ -13,8 +13,8 @@ from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
-from mdnum.gradients.diagnose.horizons import halved, spread
 from mdnum.gradients.diagnose.near import Near
+from mdnum.gradients.diagnose.trust import halved, spread
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.recorded import EventAware, passed
 from mdnum.gradients.tape import pace_of
@@ -76,7 +76,8 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
     assert 0 < short < (FARTHEST - farthest(timestep)) / 2 < 1e-3
     planted = problem(-0.5 * short, timestep)
     found = trust(planted, NAMES)
-    assert EventAware()(planted, ("r_cut",)).details["crossings"] == 0
+    own = EventAware()(planted, ("r_cut", "dt"))
+    assert own.details["crossings"] == 0
     assert found.half["cutoff.radius"].tolist() == [0.0]
     near = limit(found, "near miss")
     assert near.reached and near.horizon == 35 and found.verdict == "limited"
@@ -87,11 +88,12 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
     missed = (FARTHEST - farthest(timestep)) / 2 - 0.5 * short
     assert row["gap"] == pytest.approx(missed, rel=0.02) and row["gap"] < row["reach"]
     # with a time step at which it does enter, the derivative is of the size that was told
-    true = float(EventAware()(problem(-0.5 * short, timestep / 16), ("r_cut",)).gradient["cutoff.radius"])
+    finer = EventAware()(problem(-0.5 * short, timestep / 16), ("r_cut", "dt"))
+    true = float(finer.gradient["cutoff.radius"])
     assert true != 0 and 0.2 < abs(row["term"]["cutoff.radius"] / true) < 5
     # at a fixed number of steps, twice as many of half the length move with it as far as one of them
-    own = EventAware()(planted, ("dt",)).gradient["dynamics.timestep"]
-    assert found.half["dynamics.timestep"][0] == pytest.approx(float(own), rel=0.02)
+    by_time = float(own.gradient["dynamics.timestep"])
+    assert found.half["dynamics.timestep"][0] == pytest.approx(by_time, rel=0.02)
 
 
 @pytest.mark.parametrize("loss", [None, MeanPotential()])
@@ -101,13 +103,13 @@ def test_the_weight_of_a_near_miss_is_what_its_flips_add_when_it_flips(loss):
     missed = problem(gap, timestep, loss=loss)
     near = Near(missed.simulation, pace_of(missed.loss, missed.steps))
     passed(missed, ("cutoff.radius",), watches=[near.reverse])
-    turns = near.turns(0)
-    (k,) = np.flatnonzero((turns.i == 1) & (turns.j == 2) & (turns.gap > 0) & (turns.gap < 1e-3))
-    assert turns.gap[k] == pytest.approx(gap, rel=0.02)
+    turns = near.turns(0).table
+    (k,) = np.flatnonzero((turns["i"] == 1) & (turns["j"] == 2) & (turns["gap"] > 0) & (turns["gap"] < 1e-3))
+    assert turns["gap"][k] == pytest.approx(gap, rel=0.02)
     inside = problem(gap, timestep, radius=R_CUT + gap + depth, loss=loss)
     true = EventAware()(inside, ("r_cut",))
     assert true.details["crossings"] == 2
-    told = 2 * turns.weight[k] / np.sqrt(2 * turns.bend[k] * depth)
+    told = 2 * turns["weight"][k] / np.sqrt(2 * turns["bend"][k] * depth)
     assert told == pytest.approx(float(true.gradient["cutoff.radius"]), rel=0.1)
 
 
@@ -125,10 +127,11 @@ def test_a_pair_that_is_inside_between_two_steps_alone_is_seen():
     near = Near(simulation, pace_of(passing.loss, passing.steps))
     made = passed(passing, ("cutoff.radius",), watches=[near.reverse])
     assert sum(map(len, made.crossings)) == 0
-    turns = near.turns(1)
-    assert turns.unseen.tolist() == turns.within.tolist() == [True] and turns.step.tolist() == [2]
-    assert turns.gap[0] == pytest.approx(-1e-3, rel=1e-3)
-    assert turns.bend[0] == pytest.approx(speed**2 / closest, rel=0.01)
+    found = near.turns(1)
+    turns = found.table
+    assert turns["unseen"].tolist() == found.within.tolist() == [True] and turns["step"].tolist() == [2]
+    assert turns["gap"][0] == pytest.approx(-1e-3, rel=1e-3)
+    assert turns["bend"][0] == pytest.approx(speed**2 / closest, rel=0.01)
 
 
 def test_nothing_is_trusted_that_was_not_looked_at(monkeypatch):

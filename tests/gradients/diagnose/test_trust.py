@@ -13,14 +13,17 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
 from mdnum.gradients.diagnose.trust import (
+    Horizons,
     Limit,
     ambiguity,
+    first_difference,
+    horizons,
     last_agreeing,
     last_below,
     no_half_step,
     shadow_of,
+    spread,
     standard_error,
     trust,
     verdict_of,
@@ -35,9 +38,8 @@ NARROW: dict[str, Any] = {"precision": dict.fromkeys(("state", "force", "decisio
 
 
 @pytest.fixture(scope="module")
-def problem():
-    simulation = build(make(crystal(), LENNARD_JONES, QUINTIC))
-    return Problem(simulation, MeanPotential(every=7, first=5), 60)
+def problem(smooth):
+    return Problem(smooth, MeanPotential(every=7, first=5), 60)
 
 
 @pytest.mark.slow
@@ -57,11 +59,10 @@ def test_horizons_that_look_at_nothing_are_left_out(problem):
     assert spread(problem, 20)[0] == 6
 
 
-def made(gradient, ledgers=()) -> Horizons:
+def made(gradient, flips=()) -> Horizons:
     gradient = np.asarray(gradient, float)[:, None]
-    return Horizons(
-        np.arange(len(gradient)), (ParameterEntry("q"),), gradient[:, 0], gradient, tuple(ledgers)
-    )
+    flips = np.array(flips, np.int64).reshape(-1, 4)
+    return Horizons(np.arange(len(gradient)), (ParameterEntry("q"),), gradient[:, 0], gradient, flips)
 
 
 AT = np.array([10, 20, 30, 40, 50])
@@ -111,19 +112,28 @@ def test_the_standard_error_is_that_of_the_mean():
     assert found.tolist() == pytest.approx([0.0, 2 / np.sqrt(3)])
 
 
-def test_runs_without_flips_differ_nowhere():
-    assert first_difference(made([1.0]), made([2.0])) is None
+@pytest.mark.parametrize(
+    ("first", "second", "step"),
+    [
+        ([], [], None),
+        ([(3, 0, 1, 1)], [(3, 0, 1, 1)], None),
+        ([(3, 0, 1, 1), (5, 0, 2, 1)], [(3, 0, 1, 1)], 5),
+        ([(3, 0, 1, 1), (5, 0, 2, 1)], [(3, 0, 1, 1), (4, 0, 2, 0)], 4),
+    ],
+)
+def test_the_first_flip_that_differs_is_found(first, second, step):
+    assert first_difference(made([1.0], first), made([2.0], second)) == step
 
 
 def test_a_shadow_is_wider_where_there_is_a_wider_format(problem):
-    ours = shadow_of(problem.simulation)
-    moved = np.abs(ours.simulation.positions - problem.simulation.positions)
-    assert not ours.narrow and 0 < moved.max() < 1e-14
-    narrow = shadow_of(build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW)))
-    assert narrow.narrow == ("float32",)
-    force = eqx.filter(narrow.simulation.force, eqx.is_inexact_array)
+    ours, none = shadow_of(problem.simulation)
+    moved = np.abs(ours.positions - problem.simulation.positions)
+    assert not none and 0 < moved.max() < 1e-14
+    wide, narrow = shadow_of(build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW)))
+    assert narrow == ("float32",)
+    force = eqx.filter(wide.force, eqx.is_inexact_array)
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(force)} == {"float64"}
-    assert narrow.simulation.decider.dtype == "float64"
+    assert wide.decider.dtype == "float64"
 
 
 @pytest.mark.slow

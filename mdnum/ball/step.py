@@ -1,0 +1,528 @@
+"""One step of a ball: schemes of flight, and contact models: a force, an iterated constraint, an instant.
+
+Every scheme says at which height the contact decision is made; the record holds that height. All products
+are rounded before they are added (no fused multiply-add), so numpy in the same dtype has the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from mdnum.ball.stopping import Maximum, Reason, Solve, StopRule, elementwise, iterate, no_solve
+from mdnum.numerics.exact import fence
+from mdnum.numerics.roles import RolePrecision
+
+Balls = Float[Array, "balls"]
+Touching = Bool[Array, "balls"]
+
+
+class BallState(NamedTuple):
+    """A batch of balls between two steps.
+
+    Attributes:
+        step: number of steps made.
+        y: heights above the floor, m, shape (balls,).
+        v: velocities, upward positive, m/s, shape (balls,).
+        a: accelerations that velocity Verlet carries from one step to the next, m/s², shape (balls,).
+        touching: the contact decision of the step before, shape (balls,); what hysteresis looks back to.
+    """
+
+    step: Int[Array, ""]
+    y: Float[Array, "balls"]
+    v: Float[Array, "balls"]
+    a: Float[Array, "balls"]
+    touching: Bool[Array, "balls"]
+
+
+class BallDecisions(NamedTuple):
+    """Everything that a step decides; or what is imposed on a step, in part or in whole.
+
+    Attributes:
+        contact: whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1,
+            and a negative number where the step is to decide by itself.
+        iterations: iterations of the step's solver, shape () where one rule stops it for all balls,
+            (balls,) where each ball has its own; impacts located in the step for an event-located one. A
+            negative number, imposed, leaves it to the step.
+    """
+
+    contact: Bool[Array, "balls"] | Int[Array, "balls"]
+    iterations: Int[Array, "..."]
+
+
+class BallRecord(NamedTuple):
+    """What a step leaves.
+
+    Attributes:
+        height: what the contact decision compared with zero, m, shape (balls,).
+        contact: the decision, shape (balls,).
+        left: penetration that the contact model left, m, shape (balls,); carries derivatives.
+        solve: of the step's solver.
+    """
+
+    height: Float[Array, "balls"]
+    contact: Bool[Array, "balls"]
+    left: Float[Array, "balls"]
+    solve: Solve
+
+    @property
+    def decisions(self) -> BallDecisions:
+        """What the step decided, to be imposed on another."""
+        return BallDecisions(self.contact, self.solve.iterations)
+
+
+class Rounding(eqx.Module):
+    """Rounds a product (or anything) before it is used: the fence, with the zero it needs.
+
+    Attributes:
+        zero: an integer zero that the compiler must not know (see mdnum.numerics.exact).
+    """
+
+    zero: Int[Array, ""]
+
+    def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """x, rounded here."""
+        return fence(x, self.zero)
+
+
+class Motion(NamedTuple):
+    """What a contact model is given for one step.
+
+    Attributes:
+        y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
+            arithmetic.
+        free: acceleration without contact (control minus gravity), shape (balls,).
+        judge: the contact decision at a height: the world's own, or what was imposed.
+        imposed: iterations that are imposed, or None.
+        integrator, policy, rounding: of the world.
+        history: whether solvers keep the residual of every decision.
+    """
+
+    y: Balls
+    v: Balls
+    carried: Balls
+    free: Balls
+    judge: Callable[[Balls], Touching]
+    imposed: Int[Array, "..."] | None
+    integrator: Scheme
+    policy: RolePrecision
+    rounding: Rounding
+    history: bool
+
+
+class Moved(NamedTuple):
+    """The next height, velocity and carried acceleration, and the record of how they came about."""
+
+    y: Balls
+    v: Balls
+    a: Balls
+    record: BallRecord
+
+
+#: Acceleration from height, velocity and the contact decision.
+Pull = Callable[[Balls, Balls, Touching], Balls]
+
+
+# --- schemes --------------------------------------------------------------------------------------------
+
+
+class Scheme(Protocol):
+    """The contract of a scheme.
+
+    Attributes:
+        h: time step, s.
+    """
+
+    h: Any
+
+    def fly(self, y: Balls, v: Balls, a: Balls, r: Rounding) -> tuple[Balls, Balls]:
+        """One step under a constant acceleration."""
+        ...
+
+    def push(self, pull: Pull, motion: Motion) -> Moved:
+        """One step under a contact force; what it leaves of the penetration is not on the record yet."""
+        ...
+
+
+def _pushed(y, v, a, height, contact, solve=None, *, policy: RolePrecision) -> Moved:
+    solve = no_solve(policy.dtype("decision")) if solve is None else solve
+    return Moved(y, v, a, BallRecord(height, contact, jnp.zeros_like(y), solve))
+
+
+class _Euler(eqx.Module):
+    h: Any
+
+    def push(self, pull, motion):
+        """The decision is made at the old height."""
+        y, v = motion.y, motion.v
+        contact = motion.judge(y)
+        a = pull(y, v, contact)
+        return _pushed(*self.fly(y, v, a, motion.rounding), a, y, contact, policy=motion.policy)  # type: ignore[attr-defined]
+
+
+class ExplicitEuler(_Euler):
+    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact gains energy at any step."""
+
+    def fly(self, y, v, a, r):
+        return r(y + r(self.h * v)), r(v + r(self.h * a))
+
+
+class SemiImplicitEuler(_Euler):
+    """v += h a(y); y += h v with the new velocity. Order 1, symplectic; stable for h sqrt(k) < 2."""
+
+    def fly(self, y, v, a, r):
+        v = r(v + r(self.h * a))
+        return r(y + r(self.h * v)), v
+
+
+class BallVerlet(eqx.Module):
+    """Half kick, drift, force, half kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
+
+    h: Any
+
+    def _drift(self, y, v, a, r):
+        half = r(0.5 * self.h)
+        v = r(v + r(half * a))
+        return r(y + r(self.h * v)), v, half
+
+    def fly(self, y, v, a, r):
+        y, v, half = self._drift(y, v, a, r)
+        return y, r(v + r(half * a))
+
+    def push(self, pull, motion):
+        """The decision is made at the new height; a damping force sees the velocity of the half step."""
+        r = motion.rounding
+        y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
+        contact = motion.judge(y)
+        a = pull(y, v, contact)
+        return _pushed(y, r(v + r(half * a)), a, y, contact, policy=motion.policy)
+
+
+class ImplicitMidpoint(eqx.Module):
+    """The acceleration of the middle of the step, found by Newton's method. Order 2, stable at any step.
+
+    The derivative is the implicit one: of the equation that the solve ends at, not of its iterations.
+
+    Attributes:
+        h: time step, s.
+        stop: when the solve ends; its residual is h times the error in the acceleration, m/s.
+    """
+
+    h: Any
+    stop: StopRule = Maximum(1e-12, 50)
+
+    def fly(self, y, v, a, r):
+        half = r(0.5 * self.h)
+        middle = r(v + r(half * a))
+        return r(y + r(self.h * middle)), r(v + r(self.h * a))
+
+    def push(self, pull, motion):
+        """The decision is made at the height of the middle of the step."""
+        y, v, r, judge = motion.y, motion.v, motion.rounding, motion.judge
+        half = r(0.5 * self.h)
+        quarter = r(half * half)
+        ahead = r(y + r(half * v))
+
+        def middle(a):
+            return r(ahead + r(quarter * a)), r(v + r(half * a))
+
+        def defect(a, contact):
+            return a - pull(*middle(a), contact)
+
+        def newton(a, contact):
+            value, slope = jax.jvp(lambda x: defect(x, contact), (a,), (jnp.ones_like(a),))
+            return r(a - value / slope)
+
+        free = pull(*middle(motion.carried), jnp.zeros(y.shape, bool))
+        free = lax.stop_gradient(free)
+        # which balls touch, and after how many iterations: decided without derivatives
+        found, solve = iterate(
+            self.stop,
+            free,
+            lambda a: lax.stop_gradient(newton(a, judge(middle(a)[0]))),
+            lambda a: jnp.abs(self.h * defect(a, judge(middle(a)[0]))),
+            motion.policy,
+            r.zero,
+            imposed=motion.imposed,
+            history=motion.history,
+        )
+        contact = judge(middle(found)[0])
+        # the same iterations under the decision that was reached: as a step under imposed decisions
+        count = solve.iterations
+
+        def body(carry):
+            a, n = carry
+            return jnp.where(n < count, lax.stop_gradient(newton(a, contact)), a), n + 1
+
+        a, _ = lax.while_loop(lambda carry: jnp.any(carry[1] < count), body, (free, jnp.zeros((), jnp.int32)))
+        a = lax.stop_gradient(a)
+        # one more Newton step has the derivative of the equation; its value is taken off again
+        _, slope = jax.jvp(lambda x: defect(x, contact), (a,), (jnp.ones_like(a),))
+        more = -defect(a, contact) / lax.stop_gradient(slope)
+        a = a + (more - lax.stop_gradient(more))
+        height, _ = middle(a)
+        y, v = self.fly(y, v, a, r)
+        return _pushed(y, v, a, height, contact, solve, policy=motion.policy)
+
+
+class EventLocated(eqx.Module):
+    """Flight along the exact parabola, with every impact located inside the step. For impacts only.
+
+    Attributes:
+        h: time step, s; the trajectory does not depend on it, only where it is looked at.
+        max_impacts: the cap on impacts inside one step.
+    """
+
+    h: Any
+    max_impacts: int = eqx.field(static=True, default=200)
+
+    def fly(self, y, v, a, r):
+        drift = r(self.h * r(v + r(r(0.5 * self.h) * a)))
+        return r(y + drift), r(v + r(self.h * a))
+
+    def push(self, pull, motion):
+        raise TypeError("an event-located step has no contact force")
+
+
+# --- contact models -------------------------------------------------------------------------------------
+
+
+class Contact(Protocol):
+    """What happens at the floor."""
+
+    def move(self, motion: Motion) -> Moved:
+        """One step."""
+        ...
+
+    def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
+        """Acceleration of a state, for schemes that carry it."""
+        ...
+
+
+class _Forceless(eqx.Module):
+    """A contact that resets the state."""
+
+    def acceleration(self, y, v, free, contact, r):
+        """There is no contact force."""
+        return free
+
+
+class Penalty(eqx.Module):
+    """Force k p - damping v on a ball in contact, with p = -y; k p with a softplus p when smooth.
+
+    A step on which a contact is imposed pushes with -k y whatever the sign of y: the branch continues
+    smoothly beyond its threshold, as a pair force beyond its cutoff does when it is imposed.
+
+    Attributes:
+        k: stiffness per mass, 1/s².
+        damping: per mass, 1/s; the force may pull while the ball leaves.
+        eps: width of the softplus, m, where `smooth`.
+        smooth: p = eps softplus(-y/eps) for every height; the decision is recorded and not acted on, except
+            by the damping.
+
+    Source: the soft contact of the discrete element method (Cundall and Strack 1979).
+    """
+
+    k: Any
+    damping: Any = 0.0
+    eps: Any = 0.0
+    smooth: bool = eqx.field(static=True, default=False)
+
+    def depth(self, y, contact):
+        """Penetration p, m."""
+        if self.smooth:
+            return self.eps * jax.nn.softplus(-y / self.eps)
+        return jnp.where(contact, -y, jnp.zeros_like(y))
+
+    def acceleration(self, y, v, free, contact, r):
+        """Control, gravity, spring and damper."""
+        drag = jnp.where(contact, r(self.damping * v), jnp.zeros_like(v))
+        return r(free + r(r(self.k * self.depth(y, contact)) - drag))
+
+    def move(self, motion: Motion) -> Moved:
+        """One step of the scheme under this force."""
+        r = motion.rounding
+
+        def pull(y, v, contact):
+            return self.acceleration(y, v, motion.free, contact, r)
+
+        made = motion.integrator.push(pull, motion)
+        return made._replace(record=made.record._replace(left=self.depth(made.y, made.y < 0)))
+
+
+class Projection(_Forceless):
+    """y ← y + alpha k p with p = max(0, -y) until the rule stops it; then the clamp, and restitution.
+
+    Each iteration leaves 1 - alpha k of the penetration, so tol is reached after
+    ceil(log(tol / p0) / log(1 - alpha k)) iterations; alpha k in (1, 2) overshoots, at 2 it never ends.
+    The floor is at 0 whatever k is: where the iterations end depends on k only through what they leave.
+
+    Attributes:
+        k: gain, dimensionless; what is learned in place of a stiffness.
+        alpha: relaxation, dimensionless.
+        restitution: speed after over speed before; the velocity is reset at the end of the step.
+        stop: when the iteration stops.
+        derivative: None for the derivative of the iterations that ran; else an object whose
+            `attach(y, gain, contact)` gives the result another one.
+    """
+
+    k: Any
+    alpha: Any
+    stop: StopRule
+    restitution: Any = 0.8
+    derivative: Any = None
+
+    def move(self, motion: Motion) -> Moved:
+        """Flight, and the projection back where it ends below the floor."""
+        r, policy = motion.rounding, motion.policy
+        height, v = motion.integrator.fly(motion.y, motion.v, motion.free, r)
+        contact = motion.judge(height)
+        history = motion.history
+
+        def run(inputs, rest):
+            y, gain = inputs
+            touching, rule, imposed, rounding = rest
+
+            def depth(y):
+                return jnp.where(touching & (y < 0), -y, jnp.zeros_like(y))
+
+            y, solve = iterate(
+                rule,
+                y,
+                lambda y: rounding(y + rounding(gain * depth(y))),
+                depth,
+                policy,
+                rounding.zero,
+                imposed=imposed,
+                history=history,
+            )
+            return (y,), solve
+
+        gain = jnp.broadcast_to(r(self.alpha * self.k), height.shape)
+        (y,), solve = elementwise(run)((height, gain), (contact, self.stop, motion.imposed, r))
+        if self.derivative is not None:
+            y = self.derivative.attach(y, gain, contact)
+        left = jnp.where(contact & (y < 0), -y, jnp.zeros_like(y))
+        y = jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
+        v = jnp.where(contact, r(-self.restitution * jnp.where(v < 0, v, jnp.zeros_like(v))), v)
+        return Moved(y, v, motion.free, BallRecord(height, contact, left, solve))
+
+
+class Impact(_Forceless):
+    """v ← -restitution v at the floor.
+
+    With an event-located step the impact happens at its exact time, and the rest of the step flies on from
+    there; with any other scheme the ball is put on the floor and reset at the end of the step in which it
+    passed the floor, an error of order h in its state and of order 1 in its derivative.
+
+    Attributes:
+        restitution: speed after over speed before.
+        rest_speed: a rebound at or below this speed, m/s, ends the bouncing (a ball that loses a share of
+            its speed bounces infinitely often in a finite time).
+    """
+
+    restitution: Any = 0.8
+    rest_speed: Any = 1e-6
+
+    def move(self, motion: Motion) -> Moved:
+        """Flight with the impacts of this step."""
+        if isinstance(motion.integrator, EventLocated):
+            return self._located(motion, motion.integrator)
+        r = motion.rounding
+        height, v = motion.integrator.fly(motion.y, motion.v, motion.free, r)
+        contact = motion.judge(height)
+        zero = jnp.zeros_like(height)
+        rebound = r(-self.restitution * jnp.where(v < 0, v, zero))
+        rests = contact & (rebound <= self.rest_speed)
+        y = jnp.where(contact, zero, height)
+        v = jnp.where(contact, jnp.where(rests, zero, rebound), v)
+        solve = no_solve(motion.policy.dtype("decision"))
+        reason = jnp.where(jnp.any(rests), Reason.REST.value, Reason.NONE.value).astype(jnp.int8)
+        record = BallRecord(height, contact, zero, solve._replace(reason=reason))
+        return Moved(y, v, motion.free, record)
+
+    def _located(self, motion: Motion, scheme: EventLocated) -> Moved:
+        r = motion.rounding
+        h = jnp.broadcast_to(jnp.asarray(scheme.h, motion.y.dtype), motion.y.shape)
+        height = lowest(motion.y, motion.v, motion.free, h, r)
+        contact = motion.judge(height)
+
+        def run(inputs, rest):
+            y, v, a, left, restitution = inputs
+            touching, rest_speed, imposed, rounding = rest
+            count = jnp.zeros(y.shape, jnp.int32)
+            still = jnp.zeros(y.shape, bool)
+
+            def ahead(y, v, left, count, still):
+                below = jnp.where(count == 0, touching, lowest(y, v, a, left, rounding) < 0)
+                own = below & ~still & (count < scheme.max_impacts)
+                return own if imposed is None else jnp.where(imposed < 0, own, (count < imposed) & ~still)
+
+            def body(carry):
+                y, v, left, count, still, hits = carry
+                time = jnp.minimum(time_of_impact(y, v, a, rounding), left)
+                speed = rounding(v + rounding(a * time))
+                rebound = rounding(-restitution * speed)
+                rests = hits & (rebound <= rest_speed) & (a <= 0)
+                nothing = jnp.zeros_like(y)
+                y = jnp.where(hits, nothing, y)
+                v = jnp.where(hits, jnp.where(rests, nothing, rebound), v)
+                left = jnp.where(hits, jnp.where(rests, nothing, rounding(left - time)), left)
+                count = count + hits.astype(jnp.int32)
+                still = still | rests
+                return y, v, left, count, still, ahead(y, v, left, count, still)
+
+            start = (y, v, left, count, still, ahead(y, v, left, count, still))
+            y, v, left, count, still, _ = lax.while_loop(lambda carry: jnp.any(carry[5]), body, start)
+            # impacts without end inside one step, cut off at the cap: what is left of it is no flight
+            capped = (count >= scheme.max_impacts) & (lowest(y, v, a, left, rounding) < 0)
+            rise = rounding(left * rounding(v + rounding(rounding(0.5 * left) * a)))
+            y_end, v_end = rounding(y + rise), rounding(v + rounding(a * left))
+            nothing = jnp.zeros_like(y)
+            y = jnp.where(still | capped, nothing, y_end)
+            v = jnp.where(still | capped, nothing, v_end)
+            reason = jnp.where(still, Reason.REST.value, Reason.NONE.value)
+            reason = jnp.where(capped, Reason.CAP.value, reason).astype(jnp.int8)
+            return (y, v), (count, reason)
+
+        restitution = jnp.broadcast_to(jnp.asarray(self.restitution, motion.y.dtype), h.shape)
+        (y, v), (count, reason) = elementwise(run)(
+            (motion.y, motion.v, motion.free, h, restitution),
+            (contact, self.rest_speed, motion.imposed, r),
+        )
+        nothing = jnp.full(y.shape, jnp.nan, motion.policy.dtype("decision"))
+        empty = jnp.zeros(0, nothing.dtype)
+        solve = Solve(count, reason, nothing, nothing, nothing, empty)
+        return Moved(y, v, motion.free, BallRecord(height, contact, jnp.zeros_like(y), solve))
+
+
+def lowest(y, v, a, time, r):
+    """The lowest height of the parabola over the given time: at its end, or at its vertex."""
+    end = r(y + r(time * r(v + r(r(0.5 * time) * a))))
+    up = (a > 0) & (v < 0) & (r(-v) < r(a * time))
+    safe = jnp.where(up, a, jnp.ones_like(a))
+    return jnp.where(up, r(y - r(r(v * v) / r(2.0 * safe))), end)
+
+
+def time_of_impact(y, v, a, r):
+    """The first time at which the parabola meets the floor, s; infinite where it never does.
+
+    Error: a few units roundoff relative; of the two forms of the root the one without cancellation is used.
+    """
+    inside = r(r(v * v) - r(r(2.0 * a) * y))
+    # the argument is masked as well, so that no derivative is taken where there is no root
+    there = inside > 0
+    root = jnp.sqrt(jnp.where(there, inside, jnp.ones_like(inside)))
+    root = jnp.where(there, root, jnp.zeros_like(root))
+    falling = v < 0
+    below = jnp.where(falling, root - v, jnp.ones_like(v))
+    down = jnp.where(falling | (a >= 0), jnp.ones_like(a), a)
+    time = jnp.where(falling, r(2.0 * y) / below, (v + root) / -down)
+    never = (~falling & (a >= 0)) | (inside < 0)
+    return jnp.where(never, jnp.full_like(time, jnp.inf), time)

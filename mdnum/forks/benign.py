@@ -1,0 +1,462 @@
+"""Is a fork benign: do two programs whose runs diverge still give the same measurements?
+
+B is compared with an ensemble of A, at a step that a calibration chooses. Too early, the ensemble differs by
+less than rounding may; too late, every run has forgotten its start and a changed program gives the same
+scatter. Between the two lies a window, and it belongs to the system: so planted changes are run, and the step
+is taken at which all of them are distinguished from rounding.
+
+The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018):
+features are standardized by the ensemble and projected on its principal components; a run stands out when two
+of its components lie beyond a limit, and three runs fail when two of them stand out. That is, when the median
+over the runs of their second largest component is beyond the limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import comb
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.forks.ensemble import (
+    Change,
+    ensemble,
+    feature_names,
+    nodes_of,
+    planted,
+    starts,
+    steps_to_diverge,
+)
+from mdnum.md.integrators import Langevin
+from mdnum.program import Twin
+from mdnum.rollout.engine import Start, first_state
+from mdnum.systems.build import Simulation
+
+#: Components that are compared, at most; fewer where so much of the variance is explained by fewer.
+COMPONENTS, _EXPLAINED = 10, 0.999
+#: Runs of one verdict.
+RUNS = 3
+#: A component beyond so many standard deviations stands out; more where an ensemble has wider tails.
+LIMIT = 2.0
+#: Share of the ensemble's own runs that may stand out: two of three do then in 2.8 % of all tries.
+ALONE = 0.1
+#: False positives that are accepted.
+ACCEPTED = 0.04
+_FOLDS = 10
+# a feature whose spread is rounding has none
+_ROUNDING = 1e-14
+#: Windows that are tried, as shares of the step at which two members have split; where they do not, of this.
+_SHARES, _UNSPLIT = (0.07, 0.15, 0.25, 0.4, 0.55, 0.7, 0.85), 1000
+#: Runs have split where they are so many cutoffs apart.
+_SPLIT = 0.04
+#: A window is good where every planted change is so many limits away, and the latest good one is taken:
+#: a change that acts rarely has then had time to act.
+_CLEAR = 3.0
+#: Fewer members than this have no tail to set a limit by.
+FEWEST = 20
+#: Features that are named, at most; one is where it matters so much, relative to the one that matters most.
+_NAMED, _TELLING = 5, 0.02
+#: Noise of B's runs; no seed of a calibration's.
+_SEED = 1_000_003
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+# --- the rule -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Space:
+    """The principal components of an ensemble.
+
+    Attributes:
+        mean, spread: of each feature over the ensemble; infinite spread leaves a feature out.
+        axes: components as rows, in standardized features.
+        sigma: standard deviation of the ensemble along each component.
+    """
+
+    mean: Float[np.ndarray, "features"]
+    spread: Float[np.ndarray, "features"]
+    axes: Float[np.ndarray, "components features"]
+    sigma: Float[np.ndarray, "components"]
+
+    @classmethod
+    def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
+        """The components that explain an ensemble's variance: two to ten, and at most a third of its runs."""
+        mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
+        # nothing can be said of a feature that is constant, such as a distance that no pair has
+        spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
+        z = (features - mean) / spread
+        _, size, axes = np.linalg.svd(z, full_matrices=False)
+        explained = np.cumsum(size**2) / np.sum(size**2)
+        count = int(min(np.searchsorted(explained, _EXPLAINED) + 1, COMPONENTS, len(features) // 3))
+        # the rule is about the second largest
+        count = max(count, 2)
+        return cls(mean, spread, axes[:count], size[:count] / np.sqrt(len(features) - 1))
+
+    def standardized(
+        self, features: Float[np.ndarray, "*runs features"]
+    ) -> Float[np.ndarray, "*runs features"]:
+        """Features in standard deviations of the ensemble."""
+        return (features - self.mean) / self.spread
+
+    def scores(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs components"]:
+        """Components in standard deviations of the ensemble; not a number for a run that blew up."""
+        return self.standardized(features) @ self.axes.T / self.sigma
+
+    def second(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs"]:
+        """Each run's second largest component: it stands out where that is beyond the limit.
+
+        Infinite for a run that blew up, which stands out in everything.
+        """
+        scores = np.abs(self.scores(features))
+        return np.sort(np.where(np.isnan(scores), np.inf, scores), axis=1)[:, -2]
+
+
+def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
+    """Standard deviations beyond which a component stands out: two, or more so that at most a tenth of the
+    ensemble's own runs do.
+
+    Each run is judged in the components of others: one stands out less in those that it shaped.
+    """
+    seconds = np.empty(len(features))
+    for fold in range(min(_FOLDS, len(features))):
+        left_out = np.arange(len(features)) % _FOLDS == fold
+        seconds[left_out] = Space.of(features[~left_out]).second(features[left_out])
+    return max(LIMIT, float(np.sort(seconds)[len(seconds) - 1 - int(ALONE * len(seconds))]))
+
+
+def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
+    """The median of each three runs in turn: what the rule compares with its limit."""
+    tries = len(seconds) // RUNS
+    return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
+
+
+def two_of_three(rate: float) -> float:
+    """How often two of three runs stand out where one does at a given rate."""
+    return 3 * rate**2 - 2 * rate**3
+
+
+def bounds(count: int, of: int, level: float = 0.95) -> tuple[float, float]:
+    """The exact (Clopper-Pearson) interval of a rate of which `count` of `of` were seen."""
+    tail = (1 - level) / 2
+    low = 0.0 if count == 0 else _solve(lambda p: 1 - _at_most(count - 1, of, p), tail)
+    high = 1.0 if count == of else _solve(lambda p: -_at_most(count, of, p), -tail)
+    return low, high
+
+
+def _at_most(count: int, of: int, p: float) -> float:
+    return sum(comb(of, k) * p**k * (1 - p) ** (of - k) for k in range(count + 1))
+
+
+def _solve(rising, value: float) -> float:
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rising(middle) < value else (low, middle)
+    return (low + high) / 2
+
+
+# --- calibration ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Planted:
+    """What the rule said of a planted change.
+
+    Attributes:
+        change: what it is.
+        must_fail: whether it is another model; else only other rounding.
+        failures, tries: verdicts "fail" of all, each from three runs of their own.
+        scores: what each verdict compared with 1: the second largest component, in limits.
+    """
+
+    change: str
+    must_fail: bool
+    failures: int
+    tries: int
+    scores: tuple[float, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Seen every time, or not more often than chance allows."""
+        if self.must_fail:
+            return self.failures == self.tries
+        return bounds(self.failures, self.tries)[0] <= ACCEPTED
+
+
+@dataclass(frozen=True)
+class Window:
+    """One step at which runs could be compared.
+
+    Attributes:
+        step: of the comparison.
+        space: components of the ensemble.
+        limit: standard deviations beyond which a component stands out.
+        table: what the rule said of each planted change.
+    """
+
+    step: int
+    space: Space
+    limit: float
+    table: tuple[Planted, ...]
+
+    @property
+    def power(self) -> float:
+        """The least that a change that must fail is beyond the limit, in limits; infinity without any."""
+        return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
+
+    @property
+    def ok(self) -> bool:
+        """Whether every planted change was distinguished."""
+        return all(one.ok for one in self.table)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """An ensemble that runs can be compared with.
+
+    Attributes:
+        nodes: of the pair histogram that features are measured on.
+        window: the one that was chosen.
+        held_out: runs of the same program that the ensemble does not hold. alone: those that stood out.
+        triples: tries of three of them each. false_positives: those that failed.
+    """
+
+    nodes: Float[np.ndarray, "nodes"]
+    window: Window
+    held_out: int
+    alone: int
+    triples: int
+    false_positives: int
+
+    @property
+    def rate(self) -> float:
+        """False positives per verdict, from how often single runs that were held out stand out."""
+        return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
+
+    @property
+    def rate_bounds(self) -> tuple[float, float]:
+        """Its exact 95 % interval."""
+        low, high = bounds(self.alone, self.held_out)
+        return two_of_three(low), two_of_three(high)
+
+
+def calibrate(
+    simulation: Simulation,
+    *,
+    start: Start | None = None,
+    members: int = 60,
+    held_out: int = 30,
+    tries: int = 3,
+    steps: int | None = None,
+    changes: Sequence[Change] | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Run an ensemble, and choose the step at which planted changes are distinguished from rounding.
+
+    Args:
+        simulation: the program.
+        start: where it begins; default the system's own start.
+        members: runs of the ensemble.
+        held_out: further runs, which the rate of false positives is taken from.
+        tries: verdicts on each planted change, three runs each; one on the other list search, which is slow.
+        steps: the only step to compare at; default chosen, up to where two members have split.
+        changes: that are planted; default all of `planted(simulation)`.
+        progress: called with runs done, runs in all, and figures.
+
+    Raises:
+        InputError: too few runs, a program that blows up, or no step at which planted changes can be
+            distinguished from rounding.
+
+    Error: statistical. The limit is a quantile over the members, see `Calibration.rate_bounds`.
+    """
+    if members < FEWEST:
+        raise InputError(f"members = {members} are too few for a limit", remedy=f"Give at least {FEWEST}")
+    least = {"held_out": (held_out, 0), "tries": (tries, 1), "steps": (1 if steps is None else steps, 1)}
+    for name, (value, at_least) in least.items():
+        if value < at_least:
+            raise InputError(f"{name} = {value}; expected at least {at_least}")
+    changes = planted(simulation) if changes is None else changes
+    if not any(change.must_fail for change in changes):
+        raise InputError("no planted change must fail", remedy="Plant one that must: else nothing is proven")
+    tried = [steps] if steps is not None else _windows(simulation, start)
+    nodes = nodes_of(simulation, start or first_state(simulation))
+    own = members + held_out
+    runs = [RUNS * (1 if change.once else tries) for change in changes]
+    done, total = 0, own + sum(runs)
+
+    def note() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total, {"phase": "ensemble"})
+
+    features = ensemble(simulation, starts(simulation, own, 0, start), tried, nodes, note)
+    if not np.isfinite(features).all():
+        raise InputError(
+            "a run of the ensemble blew up", where=simulation.system.name, remedy="Use a shorter time step"
+        )
+    spaces = [(Space.of(rows[:members]), limit_of(rows[:members])) for rows in features]
+    tables: list[list[Planted]] = [[] for _ in tried]
+    for number, change in enumerate(changes):
+        begin = starts(change.simulation, runs[number], 1 + number, start)
+        rows = ensemble(change.simulation, begin, tried, nodes, note)
+        for table, (space, limit), seen in zip(tables, spaces, rows, strict=True):
+            scores = triples(space.second(seen)) / limit
+            failures = int(np.count_nonzero(scores > 1))
+            scored = tuple(scores.tolist())
+            table.append(Planted(change.name, change.must_fail, failures, len(scores), scored))
+    windows = [
+        Window(step, *space, tuple(table)) for step, space, table in zip(tried, spaces, tables, strict=True)
+    ]
+    chosen = choose(windows, simulation.system.name)
+    seconds = chosen.space.second(features[windows.index(chosen)][members:]) if held_out else np.empty(0)
+    medians = triples(seconds)
+    alone, failed = (int(np.count_nonzero(values > chosen.limit)) for values in (seconds, medians))
+    return Calibration(nodes, chosen, held_out, alone, len(medians), failed)
+
+
+def choose(windows: Sequence[Window], name: str) -> Window:
+    """The latest window in which every planted change is clear, else the one that does it best.
+
+    Raises:
+        InputError: there is none.
+    """
+    good = [window for window in windows if window.ok and window.power > 1]
+    clear = [window for window in good if window.power >= _CLEAR]
+    if clear:
+        return clear[-1]
+    if good:
+        return max(good, key=lambda window: window.power)
+    steps = ", ".join(str(window.step) for window in windows)
+    best = max(windows, key=lambda window: sum(one.ok for one in window.table))
+    missed = ", ".join(
+        f"{one.change} {'passes' if one.must_fail else 'fails'} ({one.failures} of {one.tries} fail)"
+        for one in best.table
+        if not one.ok
+    )
+    raise InputError(
+        f"planted changes cannot be told from rounding after {steps} steps: after {best.step}, {missed}",
+        where=name,
+        remedy="Compare at an earlier step, before members have split, or start from a hotter fluid",
+    )
+
+
+def _windows(simulation: Simulation, start: Start | None) -> list[int]:
+    split = steps_to_diverge(simulation, start, _SPLIT * simulation.r_cut, seed=0) or _UNSPLIT
+    return sorted({max(1, round(share * split)) for share in _SHARES})
+
+
+# --- the verdict ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Benign:
+    """Whether B's runs belong to A's ensemble.
+
+    Attributes:
+        passed: whether they do.
+        window: step of the comparison.
+        components: how many principal components were compared.
+        limit: standard deviations beyond which one stands out.
+        scores: components of B's runs, in standard deviations of A's ensemble, shape (runs, components);
+            not a number for a run that blew up.
+        failing: features that give B away, by name, with the median over B's runs of their distance from A's
+            mean, in standard deviations of A's ensemble; the ones that matter most come first.
+        calibration: what the rule said of each planted change.
+        false_positive_rate: verdicts "fail" on A itself, expected from runs that were held out; not a number
+            where none were. Its exact 95 % interval is in `false_positive_bounds`.
+        false_positive_bounds: see there.
+        false_positives: verdicts "fail" that were counted, and of how many.
+    """
+
+    passed: bool
+    window: int
+    components: int
+    limit: float
+    scores: Float[np.ndarray, "runs components"]
+    failing: dict[str, float]
+    calibration: tuple[Planted, ...]
+    false_positive_rate: float
+    false_positive_bounds: tuple[float, float]
+    false_positives: tuple[int, int]
+
+
+def benign(
+    twin: Twin,
+    *,
+    steps: int | None = None,
+    calibration: Calibration | None = None,
+    progress: Progress | None = None,
+) -> Benign:
+    """Compare three runs of B with an ensemble of A.
+
+    B fails where two of the three have two or more principal components of their features beyond the limit.
+    Where it passes, the choice made no difference larger than the smallest noise of a start does.
+
+    Args:
+        twin: the programs. B's frame does not matter: no feature knows the labels of atoms or the axes.
+        steps: step of the comparison; default calibrated.
+        calibration: of A's ensemble, where there is one.
+        progress: called with runs done, runs in all, and figures.
+
+    Raises:
+        InputError: programs that cannot be compared, or no step at which planted changes are clear.
+    """
+    _check(twin)
+    found = calibration or calibrate(twin.a.simulation, start=twin.a.begin, steps=steps, progress=progress)
+    window, b = found.window, twin.b.simulation
+    begin = starts(b, RUNS, _SEED, twin.b.begin)
+    (rows,) = ensemble(b, begin, [window.step], found.nodes)
+    passed = bool(np.median(window.space.second(rows)) <= window.limit)
+    scores, whole = window.space.scores(rows), np.isfinite(rows).all(axis=1)
+    failing = {} if passed or not whole.any() else _failing(found, rows[whole], scores[whole])
+    return Benign(
+        passed,
+        window.step,
+        len(window.space.sigma),
+        window.limit,
+        scores,
+        failing,
+        window.table,
+        found.rate,
+        found.rate_bounds,
+        (found.false_positives, found.triples),
+    )
+
+
+def _check(twin: Twin) -> None:
+    """Refuse programs that an ensemble of one cannot judge the other by."""
+    twin.a.check(twin.b)
+    keys = [
+        np.asarray(jax.random.key_data(one.simulation.integrator.key))
+        if isinstance(one.simulation.integrator, Langevin)
+        else np.empty(0)
+        for one in (twin.a, twin.b)
+    ]
+    if not np.array_equal(keys[0], keys[1]):
+        raise InputError(
+            "the runs have different noise, so they diverge at the first step whatever else they do",
+            where="dynamics.seed",
+            remedy="Give both the same seed; runs of different seeds are compared by their averages",
+        )
+
+
+def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
+    """The features that the components beyond the limit are made of, by their share in them."""
+    space, limit = calibration.window.space, calibration.window.limit
+    z = np.median(space.standardized(rows), axis=0)
+    middle = np.median(scores, axis=0)
+    weight = np.where(np.abs(middle) > limit, middle / space.sigma, 0.0)
+    share = (weight @ space.axes) * z
+    names = feature_names(calibration.nodes)
+    telling = [k for k in np.argsort(-share) if share[k] > _TELLING * share.max()]
+    # none is where they are beyond the limit only together, as a sum of energies that is kept can be
+    chosen = [k for k in telling if abs(z[k]) > limit] or telling
+    return {names[k]: float(z[k]) for k in chosen[:_NAMED]}

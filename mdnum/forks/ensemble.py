@@ -1,0 +1,242 @@
+"""Ensembles: one program from starts that differ by a little noise, measured at a few steps; planted changes.
+
+Every feature is continuous in the positions, so that in a short run, where members of an ensemble differ by
+little, it differs by little too: pairs are counted with hats and not in boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.forks.reordered import ReorderedSimulation
+from mdnum.md.cell import displacement
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
+from mdnum.rollout.program import MdProgram
+from mdnum.systems.build import Simulation
+
+#: Hats of the pair histogram, which reaches so many times the cutoff, or to half the box.
+HATS, _REACH = 24, 1.5
+#: Displacement of the furthest atom of a start, in float32 ulps of the largest coordinate. An atom then
+#: moves by more than ten: the rounding of a single precision run must drown in it.
+NOISE = 40
+#: A pair of members is followed no further than this, and compared so often.
+_LONGEST, _EVERY = 20_000, 50
+#: What planted changes multiply the time step and the cutoff radii by.
+_TIMESTEP, _RADIUS = 1.025, 0.96
+
+_NUMBERS = (
+    "potential energy",
+    "kinetic energy",
+    "pressure",
+    "spread of the atoms' kinetic energies",
+    "skewness of the atoms' kinetic energies",
+    "root mean square force",
+    "fourth moment of the forces",
+)
+
+
+# --- features -------------------------------------------------------------------------------------------
+
+
+def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
+    """Distances at which the hats of the pair histogram peak, and where it ends, length, ascending.
+
+    From the closest pairs of a start to as far as pairs are counted.
+    """
+    half = float(np.min(simulation.cell.widths)) / 2
+    reach = min(half, _REACH * simulation.r_cut)
+    distances = pair_distances(simulation, np.asarray(start.state.x, np.float64).T, reach)
+    closest = float(np.quantile(distances, 0.01)) if len(distances) else 0.5 * reach
+    return np.linspace(closest, reach, HATS + 1)
+
+
+def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
+    """The features, in the order in which `measure` gives them."""
+    return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
+
+
+def measure(
+    simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
+) -> Float[np.ndarray, "features"]:
+    """The features at the last step of a segment, in the internal units of the system.
+
+    Energies, virial and forces are the run's own; pairs are counted by a list of their own.
+    """
+    potential, kinetic, virial = (
+        float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
+    )
+    x = segment.state.x_before
+    tables = simulation.tables(segment.table)
+    force = np.asarray(_forces(simulation.force, x[:, segment.table.order], tables), np.float64)
+    square = (force**2).sum(axis=0)
+    v = np.asarray(segment.state.v, np.float64)
+    each = 0.5 * simulation.masses * (v**2).sum(axis=0)
+    off = each - each.mean()
+    volume = simulation.cell.volume if all(simulation.pbc) else 1.0
+    numbers = [
+        potential,
+        kinetic,
+        (2 * kinetic + virial) / (3 * float(volume)),
+        np.sqrt(np.mean(off**2)),
+        np.cbrt(np.mean(off**3)),
+        np.sqrt(square.mean()),
+        np.mean(square**2) ** 0.25,
+    ]
+    distances = pair_distances(simulation, np.asarray(x, np.float64).T, float(nodes[-1]))
+    return np.concatenate([np.asarray(numbers, np.float64), hats(distances, nodes)])
+
+
+@eqx.filter_jit
+def _forces(force, x, tables):
+    return force(x, tables, decisions=False).force
+
+
+def pair_distances(
+    simulation: Simulation, x: Float[np.ndarray, "atoms 3"], reach: float
+) -> Float[np.ndarray, "pairs"]:
+    """Distances of the pairs of wrapped positions that are closer than `reach`, length."""
+    table = VerletList(BUILDERS["host"], RebuildRule(0.0), reach).build(x, simulation.cell)
+    slots, columns = np.nonzero(table.index < len(x))
+    i, j = table.order[columns], table.order[table.index[slots, columns]]
+    once = i < j
+    dx, dy, dz = displacement(simulation.cell, x[i[once]], x[j[once]])
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+def hats(
+    distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
+) -> Float[np.ndarray, "hats"]:
+    """A histogram in which a distance between two nodes counts for both, by how near it is to each.
+
+    Distances below the first node count for it; the last node only ends the histogram, so that a pair that
+    leaves does not jump.
+    """
+    width = nodes[1] - nodes[0]
+    place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
+    below = np.minimum(place.astype(np.int64), len(nodes) - 2)
+    part = place - below
+    counts = np.bincount(below, 1.0 - part, len(nodes)) + np.bincount(below + 1, part, len(nodes))
+    return counts[:-1]
+
+
+# --- runs -----------------------------------------------------------------------------------------------
+
+
+def noise_size(simulation: Simulation) -> float:
+    """Displacement of the furthest atom of a start, length."""
+    largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
+    return NOISE * float(np.spacing(np.float32(largest)))
+
+
+def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
+    """Starts of an ensemble: the simulation's own, each with other noise."""
+    programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
+    return [program.start for program in programs]
+
+
+def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
+    """The segments of a run that end with each of some steps, ascending; they end where it blows up."""
+    for step in steps:
+        for segment in Engine(simulation, step, start=start, record=False).segments():
+            if segment.closes in FAILURES:
+                return
+        yield segment
+        start = resume_point(segment)
+
+
+def ensemble(
+    simulation: Simulation,
+    begin: Sequence[Start],
+    windows: Sequence[int],
+    nodes: Float[np.ndarray, "nodes"],
+    note: Callable[[], None] | None = None,
+) -> Float[np.ndarray, "windows runs features"]:
+    """Features of every run at every window; not a number from where a run blew up.
+
+    Args:
+        simulation: the program.
+        begin: a start for each run.
+        windows: steps, ascending.
+        nodes: of the comparison, see `nodes_of`.
+        note: called after each run.
+    """
+    out = np.full((len(windows), len(begin), len(feature_names(nodes))), np.nan)
+    slots = 0
+    for run, start in enumerate(begin):
+        # with the capacity of the lists before, so that every member uses one compiled program
+        start = replace(start, slots=max(start.slots, slots))
+        for w, segment in enumerate(stretches(simulation, start, windows)):
+            slots = segment.table.slots
+            out[w, run] = measure(simulation, segment, nodes)
+        if note is not None:
+            note()
+    return out
+
+
+def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
+    """The step at which two members of an ensemble are a given length from each other.
+
+    None where they are not within 20,000 steps, or blow up.
+    """
+    steps = range(_EVERY, _LONGEST + 1, _EVERY)
+    pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
+    for step, *segments in zip(steps, *pair, strict=False):
+        a, b = (np.asarray(segment.state.x, np.float64) for segment in segments)
+        d = simulation.cell.minimum_image(*(a - b))
+        if float(np.sqrt(sum(np.asarray(c) ** 2 for c in d)).max()) > separation:
+            return step
+    return None
+
+
+# --- planted changes ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Change:
+    """A program that is changed on purpose.
+
+    Attributes:
+        name: of the change, for readers.
+        must_fail: whether it is another model; else only other rounding.
+        simulation: the changed program.
+        once: whether one verdict on it is enough, because its runs take long.
+    """
+
+    name: str
+    must_fail: bool
+    simulation: Simulation
+    once: bool = False
+
+
+def planted(a: Simulation) -> tuple[Change, ...]:
+    """The changes that apply to a simulation: a longer time step and a shorter cutoff, which must fail;
+    forces in the other precision, pairs in another order and lists by the other search, which must pass.
+
+    The cutoff and the precision of a many-body potential cannot be changed, so those are left out.
+    """
+    longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
+    search = next(name for name in BUILDERS if name != a.builder)
+    changes = [Change("time step + 2.5 %", True, replace(a, integrator=longer))]
+    if a.pairwise:
+        changes.append(Change("cutoff - 4 %", True, shorter(a, _RADIUS)))
+        other = "float32" if a.policy.dtype("force") == np.float64 else "float64"
+        rounded = replace(a, policy=replace(a.policy, force=other))
+        changes.append(Change(f"forces in {other}", False, rounded))
+    changes.append(Change("pairs in another order", False, ReorderedSimulation.of(a, 1)))
+    changes.append(Change(f"lists by {search}", False, replace(a, builder=search), once=True))
+    return tuple(changes)
+
+
+def shorter(a: Simulation, factor: float) -> Simulation:
+    """The same simulation with all its cutoff radii, and where a switch sets in, scaled."""
+    model = eqx.tree_at(
+        lambda one: (one.r_cut, one.r_onset), a.model, (a.model.r_cut * factor, a.model.r_onset * factor)
+    )
+    radii = tuple(factor * r for r in a.decider.r_cut)
+    return replace(a, model=model, decider=replace(a.decider, r_cut=radii))

@@ -1,0 +1,538 @@
+"""The linearized run: how a small perturbation of the start grows along a run, and which decisions it flips.
+
+The tangent is carried along the states that the run itself recorded, so the run that is linearized is the
+run that was made, bit for bit, list after list. Its growth is the largest Lyapunov exponent: it is rescaled
+again and again (Benettin, Galgani, Giorgilli and Strelcyn 1980), so it never saturates, as the separation of
+two runs does.
+
+Along the run each decision has a margin m and a tangent dm/da, a being the amplitude of the perturbation:
+to first order it flips at a = -m / (dm/da). The least of these at each step answers for all amplitudes at
+once, as long as the perturbed run stays close to the run and makes the same decisions. Where the force jumps
+at the cutoff, the first flip kicks the two atoms, and what was linearized is another run from there on: the
+forecast ends with it. Where the force is continuous there, a flip changes nothing to first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from mdnum.errors import InputError
+from mdnum.md.pairforce import MdState, PairDynamics, PairForce
+from mdnum.numerics.verdicts import Growth
+from mdnum.rollout.engine import FAILURES, Engine, Segment
+from mdnum.systems.build import Simulation
+
+#: Share of a run in which the tangent turns to the direction that grows fastest.
+_TRANSIENT = 0.2
+#: Blocks that the error is estimated from.
+_BLOCKS = 8
+#: A rate counts where it is so many times its error.
+_SIGNIFICANT = 4.0
+#: Decisions of a step that are kept: those which the perturbation reaches first.
+KEPT = 3
+#: Time steps by which velocities are multiplied where a length of the tangent is asked for.
+_CLOCK = 30
+#: Beyond this displacement, as a share of the cutoff, a forecast is not to be relied on. Measured on argon's
+#: crystal: every first flip was predicted up to 0.006, one of two at 0.02, none of six late ones at 0.04.
+LINEAR = 5e-3
+#: How far off the amplitude of a flip may be, as a share of it, for each cutoff of displacement. Measured on
+#: a crystal, cold, warm and with a continuous force, and a liquid: 196 at most in 304 decisions, 15 in seven
+#: of eight; it is large where a pair moves across its axis and hardly along it.
+_SECOND_ORDER = 200.0
+#: Rounding perturbs a run by no more than so many ulps of its start.
+_ULPS = 8.0
+
+
+@dataclass(frozen=True)
+class StepTangents:
+    """The tangent along some steps of one list.
+
+    Attributes:
+        segment: the steps.
+        size: log of the length of the tangent (positions, and velocities times 30 time steps) at each step,
+            relative to its length at the start, shape (rows,).
+        furthest: largest displacement of an atom per amplitude, at each step, as its log, shape (rows,).
+        reach: amplitude at which the nearest decisions of each step flip, by sign of the amplitude: first
+            axis 0 for positive, 1 for negative amplitudes; shape (2, rows, KEPT). Infinite where there is
+            none.
+        pairs: i, j of those decisions (i < j; -1 where there is none), shape (2, rows, KEPT, 2).
+        margins: of those decisions, in the quantity's space, same shape as `reach`.
+        moved: largest displacement since the list was built, at each step, length, shape (rows,).
+    """
+
+    segment: Segment
+    size: Float[np.ndarray, "rows"]
+    furthest: Float[np.ndarray, "rows"]
+    reach: Float[np.ndarray, "signs rows kept"]
+    pairs: Int[np.ndarray, "signs rows kept ends"]
+    margins: Float[np.ndarray, "signs rows kept"]
+    moved: Float[np.ndarray, "rows"]
+
+
+def tangents(
+    simulation: Simulation,
+    steps: int,
+    dx: Float[np.ndarray, "atoms 3"],
+    dv: Float[np.ndarray, "atoms 3"],
+    reach: bool = True,
+) -> Iterator[StepTangents]:
+    """Carry a perturbation of the start along a run.
+
+    Args:
+        simulation: the system as objects, with a pair potential.
+        steps: last step.
+        dx: perturbation of the positions per amplitude, length. dv: of the velocities.
+        reach: whether to ask for the amplitudes at which decisions flip.
+
+    Raises:
+        InputError: a many-body potential.
+    """
+    force = simulation.smooth.force
+    if not isinstance(force, PairForce):
+        raise InputError(
+            "decisions cannot be imposed on a many-body potential",
+            remedy="Linearize a system with a pair potential",
+        )
+    dtype, clock = simulation.policy.dtype("state"), _CLOCK * float(simulation.integrator.timestep)
+    shift = 0.0
+    tangent = np.asarray(dx, np.float64).T, np.asarray(dv, np.float64).T
+    first = _length(tangent, clock)
+    if not (np.isfinite(first) and first > 0):
+        raise InputError("the perturbation is nothing", remedy="Give a direction that is not zero")
+    for segment in Engine(simulation, steps).segments():
+        order = segment.table.order
+        tables = simulation.tables(segment.table)
+        dynamics = PairDynamics(force, simulation.integrator, jnp.asarray(simulation.masses[order]), tables)
+        # of full length, so that every stretch of one kind of list is one compiled program
+        rows = jnp.arange(segment.record.bits.shape[0]) < segment.rows
+        end, out = _carry(
+            dynamics,
+            jnp.asarray(segment.first),
+            (jnp.asarray(segment.record.x), jnp.asarray(segment.record.v), jnp.asarray(segment.record.bits)),
+            rows,
+            (jnp.asarray(tangent[0][:, order], dtype), jnp.asarray(tangent[1][:, order], dtype)),
+            jnp.asarray(np.float64(clock)),
+            reach,
+        )
+        length, most, amplitude, slot, near = (np.asarray(part)[: segment.rows] for part in out)
+        with np.errstate(divide="ignore"):
+            size = np.log(length.astype(np.float64)) + shift - np.log(first)
+            furthest = np.log(most.astype(np.float64)) + shift
+        yield StepTangents(
+            segment,
+            size,
+            furthest,
+            np.swapaxes(amplitude.astype(np.float64) * np.exp(-shift), 0, 1),
+            np.swapaxes(_labels(segment, slot, amplitude), 0, 1),
+            np.swapaxes(near.astype(np.float64), 0, 1),
+            np.array(segment.rows_of("moved")),
+        )
+        if segment.closes in FAILURES:
+            return
+        tangent = tuple(_unsorted(np.asarray(part, np.float64), order) for part in end)
+        # carried at length 1, so that no length overflows, however long the run
+        now = _length(tangent, clock)
+        tangent = tuple(part / now for part in tangent)
+        shift += float(np.log(now))
+
+
+def _joined(parts: list[StepTangents], name: str, axis: int = 0) -> np.ndarray:
+    return np.concatenate([getattr(part, name) for part in parts], axis)
+
+
+def _length(tangent, clock: float) -> float:
+    x, v = tangent
+    return float(np.sqrt(np.sum(x * x) + clock * clock * np.sum(v * v)))
+
+
+def _unsorted(part: np.ndarray, order: np.ndarray) -> np.ndarray:
+    out = np.empty_like(part)
+    out[:, order] = part
+    return out
+
+
+def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """The pairs of flat slots, -1 where there is none."""
+    order = segment.table.order
+    row, column = np.divmod(slot, len(order))
+    ends = np.stack([order[column], np.append(order, -1)[segment.table.index[row, column]]], axis=-1)
+    return np.where(np.isfinite(amplitude)[..., None], np.sort(ends, axis=-1), -1)
+
+
+@eqx.filter_jit
+def _carry(
+    dynamics: PairDynamics,
+    first: Int[Array, ""],
+    recorded: tuple[
+        Float[Array, "rows 3 atoms"], Float[Array, "rows 3 atoms"], UInt8[Array, "rows words atoms"]
+    ],
+    used: Array,
+    tangent: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]],
+    clock: Float[Array, ""],
+    reach: bool,
+):
+    order = dynamics.tables.order
+    atoms = order.shape[0]
+    index = dynamics.tables.index.reshape(-1, atoms)
+    # each pair from one end alone; padding points beyond the last atom and is dropped by its margin
+    once = order[None, :] < jnp.append(order, jnp.zeros((), order.dtype))[index]
+
+    def decide(state, dx):
+        margins, change = jax.jvp(lambda x: dynamics.margins(state._replace(x=x)), (state.x,), (dx,))
+        margins, change = margins.reshape(-1, atoms), change.reshape(-1, atoms)
+        amplitude = -margins / change
+        amplitude = jnp.where(once & jnp.isfinite(amplitude), amplitude, jnp.inf)
+
+        def nearest(signed):
+            value, place = lax.top_k(-jnp.where(signed >= 0, signed, jnp.inf).reshape(-1), KEPT)
+            return -value, place, margins.reshape(-1)[place]
+
+        ends = [nearest(amplitude), nearest(jnp.where(jnp.isfinite(amplitude), -amplitude, jnp.inf))]
+        return tuple(jnp.stack(parts) for parts in zip(*ends, strict=True))
+
+    def step(carry, row):
+        dx, dv = carry
+        number, x, v, bits, use = row
+        state = MdState(number, x, v)
+        length = jnp.sqrt(jnp.sum(dx * dx) + (clock * clock).astype(dx.dtype) * jnp.sum(dv * dv))
+        furthest = jnp.sqrt(jnp.max(jnp.sum(dx * dx, axis=0)))
+        if reach:
+            near = decide(state, dx)
+        else:
+            none = jnp.full((2, KEPT), jnp.inf, dx.dtype)
+            near = none, jnp.zeros((2, KEPT), jnp.int32), none
+
+        def advance(x, v):
+            after = dynamics.step(MdState(number, x, v), bits)
+            return after.x, after.v
+
+        _, after = jax.jvp(advance, (x, v), (dx, dv))
+        carry = tuple(jnp.where(use, new, old) for new, old in zip(after, carry, strict=True))
+        return carry, (length, furthest, *near)
+
+    x, v, bits = recorded
+    numbers = first + jnp.arange(x.shape[0])
+    return lax.scan(step, tangent, (numbers, x, v, bits, used))
+
+
+# --- Lyapunov exponents -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lyapunov:
+    """Growth of a tangent along a run.
+
+    Attributes:
+        steps, timestep: of the run; the time step in the units of the system's file.
+        rate: the exponent, per step. error: its standard error, from blocks of the run.
+        size: log of the length of the tangent at each step, relative to its start, shape (steps + 1,).
+        furthest: displacement of the furthest atom at each step per displacement of the furthest atom at the
+            start, as its log, shape (steps + 1,).
+        transient: steps left out at the start.
+        chaotic: whether the rate is above what linear growth (a perturbation of speeds, or of a frequency)
+            would give in so many steps, and above four times its error.
+    """
+
+    steps: int
+    timestep: float
+    rate: float
+    error: float
+    size: Float[np.ndarray, "rows"]
+    furthest: Float[np.ndarray, "rows"]
+    transient: int
+    chaotic: bool
+
+    @property
+    def rate_time(self) -> float:
+        """The exponent per unit of time of the system's file."""
+        return self.rate / self.timestep
+
+    @property
+    def error_time(self) -> float:
+        """Its standard error."""
+        return self.error / self.timestep
+
+    def ratio(self, seen: Growth) -> float:
+        """Growth rate of two runs over the exponent; NaN where they were not seen to grow.
+
+        Near 1 the runs diverged as the motion makes them. Well above it, their flips did it.
+        """
+        return seen.rate / self.rate if self.chaotic else float("nan")
+
+    def steps_to(self, start: float, end: float) -> float | None:
+        """The step at which a displacement of the start has grown from one size to another.
+
+        From the run itself as far as it goes, beyond it at the rate. None where it does not get there: where
+        the run is not chaotic.
+
+        Args:
+            start: largest displacement of an atom at the start, length; an ulp, for example.
+            end: largest displacement asked for, length.
+        """
+        wanted = float(np.log(end / start))
+        beyond = self.furthest >= wanted
+        if beyond.any():
+            return float(beyond.argmax())
+        if not self.chaotic:
+            return None
+        return self.steps + (wanted - float(self.furthest[-1])) / self.rate
+
+
+def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0) -> Lyapunov:
+    """The largest Lyapunov exponent along a run.
+
+    Args:
+        simulation: the system as objects, with a pair potential.
+        steps: last step; default the system's own.
+        seed: of the perturbation that is followed: random displacements.
+
+    Raises:
+        InputError: a many-body potential, or too few steps for an error.
+
+    Error: statistical, see Lyapunov.error; and flips of a hard cutoff do not act on a tangent, so growth that
+        is made by flips alone is not in it.
+    """
+    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    if last < 10 * _BLOCKS:
+        raise InputError(
+            f"steps = {last} are too few for a growth rate", remedy=f"Give at least {10 * _BLOCKS}"
+        )
+    dx = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
+    dx -= dx.mean(axis=0)
+    step = float(simulation.integrator.timestep)
+    parts = list(tangents(simulation, last, dx, np.zeros_like(dx), reach=False))
+    size, furthest = _joined(parts, "size"), _joined(parts, "furthest")
+    first = int(_TRANSIENT * last)
+    edges = np.linspace(first, len(size) - 1, _BLOCKS + 1).astype(int)
+    slopes = np.diff(size[edges]) / np.diff(edges)
+    rate = float((size[-1] - size[first]) / (len(size) - 1 - first))
+    error = float(slopes.std(ddof=1) / np.sqrt(_BLOCKS))
+    # what grows in proportion to the steps gains log(end / first) over this stretch
+    linear = float(np.log((len(size) - 1) / max(first, 1))) / (len(size) - 1 - first)
+    return Lyapunov(
+        last,
+        step / simulation.units.time_factor,
+        rate,
+        error,
+        size,
+        furthest - float(np.log(np.sqrt((dx**2).sum(axis=1)).max())),
+        first,
+        rate > 2 * linear and rate > _SIGNIFICANT * error,
+    )
+
+
+# --- forecasts ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PredictedFlip:
+    """A decision that a perturbation is expected to flip.
+
+    Attributes:
+        step, i, j: of the decision, i < j.
+        amplitude: at which it flips, with its sign.
+        margin: of the unperturbed run, in the quantity's space.
+        ulps: that amplitude, in ulps of the largest start coordinate.
+    """
+
+    step: int
+    i: int
+    j: int
+    amplitude: float
+    margin: float
+    ulps: float
+
+
+class ForecastRange(NamedTuple):
+    """How far a forecast is good for one amplitude.
+
+    Attributes:
+        step: the last one; -1 for none.
+        ends: why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision
+            of the next step flips is within the error; "size", the displacement is too large from then on;
+            "list", a pair that was not examined could come inside.
+    """
+
+    step: int
+    ends: str
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What perturbations of the start along one direction will flip, to first order.
+
+    Attributes:
+        simulation, steps: the run.
+        dx, dv: the direction: change of positions (length) and velocities per amplitude, shape (atoms, 3).
+        reach: amplitude at which the nearest decisions of each step flip, for positive and negative
+            amplitudes, shape (2, steps + 1, KEPT).
+        pairs: of those decisions, shape (2, steps + 1, KEPT, 2); margins: theirs, as `reach`.
+        furthest: displacement of the furthest atom per amplitude at each step, shape (steps + 1,).
+        ulp: spacing of the floats at the largest start coordinate, length.
+        listed: pairs that were examined, those of the list, at each step, shape (steps + 1,).
+        room: how much nearer to the cutoff than in the run a pair would have to be that was not examined,
+            length, shape (steps + 1,).
+
+    Error: second order in the displacement, and some ulps; a decision that may flip or not within it is not
+        predicted. `good_until` says how far a forecast goes.
+    """
+
+    simulation: Simulation
+    steps: int
+    dx: Float[np.ndarray, "atoms 3"]
+    dv: Float[np.ndarray, "atoms 3"]
+    reach: Float[np.ndarray, "signs rows kept"]
+    pairs: Int[np.ndarray, "signs rows kept ends"]
+    margins: Float[np.ndarray, "signs rows kept"]
+    furthest: Float[np.ndarray, "rows"]
+    ulp: float
+    listed: Int[np.ndarray, "rows"]
+    room: Float[np.ndarray, "rows"]
+
+    @property
+    def kicks(self) -> bool:
+        """Whether a flip changes the force by a jump, and with it all that follows."""
+        return self.simulation.cutoff.smoothness < 1
+
+    def good_until(self, amplitude: float) -> ForecastRange:
+        """Up to which step what is predicted of a perturbation holds, and why not beyond."""
+        listed = self._until(2 * abs(amplitude) * self.furthest > self.room)
+        ends = ((self.steps, "end"), (self.linear_until(amplitude), "size"), (listed, "list"))
+        last = min((ForecastRange(*end) for end in ends), key=lambda one: one.step)
+        if self.kicks:
+            nearest = self.reach[0 if amplitude >= 0 else 1].min(axis=1)
+            error = self._error(amplitude)
+            near = np.flatnonzero(nearest[: last.step + 1] <= abs(amplitude) * (1 + error[: last.step + 1]))
+            if len(near):
+                step = int(near[0])
+                sure = nearest[step] <= abs(amplitude) * (1 - error[step])
+                return ForecastRange(step, "flip") if sure else ForecastRange(step - 1, "close")
+        return last
+
+    def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
+        """The decisions that a perturbation flips first, by step, each pair once; no further than it is good.
+
+        At most `KEPT` of a step; where there are as many, there may be more.
+
+        Args:
+            amplitude: of the perturbation; its sign matters.
+            count: how many at most.
+        """
+        sign = 0 if amplitude >= 0 else 1
+        sure = self.reach[sign] <= abs(amplitude) * (1 - self._error(amplitude))[:, None]
+        rows, places = np.nonzero(sure[: self.good_until(amplitude).step + 1])
+        flips = (
+            self._flip(sign, row, place) for row, place in zip(rows.tolist(), places.tolist(), strict=True)
+        )
+        return _each_pair_once(flips, count)
+
+    def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
+        """The decisions that the smallest amplitudes of either sign flip, each pair once.
+
+        Each at an amplitude at which its forecast is good until then: where flips kick, one that comes after
+        another one is predicted for no amplitude.
+        """
+        # where flips kick, only what flips sooner or at less than all before it can be the first
+        least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
+        first = self.reach <= least[:, :, None] if self.kicks else np.isfinite(self.reach)
+        flats = np.flatnonzero(first & np.isfinite(self.reach))
+        flats = flats[np.argsort(self.reach.reshape(-1)[flats], kind="stable")]
+        places = (map(int, np.unravel_index(flat, self.reach.shape)) for flat in flats)
+        flips = (self._flip(*place) for place in places)
+        # its own flip is within the error of its own amplitude, and ends the range a step before
+        good = (flip for flip in flips if self.good_until(flip.amplitude).step >= flip.step - 1)
+        return _each_pair_once(good, count)
+
+    def linear_until(self, amplitude: float) -> int:
+        """The last step at which a perturbation is expected to be small enough for a forecast."""
+        return self._until(abs(amplitude) * self.furthest > LINEAR * self.simulation.r_cut)
+
+    def _until(self, beyond: Bool[np.ndarray, "rows"]) -> int:
+        return int(beyond.argmax()) - 1 if beyond.any() else self.steps
+
+    def _error(self, amplitude: float) -> Float[np.ndarray, "rows"]:
+        """How far off the amplitude of a flip may be, as a share of this one."""
+        size = abs(amplitude)
+        with np.errstate(divide="ignore", over="ignore"):
+            return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size
+
+    def _flip(self, sign: int, row: int, place: int) -> PredictedFlip:
+        i, j = (int(end) for end in self.pairs[sign, row, place])
+        amplitude = float(self.reach[sign, row, place]) * (1 if sign == 0 else -1)
+        largest = float(np.sqrt((self.dx**2).sum(axis=1)).max()) or 1.0
+        margins = float(self.margins[sign, row, place])
+        return PredictedFlip(row, i, j, amplitude, margins, abs(amplitude) * largest / self.ulp)
+
+
+def _each_pair_once(flips: Iterable[PredictedFlip], count: int) -> tuple[PredictedFlip, ...]:
+    """The first flips, at most so many, without another one of a pair."""
+    found: dict[tuple[int, int], PredictedFlip] = {}
+    for flip in flips:
+        found.setdefault((flip.i, flip.j), flip)
+        if len(found) == count:
+            break
+    return tuple(found.values())
+
+
+def forecast(
+    simulation: Simulation,
+    steps: int | None = None,
+    dx: Float[np.ndarray, "atoms 3"] | None = None,
+    dv: Float[np.ndarray, "atoms 3"] | None = None,
+    *,
+    seed: int = 0,
+) -> Forecast:
+    """Foretell flips along a direction in the start.
+
+    Args:
+        simulation: the system as objects, with a pair potential.
+        steps: last step; default the system's own.
+        dx, dv: the direction; default random displacements, the furthest by 1, so that an amplitude is the
+            largest displacement.
+        seed: of a random direction.
+
+    Raises:
+        InputError: a many-body potential, a direction that is zero or of the wrong shape.
+    """
+    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    shape = simulation.positions.shape
+    if dx is None and dv is None:
+        dx = direction(simulation, seed)
+    change = [np.zeros(shape) if part is None else np.asarray(part, np.float64) for part in (dx, dv)]
+    if any(part.shape != shape for part in change):
+        raise InputError(f"a direction has the shape of the start, {shape}")
+    dx, dv = change
+    parts = list(tangents(simulation, last, dx, dv))
+    tables = [part.segment.table for part in parts]
+    listed = [np.full(len(part.size), table.pairs) for part, table in zip(parts, tables, strict=True)]
+    largest = np.abs(np.asarray(simulation.positions)).max()
+    return Forecast(
+        simulation,
+        last,
+        dx,
+        dv,
+        _joined(parts, "reach", 1),
+        _joined(parts, "pairs", 1),
+        _joined(parts, "margins", 1),
+        np.exp(_joined(parts, "furthest")),
+        float(np.spacing(np.asarray(largest, simulation.policy.dtype("state")))),
+        np.concatenate(listed),
+        simulation.rule.skin - 2 * _joined(parts, "moved"),
+    )
+
+
+def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]:
+    """Random displacements, the furthest atom by 1."""
+    noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
+    return noise / np.sqrt((noise**2).sum(axis=1)).max()

@@ -1,0 +1,492 @@
+"""What processes of their own compute for forks: histories again, and one system by several programs.
+
+Compiled or not, in a batch, inside a gradient, for other processors: programs of one system compute the same
+formulas, and the compiler is free to round them otherwise. XLA's flags belong to a process, so each variant
+runs in one of its own. Variants whose positions have the same hashes at every step are one program as far as
+numbers go; where they are not, the pattern of who agrees with whom tells the cause.
+
+`python -m mdnum.forks.processes FILE` answers the question in a JSON file: digests, a line each, on standard
+output for `digests_elsewhere`; an array of positions for `variants`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Lock, Timer
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError, MdnumError
+from mdnum.forks.worlds import program_of, varied
+from mdnum.safe_path import environment, python
+from mdnum.systems import BallSystem, System, load
+
+ProgramName = Literal["scan", "rollout", "vmap", "grad", "eager"]
+
+#: Steps of the eager program: operation by operation, a step takes a hundred times as long.
+_EAGER_STEPS = 12
+#: Copies in a batch.
+_BATCH = 4
+#: Variants that run at a time, and how long one may take, s.
+_PROCESSES, _TIMEOUT = 2, 600
+_NO_FMA = ("--xla_cpu_max_isa=AVX",)
+
+
+# --- variants of one system -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to run the same steps.
+
+    Attributes:
+        name: what to call it.
+        program: "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal
+            copies), "grad" (the primal inside value_and_grad) or "eager" (operation by operation).
+        flags: of XLA.
+        reduction: order of the force sums; None for the system's own.
+    """
+
+    name: str
+    program: ProgramName = "scan"
+    flags: tuple[str, ...] = ()
+    reduction: str | None = None
+
+
+REFERENCE = Variant("scan")
+VARIANTS: tuple[Variant, ...] = (
+    REFERENCE,
+    Variant("rollout", "rollout"),
+    Variant("vmap", "vmap"),
+    Variant("grad", "grad"),
+    Variant("eager", "eager"),
+    Variant("AVX", flags=_NO_FMA),
+    Variant("SSE4.2", flags=("--xla_cpu_max_isa=SSE4_2",)),
+    Variant("unoptimized", flags=("--xla_backend_optimization_level=0",)),
+    Variant("rollout, AVX", "rollout", _NO_FMA),
+    Variant("vmap, AVX", "vmap", _NO_FMA),
+    Variant("grad, AVX", "grad", _NO_FMA),
+    Variant("reversed", reduction="reversed"),
+)
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What became of a variant.
+
+    Attributes:
+        variant: which.
+        hashes: of the positions at steps 1, 2, ..., hexadecimal; empty where it failed.
+        failed: the last line that a failed process said.
+        seconds: of its process.
+        cluster: number of the variants that agree with it, from 0; -1 where it failed.
+        first_bit: first step whose positions are not those of the reference; None where all are.
+        separations: largest distance from the reference's atoms at steps 1, 2, ..., as far as both ran,
+            length.
+    """
+
+    variant: Variant
+    hashes: tuple[str, ...]
+    failed: str = ""
+    seconds: float = 0.0
+    cluster: int = -1
+    first_bit: int | None = None
+    separations: Float[np.ndarray, "steps"] = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def separation(self) -> float:
+        """From the reference's atoms at the last common step; NaN where it failed."""
+        return float(self.separations[-1]) if len(self.separations) else float("nan")
+
+    def agrees(self, other: Ran) -> bool:
+        """Whether both have the same positions, as far as both ran."""
+        common = min(len(self.hashes), len(other.hashes))
+        return common > 0 and self.hashes[:common] == other.hashes[:common]
+
+
+@dataclass(frozen=True)
+class Variants:
+    """Variants of one system, by what they compute.
+
+    Attributes:
+        rows: one a variant, in the order asked for.
+        reference: name of the one that the others are compared with: the first that ran.
+        steps: that it ran.
+        causes: what tells the clusters apart: codes and their values (see `causes_of`).
+    """
+
+    rows: tuple[Ran, ...]
+    reference: str
+    steps: int
+    causes: tuple[dict[str, Any], ...]
+
+    @property
+    def clusters(self) -> list[list[str]]:
+        """Names of the variants that agree with each other to the last bit, the reference's first."""
+        count = max(row.cluster for row in self.rows) + 1
+        return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
+
+
+def variants(
+    system: System,
+    steps: int = 200,
+    which: Sequence[Variant] = VARIANTS,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Variants:
+    """Run a system in several programs, two processes at a time, and tell which agree.
+
+    All use one list, as wide as twice the skin where the box has room, and stop before it is used up. On
+    another machine the clusters may be others: a processor without fused multiply-add has nothing to fuse.
+
+    Args:
+        system: as loaded; pair potentials only.
+        steps: of each program; the eager one takes a dozen.
+        which: the first one that runs is what the others are compared with; one that fails or takes too long
+            says so in its row.
+        progress: called with how many have ended, how many there are, and the name of the last.
+
+    Raises:
+        InputError: a many-body potential, no steps, or no variant.
+        MdnumError: none of them ran.
+    """
+    from mdnum.md.cell import Cell, displacement
+
+    if system.spec.cutoff is None:
+        raise InputError("variants of a many-body potential are not supported", where=system.name)
+    if steps < 1 or not which:
+        raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        # a system changed in memory is on no disk; what is written loads bit for bit
+        question = {"path": str(system.write(folder / "system")), "steps": steps}
+        done, count = 0, Lock()
+
+        def ran(k: int) -> tuple[Ran, np.ndarray | None]:
+            nonlocal done
+            found = _ran(which[k], question, folder / str(k))
+            with count:
+                done += 1
+                if progress is not None:
+                    progress(done, len(which), which[k].name)
+            return found
+
+        pool = ThreadPoolExecutor(_PROCESSES)
+        try:
+            found = list(pool.map(ran, range(len(which))))
+        finally:
+            # after a control-C no further process is started
+            pool.shutdown(cancel_futures=True)
+    reference, own = next(((row, x) for row, x in found if x is not None), (None, None))
+    if reference is None or own is None:
+        row = found[0][0]
+        raise MdnumError(f"no variant ran; {row.variant.name!r} said: {row.failed}")
+    cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
+
+    def furthest(one: np.ndarray, other: np.ndarray) -> float:
+        return float(np.sqrt(np.max(sum(c * c for c in displacement(cell, one.T, other.T)))))
+
+    rows = []
+    for row, x in found:
+        if x is not None:
+            hashes = enumerate(zip(row.hashes, reference.hashes, strict=False), 1)
+            first = next((step for step, (one, other) in hashes if one != other), None)
+            separations = [furthest(*places) for places in zip(own, x, strict=False)]
+            row = replace(row, first_bit=first, separations=np.array(separations))
+        rows.append(row)
+    rows = clustered(rows)
+    return Variants(tuple(rows), reference.variant.name, len(reference.hashes), tuple(causes_of(rows)))
+
+
+def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran, np.ndarray | None]:
+    out = str(file.with_suffix(".npy"))
+    asked = {**question, "program": variant.program, "reduction": variant.reduction, "out": out}
+    flags = " ".join([os.environ.get("XLA_FLAGS", ""), *variant.flags]).strip()
+    # a program cached by another variant must not answer for this one; these flags are a CPU's
+    settings = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    begin = time.perf_counter()
+    failed = _ask(asked, file.with_suffix(".json"), timeout=_TIMEOUT, settings=settings)
+    seconds = time.perf_counter() - begin
+    x = np.zeros(0) if failed else np.load(out)
+    if not len(x):
+        return Ran(variant, (), failed or "the skin was used up at once", seconds), None
+    hashes = tuple(hashlib.sha256(np.ascontiguousarray(row).tobytes()).hexdigest() for row in x)
+    return Ran(variant, hashes, "", seconds), x
+
+
+def clustered(rows: Sequence[Ran]) -> list[Ran]:
+    """The rows with the numbers of their clusters; that of the first one that ran, the reference, is 0."""
+    reference = next((row for row in rows if not row.failed), None)
+    # the longest of each cluster stands for it, so that a short run joins whom it agrees with
+    heads: list[Ran] = []
+    numbers: dict[str, int] = {}
+    for row in sorted(rows, key=lambda row: (row is not reference, -len(row.hashes))):
+        if not row.failed:
+            at = next((k for k, head in enumerate(heads) if row.agrees(head)), len(heads))
+            heads += [row] if at == len(heads) else []
+            numbers[row.variant.name] = at
+    return [replace(row, cluster=numbers.get(row.variant.name, -1)) for row in rows]
+
+
+def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
+    """What the pattern of agreement says, by code; nothing is said of variants that were not run.
+
+    "fused", "others" and "not_fused" of programs that cannot fuse or do not; "eager_..." of the one without a
+    compiler; "same", "fuses", "orders" and "leaves" of the others, whose name is in "program"; "reversed".
+    Where one leaves the reference, "step" says when.
+    """
+    by_name = {row.variant.name: row for row in rows if not row.failed}
+    reference = next(iter(by_name.values()))
+
+    def same(one: str, other: str) -> bool | None:
+        if one not in by_name or other not in by_name:
+            return None
+        return by_name[one].agrees(by_name[other])
+
+    def cause(code: str, name: str | None = None, **values: Any) -> dict[str, Any]:
+        return {"code": code, **({} if name is None else {"step": by_name[name].first_bit}), **values}
+
+    plain = [name for name in ("AVX", "SSE4.2", "unoptimized") if name in by_name]
+    fused = [name for name in plain if not by_name[name].agrees(reference)]
+    if len(plain) > 1 and fused == plain:
+        alike = all(same(plain[0], name) for name in plain[1:])
+        yield cause("fused", plain[0], names=plain) if alike else cause("others", names=plain)
+    elif plain and not fused:
+        yield cause("not_fused", names=plain)
+    alike, without = same("eager", "scan"), same("eager", "AVX")
+    if alike:
+        yield cause("eager_short" if without and fused else "eager_same")
+    elif without:
+        yield cause("eager_plain")
+    elif alike is False:
+        yield cause("eager_leaves", "eager")
+    for name in ("rollout", "vmap", "grad"):
+        alike, without = same(name, "scan"), same(f"{name}, AVX", "AVX")
+        if alike:
+            yield cause("same", program=name)
+        elif alike is False:
+            code = {True: "fuses", False: "orders", None: "leaves"}[without]
+            yield cause(code, name, program=name)
+    if same("reversed", "scan") is False:
+        yield cause("reversed", "reversed")
+
+
+def positions_of(system: System, steps: int, program: ProgramName) -> Float[np.ndarray, "steps 3 atoms"]:
+    """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
+
+    Ends before an atom has moved by half the skin of the one list.
+    """
+    from mdnum.md.cell import displacement
+    from mdnum.rollout.engine import Engine, first_state
+    from mdnum.systems.build import build
+
+    simulation = build(system)
+    room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
+    skin = min(2 * simulation.rule.skin, room)
+    simulation = replace(simulation, rule=replace(simulation.rule, skin=skin, check=True))
+    home = first_state(simulation).reference
+    if program == "rollout":
+        parts = []
+        for segment in Engine(simulation, steps).segments():
+            parts += [segment.unsorted("x", row).T for row in range(segment.rows)]
+        x = np.array(parts[1:])
+    else:
+        x = _stepped(simulation, steps, program)
+    moved = [np.max(sum(c * c for c in displacement(simulation.cell, home, row.T))) for row in x]
+    used = np.flatnonzero(np.sqrt(moved) > skin / 2)
+    return x[: used[0]] if len(used) else x
+
+
+def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
+    import jax
+    import jax.numpy as jnp
+    from jax import lax
+
+    from mdnum.md.pairforce import MdState, PairDynamics
+    from mdnum.rollout.engine import first_state
+
+    start = first_state(simulation)
+    table = simulation.verlet_list().build(start.reference, simulation.cell)
+    dynamics = PairDynamics(
+        simulation.force,
+        simulation.propagator,
+        jnp.asarray(simulation.masses[table.order]),
+        simulation.tables(table),
+    )
+    state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
+    leaves, structure = jax.tree.flatten(dynamics)
+
+    # the dynamics comes in as an argument: its fence is a number that the compiler must not know
+    def trajectory(leaves, x, v, count):
+        dynamics = jax.tree.unflatten(structure, leaves)
+
+        def body(state, _):
+            state = dynamics.step(state, dynamics.decide(state))
+            return state, state.x
+
+        return lax.scan(body, MdState(state.step, x, v), None, length=count)[1]
+
+    def loss(x, v, leaves):
+        path = trajectory(leaves, x, v, steps)
+        return jnp.mean(jnp.square(path[-1])), path
+
+    if program == "eager":
+        with jax.disable_jit():
+            x = trajectory(leaves, state.x, state.v, min(steps, _EAGER_STEPS))
+    elif program == "vmap":
+        copies = (jnp.stack([q] * _BATCH) for q in (state.x, state.v))
+        batched = jax.jit(jax.vmap(lambda leaves, x, v: trajectory(leaves, x, v, steps), (None, 0, 0)))
+        x = batched(leaves, *copies)[0]
+    elif program == "grad":
+        (_, x), _ = jax.jit(jax.value_and_grad(loss, has_aux=True))(state.x, state.v, leaves)
+    else:
+        x = jax.jit(trajectory, static_argnums=3)(leaves, state.x, state.v, steps)
+    ours = np.empty(x.shape, np.asarray(x).dtype)
+    ours[:, :, table.order] = np.asarray(x)
+    return ours
+
+
+# --- histories in a fresh process ---------------------------------------------------------------------
+
+
+def digests(system: System | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
+    """Digests of the histories at some values of a number, by the program that a user runs."""
+    number = program_of(system, steps).number(key)
+    return [number.proper(value).history(steps).digest for value in values]
+
+
+def digests_elsewhere(
+    system: System | BallSystem,
+    key: str,
+    steps: int,
+    values: Sequence[float],
+    progress: Callable[[int], None] | None = None,
+    *,
+    processes: int = 1,
+) -> list[str]:
+    """The same from a fresh process: what a boundary must survive before it is believed.
+
+    The system is written to a folder and read again there, bit for bit, and its program is compiled again,
+    under the same environment.
+
+    Args:
+        progress: called with how many are known, at the start and after each.
+        processes: that share the values; worth it where each value is another compiled program.
+
+    Raises:
+        MdnumError: a process failed.
+    """
+    done, lock = 0, Lock()
+
+    def count(more: int) -> None:
+        nonlocal done
+        with lock:
+            done += more
+            if progress is not None:
+                progress(done)
+
+    count(0)
+    size = -(-len(values) // processes)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        question = {"path": str(system.write(folder / "system")), "key": key, "steps": steps}
+
+        def answered(first: int) -> list[str]:
+            found: list[str] = []
+            part = [value.hex() for value in values[first : first + size]]
+
+            def heard(line: str) -> None:
+                found.append(line)
+                count(1)
+
+            failed = _ask({**question, "values": part}, folder / f"{first}.json", heard)
+            if failed or len(found) != len(part):
+                raise MdnumError(
+                    f"the process that was to confirm boundaries failed: {failed or 'no message'}",
+                    remedy="Run `mdnum doctor`",
+                )
+            return found
+
+        with ThreadPoolExecutor(max(1, processes)) as pool:
+            return [digest for part in pool.map(answered, range(0, len(values), size)) for digest in part]
+
+
+# --- asking and answering -----------------------------------------------------------------------------
+
+
+def _ask(
+    question: Mapping[str, Any],
+    file: Path,
+    heard: Callable[[str], None] = lambda line: None,
+    timeout: float | None = None,
+    settings: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Have a process answer a question; why it failed, "" where it did not.
+
+    Args:
+        file: the question is written to it.
+        heard: called with each line that it prints.
+        timeout: s.
+        settings: variables of its environment.
+    """
+    file.write_text(json.dumps(question))
+    command, late = python("-m", "mdnum.forks.processes", str(file)), []
+    # what it prints on stderr may be long, and nobody reads a pipe meanwhile
+    with tempfile.TemporaryFile("w+", errors="replace") as errors:
+        with subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=environment(**settings),
+        ) as process:
+            assert process.stdout is not None
+            timer = Timer(timeout or 0.0, lambda: (late.append(timeout), process.kill()))
+            try:
+                if timeout is not None:
+                    timer.start()
+                for line in process.stdout:
+                    heard(line.strip())
+            except BaseException:
+                process.kill()
+                raise
+            finally:
+                timer.cancel()
+        if not process.returncode:
+            return ""
+        errors.seek(0)
+        lines = [line.strip() for line in errors if line.strip()]
+    if late:
+        return f"took longer than {timeout:g} s"
+    return lines[-1] if lines else f"ended with exit code {process.returncode}"
+
+
+def main() -> None:
+    """Answer the question in the file that the last argument names."""
+    question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
+    system = load(question["path"])
+    if "values" in question:
+        for value in question["values"]:
+            print(*digests(system, question["key"], question["steps"], [float.fromhex(value)]), flush=True)
+        return
+    if question["reduction"]:
+        system = varied(system, {"precision.reduction": question["reduction"]})
+    assert isinstance(system, System)
+    np.save(question["out"], positions_of(system, question["steps"], question["program"]))
+
+
+if __name__ == "__main__":
+    main()

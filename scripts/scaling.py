@@ -1,0 +1,152 @@
+"""How do time, memory and the price of a flip grow with the system, and do two runs slow one another down?
+
+The Lennard-Jones liquid of LAMMPS's bench/in.lj (density 0.8442, r_cut 2.5, skin 0.3, float64), recorded,
+from 4,000 to 1,000,000 atoms. Every size is a process of its own on one core: a warm-up, then steps whose
+CPU time counts, with their flips decoded to ledger rows; the peak of its memory; and one neighbor search.
+Then the smallest size once more in as many processes at a time as there are cores.
+
+How to read it. What is flat is linear in the number of atoms: the slope over all sizes is the exponent of the
+growth, 1 for linear. Times depend on the machine and on what else it does, slopes hardly. `together` is the
+time of a step with all processes at work over that of one alone: above 1 they wait for memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _liquid import liquid
+from _output import figure, parser, save, say, start, table
+from _processes import machine, peak_mb
+
+#: Sizes, about, and CPU seconds that the steps of one should take, about.
+SIZES, SECONDS = (4_000, 32_000, 108_000, 256_000, 1_000_000), 8.0
+_EXPECTED = 1e-6  # CPU seconds of an atom's step, to choose how many steps that is
+_COLUMNS = ("atoms", "steps", "us_per_atom_step", "us_per_flip", "search_us_per_atom", "peak_mb")
+
+
+def measure(atoms: int, seconds: float) -> dict[str, float]:
+    """One size in this process: CPU time of an atom's step and of a flip, a search, and peak memory."""
+    from mdnum.md.cell import wrap_positions
+    from mdnum.rollout.engine import Engine
+    from mdnum.rollout.flips import PairRecorder
+    from mdnum.systems import build
+
+    simulation = build(liquid(atoms))
+    count = simulation.atoms
+    last = max(12, round(seconds / _EXPECTED / count))
+    recorder, flips, rows, began = PairRecorder(simulation), 0, 0, None
+    for segment in Engine(simulation, last + 4).segments():
+        recorder.counts(segment)
+        found = len(recorder.flips(segment))
+        if began is None:
+            # the first stretch holds the compilation
+            began = time.process_time()
+            continue
+        flips, rows = flips + found, rows + segment.rows
+    if began is None or not rows:
+        raise ValueError(f"{last} steps are over before the first list is")
+    taken = time.process_time() - began
+    wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
+    verlet = simulation.verlet_list()
+    verlet.build(wrapped, simulation.cell)
+    begin = time.process_time()
+    verlet.build(wrapped, simulation.cell)
+    search = time.process_time() - begin
+    return {
+        "atoms": count, "steps": rows, "us_per_atom_step": 1e6 * taken / rows / count,
+        "us_per_flip": 1e6 * taken / max(flips, 1), "search_us_per_atom": 1e6 * search / count,
+        "peak_mb": peak_mb(),
+    }  # fmt: skip
+
+
+def children(sizes: list[int], seconds: float, cores: list[int]) -> list[dict[str, float]]:
+    """Sizes measured at the same time, each in a process on a core of its own."""
+    runs = []
+    for atoms, core in zip(sizes, cores, strict=True):
+        words = [sys.executable, __file__, "--child", str(atoms), str(seconds), str(core)]
+        runs.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+    answers = [run.communicate()[0] for run in runs]
+    if any(run.returncode for run in runs):
+        raise RuntimeError("a process failed; its error is above")
+    return [json.loads(answer.splitlines()[-1]) for answer in answers]
+
+
+def slope(rows: list[dict[str, float]], name: str) -> float:
+    """Exponent of the growth with the number of atoms: of a whole step, a whole search, all memory."""
+    atoms = np.log([row["atoms"] for row in rows])
+    each = 0.0 if name == "peak_mb" else atoms
+    return float(np.polyfit(atoms, np.log([row[name] for row in rows]) + each, 1)[0])
+
+
+def draw(rows: list[dict[str, float]], path: Path) -> None:
+    """Time of an atom's step and memory against the number of atoms."""
+    drawn = figure(8.0, 3.4)
+    left, right = drawn.subplots(1, 2)
+    atoms = [row["atoms"] for row in rows]
+    for name, label in (("us_per_atom_step", "step, recorded"), ("search_us_per_atom", "neighbor search")):
+        growth = slope(rows, name)
+        left.plot(atoms, [row[name] for row in rows], "o-", label=f"{label}: N^{growth:.2f}")
+    left.set_ylabel("CPU time per atom (µs)")
+    right.plot(atoms, [row["peak_mb"] for row in rows], "o-", label=f"N^{slope(rows, 'peak_mb'):.2f}")
+    right.set_ylabel("peak memory (MB)")
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("atoms")
+        axes.legend()
+    save(drawn, path)
+
+
+def _options() -> argparse.Namespace:
+    made = parser(__file__, __doc__)
+    made.add_argument("--sizes", nargs="+", type=int, metavar="N", default=list(SIZES), help="atoms, about")
+    made.add_argument("--seconds", type=float, default=SECONDS, help="CPU time of a size's steps, about")
+    made.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
+    return made.parse_args()
+
+
+def main() -> None:
+    """Measure each size alone, then the smallest on all cores, print and draw."""
+    if sys.argv[1:2] == ["--child"]:
+        atoms, seconds, core = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {core})
+        print(json.dumps(measure(atoms, seconds)))
+        return
+    chosen = _options()
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else [0]
+    rows = []
+    for atoms in sorted(chosen.sizes):
+        say(f"N = {atoms:,}")
+        rows += children([atoms], chosen.seconds, cores[:1])
+    say(f"N = {min(chosen.sizes):,}, {len(cores)} at a time")
+    beside = children([min(chosen.sizes)] * len(cores), chosen.seconds, cores)
+    together = float(np.mean([row["us_per_atom_step"] for row in beside])) / rows[0]["us_per_atom_step"]
+    result: dict[str, Any] = {"sizes": rows, "cores": len(cores), "together": together}
+    if len(rows) > 1:
+        result["slopes"] = {name: slope(rows, name) for name in _COLUMNS[2:] if name != "us_per_flip"}
+        result["flat"] = rows[-1]["us_per_atom_step"] / rows[0]["us_per_atom_step"]
+    result["machine"] = machine()
+    if chosen.json:
+        print(json.dumps(result, indent=2))
+    else:
+        print("on " + result["machine"])
+        cells = [[f"{row['atoms']:,.0f}", *(float(row[name]) for name in _COLUMNS[1:])] for row in rows]
+        table("growth", ("N", "steps", "µs/atom/step", "µs/flip", "search µs/atom", "peak MB"), cells)
+        print(f"\n{len(cores)} at a time: a step takes {together:.2f} of one alone")
+        if "flat" in result:
+            print(f"cost of an atom's step, largest over smallest: {result['flat']:.2f} (wanted <= 1.3)")
+    if len(rows) > 1:
+        draw(rows, chosen.output)
+
+
+if __name__ == "__main__":
+    start(main)

@@ -1,0 +1,257 @@
+"""Gradients through flips, against closed forms that no simulation enters, and tangents against the reverse
+pass, with whose code they share nothing beyond the recorded run."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from gradient_problems import everything
+from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
+
+from mdnum.errors import InputError
+from mdnum.gradients.adjoint import reverse
+from mdnum.gradients.losses import Custom, FinalProjection
+from mdnum.gradients.parameters import gathered, gradient, resolve, with_values
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import EventAware, Forward, Symmetric
+from mdnum.gradients.tangents import by_column, tangents
+from mdnum.gradients.tape import RunTape
+from mdnum.rollout.engine import Engine
+from mdnum.systems import build
+
+NAMES = ("initial.positions", "initial.velocities", "cutoff.radius", "potential.sigma", "potential.epsilon")
+
+
+def exact() -> dict[str, float]:
+    """Derivatives of the speed of a particle that has left a well, by conservation of energy.
+
+    mu v²/2 + u(r_cut) = mu v0²/2 + u(r0) with a reduced mass of 1: inside the cutoff nothing is lost, and
+    beyond it nothing acts.
+    """
+    r0, r_cut, sigma, epsilon, v0 = sympy.symbols("r0 r_cut sigma epsilon v0", positive=True)
+
+    def u(r):
+        return 4 * epsilon * ((sigma / r) ** 12 - (sigma / r) ** 6)
+
+    v = sympy.sqrt(v0**2 + 2 * u(r0) - 2 * u(r_cut))
+    at = {r0: 1.8, r_cut: 2.5, sigma: 1, epsilon: 1, v0: 1}
+    names = zip(NAMES, (r0, v0, r_cut, sigma, epsilon), strict=True)
+    return {name: float(sympy.diff(v, q).subs(at)) for name, q in names}
+
+
+def along(gradient: dict[str, np.ndarray], axis: int) -> dict[str, float]:
+    """By distance and relative speed: half of each atom's, since both move by halves."""
+    return {
+        name: float((value[1, axis] - value[0, axis]) / 2) if value.ndim == 2 else float(value)
+        for name, value in gradient.items()
+    }
+
+
+def test_leaving_a_well_has_the_derivatives_of_the_closed_form(well):
+    problem, axis = well
+    found = EventAware()(problem, NAMES)
+    got = along(found.gradient, axis)
+    for name, value in exact().items():
+        assert got[name] == pytest.approx(value, abs=1e-4), name
+    assert found.details["crossings"] == 1
+
+
+def test_without_the_flip_the_error_is_an_eighth_and_the_radius_seems_not_to_matter(well):
+    problem, axis = well
+    found = Symmetric()(problem, NAMES)
+    got, true = along(found.gradient, axis), exact()
+    assert got["initial.positions"] == pytest.approx(0.875 * true["initial.positions"], rel=2e-3)
+    assert got["cutoff.radius"] == 0.0
+    assert "exactly 0" in found.notes["cutoff.radius"]
+    assert "event-aware" in found.notes["potential.sigma"]
+
+
+def test_a_crossing_slower_than_the_guard_is_left_out_and_listed(well):
+    problem, axis = well
+    # far above any speed of this run
+    found = EventAware(guard=100.0)(problem, NAMES)
+    plain = Symmetric()(problem, NAMES)
+    assert along(found.gradient, axis) == along(plain.gradient, axis)
+    (row,) = found.details["heaviest"]
+    assert row["grazing"] and found.details["grazing"] == 1
+    # its weight is what it would have added to the derivative by the radius
+    assert row["weight"] == pytest.approx(exact()["cutoff.radius"], abs=1e-4)
+    assert found.details["weight left out"] == abs(row["weight"])
+
+
+def averages(w: str, time: float) -> dict[str, float]:
+    """Derivatives of the time average of energy ("u") or virial ("w") of the particle that leaves the well.
+
+    Dwelling at a distance goes with one over the speed: the average is the integral of what is seen over
+    v(r), from the start to the cutoff, over the time.
+    """
+    mpmath.mp.dps = 30
+
+    def average(r0, v0, r_cut, sigma, epsilon):
+        def u(r):
+            return 4 * epsilon * ((sigma / r) ** 12 - (sigma / r) ** 6)
+
+        def seen(r):
+            return u(r) if w == "u" else 4 * epsilon * (12 * (sigma / r) ** 12 - 6 * (sigma / r) ** 6)
+
+        def density(r):
+            return seen(r) / mpmath.sqrt(v0**2 + 2 * u(r0) - 2 * u(r))
+
+        return mpmath.quad(density, [r0, r_cut]) / time
+
+    at = [mpmath.mpf(q) for q in ("1.8", "1", "2.5", "1", "1")]
+    found = [mpmath.diff(average, at, tuple(int(k == n) for k in range(5))) for n in range(5)]
+    return {name: float(value) for name, value in zip(NAMES, found, strict=True)}
+
+
+@pytest.mark.parametrize(("w", "every"), [("u", 1), pytest.param("w", 4, marks=pytest.mark.slow)])
+def test_what_a_loss_sees_jump_moves_with_the_crossing(well, w, every):
+    """Energy and virial jump with the flip: by the radius their averages have no other derivative."""
+    simulation, axis = well[0].simulation, well[1]
+    steps = 2000
+    see = (lambda frame, *_: frame.potential) if w == "u" else (lambda frame, *_: frame.virial)
+    exact = averages(w, (steps + 1) * float(simulation.integrator.timestep))
+    problem = Problem(simulation, Custom(see=see, every=every), steps)
+    got = along(EventAware()(problem, NAMES).gradient, axis)
+    for name, value in exact.items():
+        # frames are a rule of rectangles for the integral
+        assert got[name] == pytest.approx(value, abs=2e-3 * every * max(map(abs, exact.values()))), name
+    # what the crossing adds has no such error: its frame is as early as late
+    assert got["cutoff.radius"] == pytest.approx(exact["cutoff.radius"], rel=1e-5 if every == 1 else 2e-3)
+    tangent = Forward(saltation=True)(problem, ("cutoff.radius", "potential.sigma"))
+    for name, value in tangent.gradient.items():
+        assert float(value) == pytest.approx(got[name], rel=1e-11)
+
+
+def test_a_single_frame_that_jumps_is_told(well):
+    simulation = well[0].simulation
+    late = Custom(see=lambda frame, *_: frame.potential, first=20)
+    found = EventAware()(Problem(simulation, late, 20), ("potential.sigma",))
+    assert found.details["loss jumps"] and "single frames" in found.notes["potential.sigma"]
+    often = Custom(see=lambda frame, *_: frame.potential, every=2)
+    found = EventAware()(Problem(simulation, often, 20), ("potential.sigma",))
+    assert not found.details["loss jumps"] and not found.notes
+    speed = EventAware()(Problem(simulation, Custom(see=lambda f, *_: f.v[0, 0], first=20), 20), ("sigma",))
+    assert not speed.details["loss jumps"]
+
+
+# --- tangents ----------------------------------------------------------------------------------------
+
+STEPS = 40
+WORDS = ("sigma", "epsilon", "cutoff.radius", "timestep", "temperature", "scale")
+
+
+@pytest.fixture(scope="module")
+def hot():
+    """Atoms so fast that pairs cross the cutoff, where the force jumps."""
+    dynamics = {"kind": "nve", "timestep": 0.004, "temperature": 3.0, "seed": 3}
+    system = make(crystal(), LENNARD_JONES, {"kind": "hard", "radius": 2.0}, dynamics=dynamics)
+    simulation = build(system)
+    return RunTape(simulation, everything(simulation.atoms), STEPS, flips=True)
+
+
+@pytest.fixture(scope="module")
+def forward(hot):
+    """Tangents along one recorded run, without and with what the flips add."""
+    names = resolve(hot.simulation, WORDS)
+    return {jumps: list(tangents(hot, names, saltation=jumps, states=True)) for jumps in (False, True)}
+
+
+@pytest.fixture(scope="module")
+def backward(hot):
+    """Reverse passes in which every flip grazes and none does: one program, plain and event-aware."""
+    return {jumps: reverse(hot, saltation=True, guard=0.0 if jumps else np.inf) for jumps in (False, True)}
+
+
+def agree(ours, theirs):
+    for name, value in theirs.items():
+        scale = max(float(np.max(np.abs(value))), 1e-300)
+        assert np.max(np.abs(ours[name] - value)) <= 1e-9 * scale, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jumps", [False, True])
+def test_tangents_agree_with_the_reverse_pass(hot, forward, backward, jumps):
+    names = resolve(hot.simulation, WORDS)
+    ours = gathered(hot.simulation, names, by_column(hot, forward[jumps][-1].total))
+    theirs = {name: gradient(hot.simulation, backward[jumps][0], name) for name in names}
+    agree(ours, theirs)
+    # with flips, and only with them, the radius counts
+    assert (theirs["cutoff.radius"] != 0) == jumps
+
+
+@pytest.mark.slow
+def test_what_flips_add_is_the_sum_of_their_weights(hot, forward, backward):
+    names = resolve(hot.simulation, WORDS)
+    (plain, _), (parts, found) = backward[False], backward[True]
+    added, count = 0.0, 0
+    for met, part in zip(reversed(found), forward[False], strict=True):
+        assert part.dr is not None and part.dr_cut is not None
+        added = added + np.where(met.grazing, 0, met.weight) @ (part.dr_cut - part.dr)
+        count += len(met)
+    assert count > 50
+    by_name = [{name: gradient(hot.simulation, one, name) for name in names} for one in (parts, plain)]
+    difference = {name: by_name[0][name] - by_name[1][name] for name in names}
+    assert all(np.all(value != 0) for value in difference.values())
+    agree(gathered(hot.simulation, names, np.asarray(added)), difference)
+
+
+@pytest.mark.slow
+def test_the_tangent_of_a_state_is_that_of_differences(hot, forward):
+    """Of the last positions by sigma, against two runs that make the same decisions."""
+
+    def last(shift: float) -> tuple[np.ndarray, int]:
+        shifted = with_values(hot.simulation, {"potential.sigma": np.asarray(1.0 + shift)})
+        segments = [
+            (segment.unsorted("x", segment.rows - 1), segment.unsorted("images", segment.rows - 1))
+            for segment in Engine(shifted, STEPS).segments()
+        ]
+        x, images = segments[-1]
+        return x + images @ np.asarray(shifted.cell.matrix), len(segments)
+
+    (above, lists), (below, as_many) = last(1e-7), last(-1e-7)
+    assert lists == as_many > 1
+    difference = (above - below) / 2e-7
+    part = forward[False][-1]
+    ours = np.empty_like(difference)
+    ours[part.stretch.table.order] = part.x[part.stretch.rows - 1, 0].T
+    assert ours == pytest.approx(difference, abs=1e-6 * np.abs(difference).max())
+
+
+def test_bad_input_says_what_would_do(hot):
+    problem = Problem(hot.simulation, hot.loss, STEPS)
+    with pytest.raises(InputError, match="324 numbers"):
+        Forward()(problem, ("x0",))
+    with pytest.raises(InputError, match="without its flips"):
+        next(tangents(RunTape(hot.simulation, hot.loss, STEPS), ("potential.sigma",), saltation=True))
+
+
+@pytest.mark.slow
+def test_a_mixture_in_a_bath_agrees_by_every_pair_type():
+    dynamics = {"kind": "langevin", "timestep": 0.004, "temperature": 3.0, "friction": 2.0, "seed": 3}
+    system = make(mixture(), KOB_ANDERSEN, {"kind": "hard", "radius": 2.0}, dynamics=dynamics)
+    simulation = build(system)
+    problem = Problem(simulation, everything(simulation.atoms), STEPS)
+    names = (*WORDS, "friction")
+    ours, theirs = Forward(saltation=True)(problem, names), EventAware()(problem, names)
+    assert ours.value == theirs.value
+    assert ours.gradient["potential.epsilon"].shape == (3,)
+    assert ours.details["crossings"] == theirs.details["crossings"] > 50
+    agree(ours.gradient, theirs.gradient)
+
+
+@pytest.mark.slow
+def test_the_pair_that_leaves_its_well_agrees_by_every_number():
+    """Each coordinate of a free pair is a column; stretched, it starts at another distance."""
+    simulation = build("pair/leaving-well")
+    problem = Problem(simulation, FinalProjection(direction=jnp.asarray([[1.0, 0], [0, 0], [0, 0]])), 2000)
+    names = ("x0", "v0", "scale", "sigma")
+    ours, theirs = Forward(saltation=True)(problem, names), EventAware()(problem, names)
+    for name, value in theirs.gradient.items():
+        assert ours.gradient[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+    assert np.linalg.norm(simulation.positions[1] - simulation.positions[0]) == pytest.approx(1.8)
+    by_distance = float(np.sum(theirs.gradient["initial.positions"] * simulation.positions))
+    assert float(ours.gradient["box.scale"]) == pytest.approx(by_distance, rel=1e-9)
