@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
 from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
+from mdnum.report.section import Table
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from mdnum.ball import (
     BallVerlet,
+    ExactImpact,
     ExactPenalty,
     ExplicitEuler,
     ImplicitMidpoint,

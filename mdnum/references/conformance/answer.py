@@ -27,7 +27,7 @@ class Malformed(Exception):
 
 
 @dataclass(frozen=True)
-class Answer:
+class ListAnswer:
     """The rows that a list gave.
 
     Attributes:
@@ -46,12 +46,12 @@ class Answer:
     def __len__(self) -> int:
         return len(self.i)
 
-    def same(self, other: Answer) -> bool:
+    def same(self, other: ListAnswer) -> bool:
         """Whether another answer has the same rows in the same order."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
-def read(given: Any) -> Answer:
+def read(given: Any) -> ListAnswer:
     """The rows of what a list returned.
 
     It may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance, vector), or any of
@@ -77,11 +77,11 @@ def read(given: Any) -> Answer:
         if not np.array_equal(whole, rows["shift"]):
             raise Malformed("shifts are not whole numbers of lattice vectors")
         rows["shift"] = whole.astype(np.int64)
-    return Answer(i, j, **rows)
+    return ListAnswer(i, j, **rows)
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """What was returned, by the names of `Answer`, with i and j at least.
+    """What was returned, by the names of `ListAnswer`, with i and j at least.
 
     Raises:
         Malformed: it is no list of pairs.

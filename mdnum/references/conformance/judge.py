@@ -13,7 +13,7 @@ from numpy import ndarray
 from pydantic import FiniteFloat
 
 from mdnum.errors import InputError
-from mdnum.references.conformance.answer import Answer
+from mdnum.references.conformance.answer import ListAnswer
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
@@ -160,7 +160,7 @@ def without_numbers(text: str) -> str:
     return re.sub(r"[-+\d.e]+", "#", text)
 
 
-def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
+def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """Everything that is wrong with an answer; nothing where it conforms.
 
     A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be there or not,
@@ -189,7 +189,7 @@ def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     return found or _measures(answer, truth, how)
 
 
-def _compare(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
+def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """What is wrong with the rows of an answer, matched with those of the truth."""
     i, j, shifts = answer.i, answer.j, answer.shift is not None
     shift = how.sign * answer.shift if answer.shift is not None else np.zeros((len(i), 3), np.int64)
@@ -276,7 +276,7 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
     return np.where(turn, j, i), np.where(turn, i, j), np.where(turn[:, None], -shift, shift)
 
 
-def _shift_hint(answer: Answer, truth: Truth, how: Conventions) -> str:
+def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
     """What the shifts may have been meant for."""
     assert answer.shift is not None
     if not _compare(answer, truth, replace(how, sign=-how.sign)):
@@ -288,7 +288,7 @@ def _shift_hint(answer: Answer, truth: Truth, how: Conventions) -> str:
     return "; they are right for positions wrapped into the box" if right else ""
 
 
-def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
+def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """Distances and vectors of rows that are all right."""
     if answer.distance is None and answer.vector is None:
         return []
@@ -324,7 +324,7 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     return found
 
 
-def measures_well(answer: Answer, truth: Truth, how: Conventions) -> bool:
+def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
     """Whether an answer has distances or vectors, and they are as good as the conventions say."""
     given = answer.distance is not None or answer.vector is not None
     n = len(truth.positions)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy import ndarray
 
 from mdnum.errors import MdnumError
-from mdnum.references.conformance.answer import Answer, Malformed, parts, read
+from mdnum.references.conformance.answer import ListAnswer, Malformed, parts, read
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import PairList
@@ -55,7 +55,7 @@ class CallOutcome:
         skin: the padding that a list that is kept states, length; None where it states none.
     """
 
-    answer: Answer | None = None
+    answer: ListAnswer | None = None
     failure: Failure | None = None
     refused: str | None = None
     changed: str | None = None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.deadline import Deadline, fewest
-from mdnum.references.conformance.answer import Answer
+from mdnum.references.conformance.answer import ListAnswer
 from mdnum.references.conformance.case import AREAS, Case, gas, once
 from mdnum.references.conformance.judge import (
     CODES,
@@ -185,7 +185,7 @@ class Examiner:
                 self.refused[like] = RefusalKind(words, case)
 
     def _judge(
-        self, case: Case, step: int, answer: Answer, how: Conventions
+        self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], Conventions, tuple[int, int]]:
         """(failures, conventions that the answer was judged by, ties counted and not)."""
         reach = self.report.reach(case) if self.report.superset else None
@@ -208,7 +208,7 @@ class Examiner:
         return found, how, _ties(answer, right) if counts else (0, 0)
 
 
-def _ties(answer: Answer, right: Truth) -> tuple[int, int]:
+def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
     """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):

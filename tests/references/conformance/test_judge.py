@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from mdnum.references.conformance.answer import Answer, Malformed, read
+from mdnum.references.conformance.answer import ListAnswer, Malformed, read
 from mdnum.references.conformance.case import gas, once
 from mdnum.references.conformance.judge import DOUBLE, SINGLE, Conventions, judge, truth
 from mdnum.references.conformance.questions import lattice
@@ -16,22 +16,22 @@ from mdnum.references.oracle import all_pairs
 _CASE = once("a gas", "few", gas(20, 3.0, 0), 3.0)
 
 
-def _right() -> Answer:
+def _right() -> ListAnswer:
     pairs = truth(_CASE, 0)
     i, j = np.concatenate([pairs.i, pairs.j]), np.concatenate([pairs.j, pairs.i])
     shift = np.concatenate([pairs.shift, -pairs.shift])
     vector = pairs.positions[j] - pairs.positions[i] + shift @ pairs.cell
-    return Answer(i, j, shift, np.linalg.norm(vector, axis=1), vector)
+    return ListAnswer(i, j, shift, np.linalg.norm(vector, axis=1), vector)
 
 
-def _with(**changes) -> Answer:
+def _with(**changes) -> ListAnswer:
     right = _right()
-    return Answer(
+    return ListAnswer(
         *(changes.get(name, getattr(right, name)) for name in ("i", "j", "shift", "distance", "vector"))
     )
 
 
-def _codes(answer: Answer, how: Conventions | None = None) -> list[str]:
+def _codes(answer: ListAnswer, how: Conventions | None = None) -> list[str]:
     return [failure.code for failure in judge(answer, truth(_CASE, 0), how or Conventions())]
 
 
@@ -39,32 +39,32 @@ def test_what_is_right_has_no_failure():
     right = _right()
     assert len(right) > 40
     assert _codes(right) == []
-    assert _codes(Answer(right.i, right.j)) == []
-    assert _codes(Answer(right.i, right.j, None, right.distance)) == []
-    assert _codes(Answer(right.i, right.j, -right.shift), Conventions(sign=-1)) == []
+    assert _codes(ListAnswer(right.i, right.j)) == []
+    assert _codes(ListAnswer(right.i, right.j, None, right.distance)) == []
+    assert _codes(ListAnswer(right.i, right.j, -right.shift), Conventions(sign=-1)) == []
     half = right.i < right.j
-    half_answer = Answer(right.i[half], right.j[half], right.shift[half])
+    half_answer = ListAnswer(right.i[half], right.j[half], right.shift[half])
     assert _codes(half_answer, Conventions(full=False)) == []
-    turned = Answer(right.j[half], right.i[half], -right.shift[half])
+    turned = ListAnswer(right.j[half], right.i[half], -right.shift[half])
     assert _codes(turned, Conventions(full=False)) == []
     order = np.random.default_rng(0).permutation(len(right))
-    assert _codes(Answer(right.i[order], right.j[order], right.shift[order])) == []
+    assert _codes(ListAnswer(right.i[order], right.j[order], right.shift[order])) == []
 
 
 def test_each_fault_has_its_code():
     right = _right()
     most = len(right)
     cut = slice(0, most - 1)
-    assert _codes(Answer(right.i[cut], right.j[cut], right.shift[cut])) == ["ONE_SIDED"]
+    assert _codes(ListAnswer(right.i[cut], right.j[cut], right.shift[cut])) == ["ONE_SIDED"]
     without = (right.i != right.i[0]) | (right.j != right.j[0])
     without &= (right.j != right.i[0]) | (right.i != right.j[0])
-    assert _codes(Answer(right.i[without], right.j[without])) == ["MISSING"]
+    assert _codes(ListAnswer(right.i[without], right.j[without])) == ["MISSING"]
     twice = np.append(np.arange(most), 0)
-    assert _codes(Answer(right.i[twice], right.j[twice], right.shift[twice])) == ["DUPLICATE"]
+    assert _codes(ListAnswer(right.i[twice], right.j[twice], right.shift[twice])) == ["DUPLICATE"]
     far = int(np.argmax(~np.isin(np.arange(20), right.j[right.i == 0]) & (np.arange(20) > 0)))
-    more = Answer(np.append(right.i, [0, far]), np.append(right.j, [far, 0]))
+    more = ListAnswer(np.append(right.i, [0, far]), np.append(right.j, [far, 0]))
     assert _codes(more) == ["EXTRA"]
-    own = Answer(np.append(right.i, 3), np.append(right.j, 3))
+    own = ListAnswer(np.append(right.i, 3), np.append(right.j, 3))
     assert _codes(own) == ["SELF"]
     assert _codes(_with(i=np.where(np.arange(most) == 2, 20, right.i))) == ["RANGE"]
     assert _codes(_with(i=np.where(np.arange(most) == 2, -1, right.i))) == ["RANGE"]
@@ -86,10 +86,10 @@ def test_what_shifts_cannot_mend_is_not_called_a_shift():
     zero, i = np.zeros(1, int), np.zeros(7, int)
     shift = np.vstack([right.shift, -right.shift, np.zeros((1, 3), int)])
     cases = (
-        (Answer(zero, zero, right.shift[:1]), ["ONE_SIDED"]),
-        (Answer(i[:5], i[:5], shift[:5]), ["ONE_SIDED"]),
-        (Answer(zero, zero, shift[6:]), ["SELF"]),
-        (Answer(i[:6], i[:6], shift[:6]), []),
+        (ListAnswer(zero, zero, right.shift[:1]), ["ONE_SIDED"]),
+        (ListAnswer(i[:5], i[:5], shift[:5]), ["ONE_SIDED"]),
+        (ListAnswer(zero, zero, shift[6:]), ["SELF"]),
+        (ListAnswer(i[:6], i[:6], shift[:6]), []),
     )
     for answer, codes in cases:
         found = judge(answer, right, Conventions())
@@ -104,7 +104,7 @@ def test_shifts_of_wrapped_positions_are_told_as_such():
     home = np.floor(right.positions / 3.0).astype(int)
     shift = right.shift - home[right.i] + home[right.j]
     i, j = np.concatenate([right.i, right.j]), np.concatenate([right.j, right.i])
-    found = judge(Answer(i, j, np.concatenate([shift, -shift])), right, Conventions())
+    found = judge(ListAnswer(i, j, np.concatenate([shift, -shift])), right, Conventions())
     assert [failure.code for failure in found] == ["SHIFTS"]
     assert "wrapped" in found[0].text
 
@@ -115,7 +115,7 @@ def test_a_pair_within_rounding_may_be_there_or_not_but_from_both_atoms(ulps: in
     case = once("tie", "ties", [[1.0, 1, 1], [3.5, 1, 1]], 8.0, r_cut=r_cut)
     right = truth(case, 0)
     for i, j, codes in (([], [], []), ([0, 1], [1, 0], []), ([0], [1], ["ONE_SIDED"])):
-        answer = Answer(np.array(i, int), np.array(j, int))
+        answer = ListAnswer(np.array(i, int), np.array(j, int))
         assert [failure.code for failure in judge(answer, right, Conventions())] == codes
     # the truth itself is that of Fractions
     exact = Fraction(5, 2) ** 2 - Fraction(r_cut) ** 2
@@ -125,7 +125,7 @@ def test_a_pair_within_rounding_may_be_there_or_not_but_from_both_atoms(ulps: in
 
 def test_what_float32_may_decide_float64_may_not():
     case = once("near", "ties", [[1.0, 1, 1], [3.5 - 1e-7, 1, 1]], 8.0, r_cut=2.5)
-    nothing = Answer(np.zeros(0, int), np.zeros(0, int))
+    nothing = ListAnswer(np.zeros(0, int), np.zeros(0, int))
     assert judge(nothing, truth(case, 0, unit=SINGLE), Conventions(unit=DOUBLE))
     assert not judge(nothing, truth(case, 0, unit=SINGLE), Conventions(unit=SINGLE))
 
