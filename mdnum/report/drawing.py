@@ -247,9 +247,9 @@ def _region(axes: Axes, region: Region) -> None:
     x, y = (_edges(axis, log == "log") for axis, log in
             ((region.x, axes.get_xscale()), (region.y, axes.get_yscale())))  # fmt: skip
     for at, (color, word) in enumerate(zip(_CLASSES, region.words, strict=False)):
-        inside = np.pad(region.value == at, ((0, 0), (1, 1))).astype(int)
+        inside = (region.value == at).astype(int)
         axes.plot([], [], "s", color=color, alpha=0.5, label=word)
-        for row, steps in enumerate(np.diff(inside, axis=1)):
+        for row, steps in enumerate(np.diff(inside, axis=1, prepend=0, append=0)):
             # neighbors in a row are one rectangle: a cell each would make a page heavy
             starts, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
             bars = list(zip(x[starts], x[ends] - x[starts], strict=True))

@@ -157,6 +157,24 @@ def curves(
     )
 
 
+def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
+    """The table of a folder that holds the points of its figures: a row for each.
+
+    Args:
+        lines: part, curve, label, x and y of each line.
+    """
+    lines = list(lines)
+    sizes = [len(line[3]) for line in lines]
+    words = zip(*(line[:3] for line in lines), strict=True) if lines else ((), (), ())
+    columns = {
+        name: np.repeat(np.array(column, dtype=str), sizes)
+        for name, column in zip(("part", "curve", "line"), words, strict=True)
+    }
+    for at, name in ((3, "x"), (4, "y")):
+        columns[name] = np.concatenate([np.asarray(line[at], float) for line in lines] or [np.zeros(0)])
+    return columns
+
+
 @dataclass(frozen=True)
 class Region:
     """A map over a grid: small integers with a word for each (a stability map, say).

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -148,6 +148,41 @@ class Outcome:
     result: Any = None
 
 
+class Interrupted(KeyboardInterrupt):
+    """Somebody pressed control-C where there was an answer already, which is in its folder.
+
+    Args:
+        outcome: that answer.
+    """
+
+    def __init__(self, outcome: Outcome):
+        super().__init__("stopped")
+        self.outcome = outcome
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Control-C as a wish: whether it was pressed since; pressed again, it interrupts as it always does.
+
+    Outside of the main thread, where Python hands no signals over, nobody ever asks.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        asked.set()
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Keep(TypedDict, total=False):
     """Keyword arguments of every question that is asked of a system.
 
@@ -186,58 +221,36 @@ class Answer:
 
 
 @contextmanager
-def answering(kind: str, name: str, system: Any = None, **keep: Unpack[Keep]) -> Iterator[Answer]:
+def answering(
+    kind: str,
+    name: str,
+    system: Any = None,
+    *,
+    out: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> Iterator[Answer]:
     """A new folder that is filled, then stored with the seconds that it took, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
-        keep: its overrides are in the system already.
+        overrides: are in the system already.
+        out, report, progress: see `Keep`; named one by one, so that what is misspelled is refused.
 
     Raises:
-        FolderError: the folder cannot be used.
+        InputError: overrides of no system. FolderError: the folder cannot be used.
     """
-    began, progress = perf_counter(), keep.get("progress")
-    with new_folder(kind, name, keep.get("out"), system=system) as folder:
+    if overrides and system is None:
+        raise InputError("overrides change a system file, and there is none", remedy="Leave them out")
+    began = perf_counter()
+    with new_folder(kind, name, out, system=system) as folder:
         answer = Answer(folder, logged(folder, progress, STEPWISE))
         yield answer
-        store(folder, {**answer.summary, "seconds": perf_counter() - began}, answer.tables)
-    report = keep.get("report", True)
+        store(folder, {"seconds": perf_counter() - began, **answer.summary}, answer.tables)
+        if folder.has_checkpoint():
+            folder.drop_checkpoint()
     answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
-
-
-class Interrupted(KeyboardInterrupt):
-    """Somebody pressed control-C where there was an answer already, which is in its folder.
-
-    Args:
-        outcome: that answer.
-    """
-
-    def __init__(self, outcome: Outcome):
-        super().__init__("stopped")
-        self.outcome = outcome
-
-
-@contextmanager
-def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Control-C as a wish: whether it was pressed since; pressed again, it interrupts as it always does.
-
-    Outside of the main thread, where Python hands no signals over, nobody ever asks.
-    """
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def ask(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, before)
-        asked.set()
-
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
