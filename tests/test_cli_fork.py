@@ -144,6 +144,9 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("silicon/tersoff-512", "--vary", "precision"), "`mdnum fork` lists them"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
         (("forecast", "ball/drop", "1e-6"), "the margin that mdnum ball records"),
+        (("processes", "ball/drop"), "mdnum ball --demo determinism"),
+        (("benign", "ball/drop", "start"), "no ensemble"),
+        (("ball/drop", "--vary", "skin"), "it is a choice of molecular dynamics"),
         (("map", "argon/crystal-108", "sigma"), "KEY=LOW:HIGH"),
         (("map", "argon/crystal-108", "sigma=2:1"), "nothing between 2.0 and 1.0"),
         (("map", "argon/crystal-108", "sgima=1:2"), "Did you mean potential.sigma?"),
@@ -156,7 +159,6 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("certify", "ball/zeno"), "more than sums and products"),
         (("ball/drop", "--vary", "reduction=exact"), "its steps solve nothing"),
         (("ball/drop", "--vary", "start", "--minimal"), "contact=STEP:BALL"),
-        (("ball/drop", "--vary", "start", "--split", "-1"), "split = -1"),
         (("ball/drop", "--vary", "contakt=earlier"), "Did you mean contact=earlier"),
     ],
 )

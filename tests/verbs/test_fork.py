@@ -309,11 +309,8 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
 @pytest.mark.parametrize(
     ("system", "vary", "options", "words"),
     [
-        ("ball/drop", "skin", {}, "it is a choice of molecular dynamics"),
-        ("argon/crystal-108", "precison", {}, "no choice 'precison'"),
         ("argon/crystal-108", "noise", {}, "noise"),
         ("argon/crystal-108", "precision", {"steps": 0}, "steps = 0"),
-        ("ball/drop", "precision", {"steps": 0}, "steps = 0"),
         ("argon/crystal-108", "precision", {"split": -1.0}, "split = -1"),
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
@@ -324,7 +321,6 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "A under B's decisions"),
         ("silicon/tersoff-512", "precision", {"repeats": 4}, "many-body"),
         ("ball/drop", "start", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
-        ("ball/drop", "start", {"minimal": True}, "minimal is an option of molecular dynamics"),
         ("ball/drop", "all", {"split": 0.1, "repeats": 4}, "split and repeats are options of one comparison"),
         ("argon/crystal-108", "all", {"minimal": True}, "minimal is an option of one comparison"),
     ],
@@ -485,15 +481,3 @@ def test_an_ensemble_that_differs_is_a_finding(tmp_path, monkeypatch, passed):
     summary = RunFolder.open(tmp_path / "x").summary
     assert [one["code"] for one in summary["findings"]] == ([] if passed else ["NOT_BENIGN"])
     assert summary["steps"] == 40 and (tmp_path / "x" / "report.html").exists()
-
-
-def test_what_a_ball_cannot_be_asked_says_what_can(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for ask, words in (
-        (lambda: mdnum.fork_processes(load("ball/drop")), "mdnum ball --demo determinism"),
-        (lambda: mdnum.fork_forecast("ball/drop", 1e-6), "the margin that mdnum ball records"),
-        (lambda: mdnum.verbs.fork_benign("ball/drop", "start"), "no ensemble"),
-    ):
-        with pytest.raises(InputError, match=words):
-            ask()
-    assert not list(tmp_path.iterdir())
