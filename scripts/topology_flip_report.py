@@ -152,7 +152,8 @@ def main() -> None:
     made.add_argument("--busiest", type=int, default=8, metavar="N", help="pairs to list (default 8)")
     chosen = made.parse_args()
     folder = found_or_made(chosen.subject, chosen.folder, chosen.steps)
-    run = load(RunFolder.open(folder))
+    opened = RunFolder.open(folder)
+    run = RunView(opened, opened.summary)
     table(
         f"{run.summary['system']}, {run.summary['atoms']} atoms, {run.steps:,} steps",
         ("what", "value"),
