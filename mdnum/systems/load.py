@@ -6,7 +6,7 @@ import importlib.resources
 import shutil
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -48,12 +48,14 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
     return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
 
 
-def world_of(name: str | Path) -> str:
-    """ "md" or "ball", read from a system's file without checking it; "md" where that is no TOML.
+def world_of(name: Any) -> str:
+    """ "md" or "ball", of a loaded system or read from its file unchecked; "md" where that is no TOML.
 
     Raises:
         InputError: nothing of that name.
     """
+    if isinstance(name, System | BallSystem):
+        return "ball" if isinstance(name, BallSystem) else "md"
     try:
         return str(_world(find(name)[1]))
     except (ValueError, RecursionError):
@@ -196,21 +198,6 @@ class System:
 
 
 @dataclass(frozen=True)
-class VariantSpec:
-    """The same system with some keys changed.
-
-    Attributes:
-        name: what to call it.
-        changes: dotted keys to values.
-        spec: what comes of it.
-    """
-
-    name: str
-    changes: Mapping[str, Any]
-    spec: BallSpec
-
-
-@dataclass(frozen=True)
 class BallSystem:
     """A checked system of the ball.
 
@@ -218,13 +205,13 @@ class BallSystem:
         name: such as "ball/drop".
         spec: the file's tables, defaults filled in.
         path: the file, or None.
-        variants: each checked like the system itself.
+        variants: the file with some keys changed (spec.variants says which), by name, each checked like it.
     """
 
     name: str
     spec: BallSpec
     path: Path | None = None
-    variants: tuple[VariantSpec, ...] = ()
+    variants: Mapping[str, BallSpec] = field(default_factory=dict)
 
     @property
     def balls(self) -> int:
@@ -242,13 +229,13 @@ class BallSystem:
             InputError: the variant cannot be run, or its name is taken.
         """
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
-        if name in {variant.name for variant in self.variants}:
+        if name in self.variants:
             raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
         given = {".".join(key): value for key, value in read_overrides(changes).items()}
         variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
         spec = self.spec.model_copy(update={"variants": tables})
-        return BallSystem(self.name, spec, self.path, (*self.variants, variant))
+        return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
         """This system with another number of steps; a control given by values is cut, or keeps its last.
@@ -279,7 +266,7 @@ class BallSystem:
         return path
 
 
-def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> VariantSpec:
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
     """The system with keys changed, checked.
 
     Args:
@@ -315,7 +302,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
             where=where,
             remedy="Keep the number of balls",
         )
-    return VariantSpec(name, dict(changes), spec)
+    return spec
 
 
 # --- copying ----------------------------------------------------------------------------------------
@@ -355,16 +342,19 @@ def copy(name: str | Path, folder: str | Path) -> Path:
 # --- loading ------------------------------------------------------------------------------------------
 
 
+Named = System | BallSystem | str | Path
+
+
 @overload
-def load(name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["md"]) -> System: ...
+def load(name: Named, overrides: Mapping[str, Any] | None = None, *, world: Literal["md"]) -> System: ...
 @overload
 def load(
-    name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["ball"]
+    name: Named, overrides: Mapping[str, Any] | None = None, *, world: Literal["ball"]
 ) -> BallSystem: ...
 @overload
-def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Any: ...
+def load(name: Named, overrides: Mapping[str, Any] | None = None) -> Any: ...
 def load(
-    name: str | Path,
+    name: Named,
     overrides: Mapping[str, Any] | None = None,
     *,
     world: Literal["md", "ball"] | None = None,
@@ -372,7 +362,8 @@ def load(
     """A system by name or path, checked: a System, or a BallSystem where the file says `world = "ball"`.
 
     Args:
-        name: a shipped name, a path to a TOML file, or a folder that holds system.toml.
+        name: a shipped name, a path to a TOML file, a folder that holds system.toml, or a loaded system,
+            which is returned as it is.
         overrides: dotted key to value, as `--set` gives them: `{"cutoff.kind": "switched"}`; text is read as
             TOML would read it. Changing a kind drops the file's keys that the new kind does not have;
             changing the temperature or seed of an NVE run draws its velocities anew.
@@ -381,6 +372,12 @@ def load(
     Raises:
         InputError: anything that cannot be run, in one line.
     """
+    if isinstance(name, System | BallSystem):
+        if overrides:
+            remedy = "Load it with the overrides, or give its name"
+            raise InputError("overrides change a system while it is loaded", where=name.name, remedy=remedy)
+        _check_world(name.name, isinstance(name, BallSystem), world)
+        return name
     found, path = find(name)
     where = shown(path)
     try:
@@ -393,14 +390,18 @@ def load(
     values = read_overrides(overrides)
     source = Source(found, path, where, text, values)
     is_ball = _is_ball(data, where)
-    if world is not None and is_ball != (world == "ball"):
-        verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
-        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
+    _check_world(name, is_ball, world)
     root = BallSpec if is_ball else schema.SystemSpec
     apply_overrides(data, values, root)
     root.follow(data, values)
     spec = checked(root, data, source)
     return _ball(spec, source) if isinstance(spec, BallSpec) else _md(spec, source)
+
+
+def _check_world(name: str | Path, is_ball: bool, world: str | None) -> None:
+    if world is not None and is_ball != (world == "ball"):
+        verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
+        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
 
 
 def _is_ball(data: Mapping[str, Any], where: str) -> bool:
@@ -435,9 +436,10 @@ def _md(spec: schema.SystemSpec, source: Source) -> System:
 
 
 def _ball(spec: BallSpec, source: Source) -> BallSystem:
-    variants = tuple(
-        vary(name, changes, spec, source.place(("variants", name))) for name, changes in spec.variants.items()
-    )
+    variants = {
+        name: vary(name, changes, spec, source.place(("variants", name)))
+        for name, changes in spec.variants.items()
+    }
     return BallSystem(spec.name or source.name, spec, source.path, variants)
 
 
