@@ -75,12 +75,8 @@ class _ProcessPart:
     """What one process found with one rule, frames counted from the first that it examined."""
 
     flips: list[FlipTable] = field(default_factory=list)  # of its frames that have any
-    rows: list[tuple[int, int, float]] = field(
-        default_factory=list
-    )  # (pairs, near, smallest margin) of its own
-    first: Members | None = (
-        None  # the pairs inside at the first of them: of later parts, the one before theirs
-    )
+    rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
+    first: Members | None = None  # the pairs inside at the first; of later parts, at the frame before it
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Chosen, Frame, FrameCheck, leap
+from mdnum.trajectories.frame import AtomIndices, Box, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
@@ -41,7 +41,7 @@ _SAME_TIME = 1e-6
 
 def _usable(
     files: Sequence[Trajectory],
-    atoms: Chosen,
+    atoms: AtomIndices,
     rules: Sequence[Rule],
     step: Callable[..., Any],
     found: Pass | Compared,
@@ -130,9 +130,7 @@ class Pass:
     rules: list[Followed]
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
-    moved: float = float(
-        "nan"
-    )  # root mean square displacement of a frame over what velocities say; nan without
+    moved: float = float("nan")  # root mean square displacement over what velocities say; nan without
     # (number of the frame, atom, how far) of what no atom does between two frames
     leaps: list[tuple[int, int, float]] = field(default_factory=list)
 
@@ -292,7 +290,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
-def separation(one: Frame, other: Frame, atoms: Chosen = None) -> Separation:
+def separation(one: Frame, other: Frame, atoms: AtomIndices = None) -> Separation:
     """The separation of two frames; only of these atoms, where they are given."""
     moved, whole = _displaced(one, other)
     if atoms is not None:
@@ -464,7 +462,7 @@ class Compared:
     stopped: InputError | None = None
 
 
-def follow_both(sets: list[NeighborSets], atoms: Chosen, sink: Sink) -> Iterator[Compared]:
+def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Iterator[Compared]:
     """Reads both once, in step, yielding the same `Compared` after each frame; only these atoms matter.
 
     The sink takes rows of "apart" and "differing".

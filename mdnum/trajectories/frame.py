@@ -23,7 +23,7 @@ _LEAP_BOXES, _LEAP_SIZES = 100.0, 1e4
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 
 #: Indices of some atoms of a file; None for all.
-Chosen = Int[np.ndarray, "chosen"] | None
+AtomIndices = Int[np.ndarray, "chosen"] | None
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class FrameCheck:
             atom is labeled as another one than in the first frame.
     """
 
-    atoms: Chosen = None  # those that matter, ascending; None for all
+    atoms: AtomIndices = None  # those that matter, ascending; None for all
     where: str | None = None  # the file, for messages
     radius: float = np.inf  # the shortest length that distances are compared with
     bits: int = 64  # width of a coordinate as it was read
@@ -170,7 +170,7 @@ def _and_others(count: int) -> str:
 
 
 def far_out(
-    frame: Frame, atoms: Chosen = None, radius: float = np.inf, bits: int = 64
+    frame: Frame, atoms: AtomIndices = None, radius: float = np.inf, bits: int = 64
 ) -> tuple[int, int, str] | None:
     """The atom that is furthest out, where that is further than can be; arguments as of `FrameCheck`.
 
@@ -199,7 +199,7 @@ def far_out(
     return None
 
 
-def leap(before: Frame, now: Frame, atoms: Chosen = None) -> tuple[int, float] | None:
+def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
     """The atom that is furthest from where it was a frame before, where that is further than can be.
 
     Wrapping an atom, or all of them at once after a long time, is none.
@@ -228,6 +228,6 @@ def _box(frame: Frame) -> float:
     return float(np.linalg.norm(frame.box.matrix, axis=1).max())
 
 
-def _named(at: Any, atoms: Chosen) -> int:
+def _named(at: Any, atoms: AtomIndices) -> int:
     """Number in the file of the atom at this place among those that matter."""
     return int(at if atoms is None else atoms[at])

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.frame import Box, Chosen, Frame
+from mdnum.trajectories.frame import AtomIndices, Box, Frame
 
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
@@ -66,7 +66,7 @@ class Resolution:
     digits: int = 0  # significant digits of every number, where it is these that are fixed
     told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
-    def bound(self, frame: Frame, atoms: Chosen = None) -> float:
+    def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
 
         The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and
@@ -234,11 +234,7 @@ def _chance(parts: Float[np.ndarray, "values"]) -> float:
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
-def _multiples(
-    values: Float[np.ndarray, "values"],
-    steps: Float[np.ndarray, "values"],
-    slack: Float[np.ndarray, "values"],
-) -> bool:
+def _multiples(values: np.ndarray, steps: np.ndarray, slack: np.ndarray) -> bool:
     ratio = values / steps
     return bool((np.abs(ratio - np.round(ratio)) * steps <= slack).all())
 

@@ -42,7 +42,7 @@ def _count(value: int, where: str) -> None:
         )
 
 
-class _Rule:
+class _Membership:
     """What most rules have in common."""
 
     directed = False
@@ -71,7 +71,7 @@ class _Rule:
 
 
 @dataclass(frozen=True)
-class CutoffRule(_Rule):
+class CutoffRule(_Membership):
     """Inside where r < radius, a length.
 
     The decision compares r² with radius² in float64, as most codes do; a pair within rounding of the radius
@@ -93,7 +93,7 @@ class CutoffRule(_Rule):
 
 
 @dataclass(frozen=True)
-class SpeciesCutoffs(_Rule):
+class SpeciesCutoffs(_Membership):
     """A radius, length, for each pair of species, in either order; pairs without one are never inside."""
 
     radii: Mapping[tuple[str, str], float]
@@ -152,7 +152,7 @@ class SpeciesCutoffs(_Rule):
 
 
 @dataclass(frozen=True)
-class Nearest(_Rule):
+class Nearest(_Membership):
     """The k nearest of each atom within a length, directed from the atom to its neighbors."""
 
     k: int
@@ -185,7 +185,7 @@ class Nearest(_Rule):
 
 
 @dataclass(frozen=True)
-class Capped(_Rule):
+class Capped(_Membership):
     """A cutoff, length, with a largest number of neighbors: the `most` nearest of those inside, directed.
 
     What graph builders do that have a maximum number of neighbors and keep the nearest.

@@ -17,12 +17,7 @@ from mdnum.trajectories.follow import (
     separation,
 )
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.ledger import FlipTable, Members
-
-
-def of_frame(flips: FlipTable, frame: int) -> FlipTable:
-    rows = flips.frame == frame
-    return FlipTable(**{name: getattr(flips, name)[rows] for name in FlipTable.__dataclass_fields__})
+from mdnum.trajectories.ledger import Members
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30))
@@ -36,7 +31,7 @@ def test_the_difference_carried_along_is_that_of_the_sets(seed: int, differing: 
     assert not len(found) and found.new == []
     before: set[tuple[int, int, int]] = set()
     for frame in range(1, a.shape[1]):
-        found.step(of_frame(flips_a, frame), of_frame(flips_b, frame))
+        found.step(*(flips[flips.frame == frame] for flips in (flips_a, flips_b)))
         in_a, in_b = ({names[p] for p in np.flatnonzero(one[:, frame])} for one in (a, b))
         assert found.only_a == in_a - in_b and found.only_b == in_b - in_a
         assert set(found.new) == (in_a ^ in_b) - before and found.new == sorted(found.new)

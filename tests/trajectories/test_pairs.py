@@ -21,7 +21,7 @@ from mdnum.trajectories.tracker import HORIZON, Tracker
 PERIODIC = np.ones(3, bool)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.data(), st.floats(0.5, 4.0))
 def test_every_pair_and_every_image_in_any_box(data, radius):
     box = data.draw(boxes())
@@ -42,7 +42,7 @@ def test_every_pair_and_every_image_in_any_box(data, radius):
         assert tracker.min_margin == np.inf
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(boxes())
 def test_reduced_vectors_span_the_same_lattice_and_are_short(box):
     lattice = lattice_of(box)
@@ -57,7 +57,7 @@ def test_reduced_vectors_span_the_same_lattice_and_are_short(box):
             assert np.linalg.norm(longer) >= np.linalg.norm(row) * (1 - 1e-9)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.data())
 def test_images_by_rank(data):
     box = data.draw(boxes())

@@ -60,7 +60,7 @@ def test_of_real_files(path, topology, kind, step):
     assert (resolution.kind, resolution.step) == (kind, pytest.approx(step))
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     st.sampled_from([0.05, 0.02, 0.01, 0.005, 1e-3, 2e-4, 1e-4, 1e-6, 1e-9]),
     st.integers(0, 10**6),
@@ -122,7 +122,7 @@ def test_the_sites_of_a_crystal_are_no_resolution():
     assert still.kind == "grid" and not still.moved
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.integers(0, 10**6), st.sampled_from(["grid", "fractions", "float32"]), st.floats(1e-5, 0.1))
 def test_no_distance_is_further_off_than_the_bound(seed, kind, step):
     true = moving(60, 4, seed)
@@ -230,7 +230,7 @@ def test_what_rounding_adds_to_displacements_is_taken_off(speed):
 
 
 def test_doubles_hide_nothing():
-    positions, length = liquid(60, 0.005, 1)
+    positions, length = liquid(20, 0.005, 4)
     frames = frames_of(positions[:8], length * np.eye(3))
     resolution = infer(frames)
     effect = grid_effect(resolution, frames, CUTOFF)
@@ -241,7 +241,7 @@ def test_doubles_hide_nothing():
 
 
 def test_wrapping_is_no_motion():
-    positions, length = liquid(60, 0.005, 1)
+    positions, length = liquid(20, 0.005, 4)
     kept = quantized(positions % length, 0.01)
     frames = frames_of(kept[:8], length * np.eye(3))
     plain = frames_of(quantized(positions, 0.01)[:8], length * np.eye(3))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import fields, replace
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -75,8 +75,7 @@ def test_a_missing_flip_is_noticed() -> None:
     inside, names = random_membership(1)
     flips, first = ledger(inside, names)
     keep = np.arange(len(flips)) != 7
-    cut = type(flips)(**{one.name: getattr(flips, one.name)[keep] for one in fields(flips)})
-    history = History.of(cut, first, inside.shape[1])
+    history = History.of(flips[keep], first, inside.shape[1])
     # unless it was the pair's last one, after which nothing contradicts
     gone = (int(flips.i[7]), int(flips.j[7]), int(flips.rank[7]))
     assert [(history.i[p], history.j[p], history.rank[p]) for p in history.broken()] == [gone]
@@ -197,8 +196,7 @@ def test_counts_of_parts_of_the_pairs_add_up_to_those_of_all() -> None:
 @given(seeds, st.booleans())
 @settings(max_examples=20)
 def test_flips_and_time_inside_by_class(seed: int, directed: bool) -> None:
-    inside, names = random_membership(seed)
-    history = History.of(*ledger(inside, names), inside.shape[1])
+    inside, names, history = made(seed)
     classes = np.random.default_rng(seed).integers(0, 3, 8)
     found = ClassTally.of(contacts(history), Classes(classes, ["a", "b", "c"]), inside.shape[1], directed)
     entered, left, time, exposed = Counter(), Counter(), Counter(), Counter()
@@ -219,8 +217,8 @@ def test_flips_and_time_inside_by_class(seed: int, directed: bool) -> None:
 @given(seeds, st.integers(1, 8))
 @settings(max_examples=20)
 def test_flips_taken_back_and_how_soon(seed: int, window: int) -> None:
-    inside, names = random_membership(seed)
-    found = Chatter.of(History.of(*ledger(inside, names), inside.shape[1]), window)
+    inside, _, history = made(seed)
+    found = Chatter.of(history, window)
     within, beyond, total = Counter(), Counter(), 0
     for row in inside:
         at = np.flatnonzero(np.diff(row.astype(int))) + 1
@@ -236,9 +234,8 @@ def test_flips_taken_back_and_how_soon(seed: int, window: int) -> None:
 @given(seeds)
 @settings(max_examples=20)
 def test_the_busiest_pairs_are_the_same_from_parts(seed: int) -> None:
-    inside, names = random_membership(seed)
+    inside, names, whole = made(seed)
     frames = inside.shape[1]
-    whole = History.of(*ledger(inside, names), frames)
     found = Busiest.of(whole, contacts(whole), 6)
     expected = sorted(
         (-int((np.diff(row.astype(int)) != 0).sum()), name, int(row.sum()))
@@ -261,8 +258,7 @@ def test_the_busiest_pairs_are_the_same_from_parts(seed: int) -> None:
 
 
 def test_flips_of_groups_with_others_and_within() -> None:
-    inside, names = random_membership(4)
-    history = History.of(*ledger(inside, names), inside.shape[1])
+    inside, names, history = made(4)
     residues = np.array([0, 0, 1, 1, 1, 2, 3, 3])
     found = Residues.of(history, Classes(residues, ["r"] * 5))
     expected = np.zeros((2, 5), int)
@@ -283,8 +279,7 @@ def flips_of(inside: np.ndarray) -> int:
 @given(st.integers(0, 10**6), st.integers(1, 9))
 @settings(max_examples=30)
 def test_flips_of_every_so_manieth_frame(seed: int, stride: int) -> None:
-    inside, names = random_membership(seed)
-    history = History.of(*ledger(inside, names), inside.shape[1])
+    inside, _, history = made(seed)
     found = Strides.of_history(history, [1, stride])
     assert found.flips[1] == flips_of(inside[:, ::stride])
     assert found.of[1] == flips_of(inside[:, : (inside.shape[1] - 1) // stride * stride + 1])
