@@ -58,7 +58,7 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
         from mdnum.systems.load import vary
 
         name = name or ", ".join(values)
-        return replace(system, spec=vary(name, values, system.spec, f"--vary {name}").spec, variants=())
+        return replace(system, spec=vary(name, values, system.spec, f"--vary {name}"), variants={})
     from mdnum.systems import structures, toml
     from mdnum.systems.schema import SystemSpec
 

@@ -18,9 +18,6 @@ ALL: Mapping[str, np.dtype] = {
 }
 #: The state in whole numbers: doubles that are multiples of fixed units.
 LATTICE = "lattice"
-_ROUNDINGS = ("nearest", "stochastic")
-
-
 #: Roles of molecular dynamics that sixteen bits cannot play, and why.
 _TOO_SHORT: Mapping[str, str] = {
     "state": "a step moves an atom by less than the spacing of such coordinates, so nothing would move",
@@ -34,13 +31,10 @@ def carrier(name: str) -> np.dtype:
     return ALL["float64" if name == LATTICE else name]
 
 
-def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]) -> None:
-    for role in roles:
-        value = getattr(policy, role)
-        if value not in known:
-            raise InputError(
-                f"unknown dtype {value!r}; known are {', '.join(known)}", where=f"precision.{role}"
-            )
+def _refuse_unknown(role: str, word: str, known: Mapping[str, object], noun: str = "dtype") -> None:
+    if word not in known:
+        said = f"unknown {noun} {word!r}; known are {', '.join(known)}"
+        raise InputError(said, where=f"precision.{role}")
 
 
 def check_role(role: str, dtype: str) -> None:
@@ -58,8 +52,7 @@ def check_role(role: str, dtype: str) -> None:
             where=f"precision.{role}",
             remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
         )
-    if dtype not in known:
-        raise InputError(f"unknown dtype {dtype!r}; known are {', '.join(known)}", where=f"precision.{role}")
+    _refuse_unknown(role, dtype, known)
 
 
 @dataclass(frozen=True)
@@ -121,12 +114,9 @@ class RolePrecision:
     seed: int = 0
 
     def __post_init__(self):
-        _check(self, ("state", "arithmetic", "decision", "accumulate", "loss"), ALL)
-        if self.rounding not in _ROUNDINGS:
-            raise InputError(
-                f"unknown rounding {self.rounding!r}; known are {', '.join(_ROUNDINGS)}",
-                where="precision.rounding",
-            )
+        for role in ("state", "arithmetic", "decision", "accumulate", "loss"):
+            _refuse_unknown(role, getattr(self, role), ALL)
+        _refuse_unknown("rounding", self.rounding, dict.fromkeys(("nearest", "stochastic")), "rounding")
         if self.seed < 0:
             raise InputError(f"{self.seed} is negative", remedy="Give 0 or more.", where="precision.seed")
 

@@ -81,8 +81,8 @@ def build_ball(
     if not isinstance(system, BallSystem):
         system = load(system, overrides, world="ball")
     variants = tuple(
-        BallVariant(variant.name, variant.changes, problem(variant.spec, steps, f"variant {variant.name!r}"))
-        for variant in system.variants
+        BallVariant(name, system.spec.variants[name], problem(spec, steps, f"variant {name!r}"))
+        for name, spec in system.variants.items()
     )
     return BallSimulation(system, problem(system.spec, steps, system.name), variants)
 

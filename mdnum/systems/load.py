@@ -6,7 +6,7 @@ import importlib.resources
 import shutil
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -196,21 +196,6 @@ class System:
 
 
 @dataclass(frozen=True)
-class VariantSpec:
-    """The same system with some keys changed.
-
-    Attributes:
-        name: what to call it.
-        changes: dotted keys to values.
-        spec: what comes of it.
-    """
-
-    name: str
-    changes: Mapping[str, Any]
-    spec: BallSpec
-
-
-@dataclass(frozen=True)
 class BallSystem:
     """A checked system of the ball.
 
@@ -218,13 +203,13 @@ class BallSystem:
         name: such as "ball/drop".
         spec: the file's tables, defaults filled in.
         path: the file, or None.
-        variants: each checked like the system itself.
+        variants: the file with some keys changed (spec.variants says which), by name, each checked like it.
     """
 
     name: str
     spec: BallSpec
     path: Path | None = None
-    variants: tuple[VariantSpec, ...] = ()
+    variants: Mapping[str, BallSpec] = field(default_factory=dict)
 
     @property
     def balls(self) -> int:
@@ -242,13 +227,13 @@ class BallSystem:
             InputError: the variant cannot be run, or its name is taken.
         """
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
-        if name in {variant.name for variant in self.variants}:
+        if name in self.variants:
             raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
         given = {".".join(key): value for key, value in read_overrides(changes).items()}
         variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
         spec = self.spec.model_copy(update={"variants": tables})
-        return BallSystem(self.name, spec, self.path, (*self.variants, variant))
+        return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
         """This system with another number of steps; a control given by values is cut, or keeps its last.
@@ -279,7 +264,7 @@ class BallSystem:
         return path
 
 
-def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> VariantSpec:
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
     """The system with keys changed, checked.
 
     Args:
@@ -315,7 +300,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
             where=where,
             remedy="Keep the number of balls",
         )
-    return VariantSpec(name, dict(changes), spec)
+    return spec
 
 
 # --- copying ----------------------------------------------------------------------------------------
@@ -435,9 +420,10 @@ def _md(spec: schema.SystemSpec, source: Source) -> System:
 
 
 def _ball(spec: BallSpec, source: Source) -> BallSystem:
-    variants = tuple(
-        vary(name, changes, spec, source.place(("variants", name))) for name, changes in spec.variants.items()
-    )
+    variants = {
+        name: vary(name, changes, spec, source.place(("variants", name)))
+        for name, changes in spec.variants.items()
+    }
     return BallSystem(spec.name or source.name, spec, source.path, variants)
 
 

@@ -447,7 +447,7 @@ def _ball_system(
         remedy = "Load it with the overrides, or give its name"
         raise InputError("overrides change a system while it is loaded", remedy=remedy, where=system.name)
     elif changes:
-        made = replace(system, spec=system.against(changes, "asked").variants[-1].spec)
+        made = replace(system, spec=system.against(changes, "asked").variants["asked"])
     return made if steps is None else made.for_steps(steps)
 
 

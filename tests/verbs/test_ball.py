@@ -176,7 +176,7 @@ def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     assert not {f"{name}.parquet" for name in TABLES["md"]} & names
     again = load(three.folder)
     assert again.spec.model_dump(exclude={"name"}) == load(three.folder).spec.model_dump(exclude={"name"})
-    assert [variant.name for variant in again.variants] == ["stop.rule=per-instance"]
+    assert list(again.variants) == ["stop.rule=per-instance"]
     with pytest.raises(FolderError, match="already holds a run"):
         bounce("ball/drop", out=three.folder)
     with pytest.raises(InputError, match=r"run of the ball.*Run it again with `mdnum ball"):
