@@ -139,7 +139,7 @@ def test_an_interval_is_a_key_and_two_numbers():
     [
         (("argon/crystal-108", "--vary", "vmap"), "mdnum fork processes"),
         (("argon/crystal-108", "--vary", "presicion"), "Did you mean precision"),
-        (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. Known are precision, reduction,"),
+        (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. There are precision, reduction,"),
         (("silicon/tersoff-512", "--vary", "precision"), "`mdnum fork` lists them"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
         (("forecast", "ball/drop", "1e-6"), "the margin that mdnum ball records"),

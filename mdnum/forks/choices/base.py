@@ -12,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
-from mdnum.registry import Registry, unknown
+from mdnum.registry import Registry, nearest
 from mdnum.systems import BallSystem, System
 
 #: Reductions whose result does not depend on the order of their terms.
@@ -194,7 +194,11 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    raise unknown("choice", text, CHOICES)
+    close = nearest(text, [*CHOICES, *shipped("md"), *shipped("ball")])
+    hint = f"Did you mean {close}? " if close else ""
+    raise InputError(
+        f"no choice {text!r}", remedy=f"{hint}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
+    )
 
 
 # --- for the choices ----------------------------------------------------------------------------------
