@@ -27,11 +27,13 @@ _HOMES = {
     "diagnose": "mdnum.doctor:diagnose",
     "flips": "mdnum.verbs:flips",
     "fork": "mdnum.verbs:fork",
+    "fork_benign": "mdnum.verbs:fork_benign",
     "fork_certify": "mdnum.verbs:fork_certify",
     "fork_folders": "mdnum.verbs:fork_folders",
     "fork_forecast": "mdnum.verbs:fork_forecast",
     "fork_map": "mdnum.verbs:fork_map",
     "fork_processes": "mdnum.verbs:fork_processes",
+    "fork_screen": "mdnum.verbs:fork_screen",
     "grad": "mdnum.verbs:grad",
     "load": "mdnum.systems:load",
     "run": "mdnum.verbs:run",
@@ -55,11 +57,13 @@ if TYPE_CHECKING:
     from mdnum.verbs import demonstrate as demonstrate
     from mdnum.verbs import flips as flips
     from mdnum.verbs import fork as fork
+    from mdnum.verbs import fork_benign as fork_benign
     from mdnum.verbs import fork_certify as fork_certify
     from mdnum.verbs import fork_folders as fork_folders
     from mdnum.verbs import fork_forecast as fork_forecast
     from mdnum.verbs import fork_map as fork_map
     from mdnum.verbs import fork_processes as fork_processes
+    from mdnum.verbs import fork_screen as fork_screen
     from mdnum.verbs import grad as grad
     from mdnum.verbs import run as run
 
@@ -79,11 +83,13 @@ __all__ = [
     "diagnose",
     "flips",
     "fork",
+    "fork_benign",
     "fork_certify",
     "fork_folders",
     "fork_forecast",
     "fork_map",
     "fork_processes",
+    "fork_screen",
     "grad",
     "load",
     "run",

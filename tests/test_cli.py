@@ -9,75 +9,45 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import Recorder, call, printed
 
-import mdnum.verbs
+import mdnum
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
-from mdnum.report.finding import conclude, restore
-from mdnum.report.section import Key, Page, Section, records
+from mdnum.report.finding import restore
 from mdnum.store.files import default_folder
-from mdnum.verbs.frame import Outcome
 
 SUMMARY: dict[str, Any] = {
-    "system": "argon/crystal-108",
-    "atoms": 108,
-    "steps": 200,
-    "flips_entered": 1_234,
-    "flips_left": 1_230,
-    "rebuilds": 3,
-    "dangerous_builds": 0,
-    "lost_pairs": 0,
-    "ambiguous": 0,
-    "energy_drift": 1e-9,
-    "energy_budget_residual": 2e-12,
-    "energy_budget_closes": True,
-    "steps_per_second": np.float64(512.0),
+    "flips_entered": 1_234, "steps_per_second": np.float64(512.0), "findings": [], "status": "complete",
     "ase": {"energy_rel": 1e-16, "force_max": float("nan"), "stress_max": None, "ok": True},
-    "findings": [],
-    "verdict": "2,464 flips, none ambiguous.",
-    "status": "complete",
-}
-
-
-SHOWN = Section("Lists", ["Sound.", records([{"name": "a", "pairs": n} for n in range(30)])], terminal=True)
-HIDDEN = Section("Details", ["On the page alone."])
-
-
-@dataclass
-class Recorder:
-    """A rollout that remembers how it was called and answers what it was told to."""
-
-    summary: dict[str, Any] = field(default_factory=lambda: dict(SUMMARY))
-    error: Exception | None = None
-    calls: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
-
-    def __call__(self, system: Any, **options: Any) -> Any:
-        self.calls.append((system, options))
-        if self.error is not None:
-            raise self.error
-        options["progress"](1, 200, {"phase": "run", "steps_per_second": 10.0, "flips": 1, "rebuilds": 0})
-        verdict = conclude(map(restore, self.summary["findings"]), headline="2,464 flips, none ambiguous.")
-        keys = [Key("Flips", "2,464", "1,234 entered, 1,230 left")]
-        page = Page("argon/crystal-108", "108 atoms", keys, [SHOWN, HIDDEN])
-        return Outcome(options["out"] or options["resume"], self.summary, verdict, page)
+}  # fmt: skip
 
 
 @pytest.fixture
 def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
-    recorder = Recorder()
-    monkeypatch.setattr(mdnum.verbs, "run", recorder)
+    recorder = Recorder(dict(SUMMARY))
+    monkeypatch.setattr(mdnum, "run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr about a mistake, which is one JSON document where one was asked for."""
+    assert call(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("mdnum: ") and err.count("\n") == 1
+    assert call(*arguments, "--json") == 2
+    assert json.loads(capsys.readouterr().out)["error"]["exit_code"] == 2
+    return err
 
 
 def test_run_passes_on_what_was_asked(rollout: Recorder):
@@ -85,100 +55,63 @@ def test_run_passes_on_what_was_asked(rollout: Recorder):
         "run", "argon/crystal-108", "-o", "here", "--steps", "200", "--save-every", "5",
         "--set", "cutoff.kind=switched", "--set", "dynamics.seed = 3", "--no-check", "--no-report",
     )  # fmt: skip
-    assert code == 0
     ((system, options),) = rollout.calls
-    progress = options.pop("progress")
-    assert isinstance(progress, ProgressBar)
-    assert system == "argon/crystal-108"
+    assert code == 0 and system == "argon/crystal-108" and isinstance(options.pop("progress"), ProgressBar)
     assert options == {
-        "out": Path("here"),
-        "steps": 200,
-        "save_every": 5,
+        "out": Path("here"), "steps": 200, "save_every": 5, "resume": None, "check": False, "report": False,
         "overrides": {"cutoff.kind": "switched", "dynamics.seed": "3"},
-        "resume": None,
-        "check": False,
-        "report": False,
-    }
+    }  # fmt: skip
 
 
 def test_run_prints_what_a_person_wants_to_know(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
     assert call("run", "argon/crystal-108") == 0
-    out, err = capsys.readouterr()
-    lines = [" ".join(line.split()) for line in out.splitlines()]
+    lines = printed(capsys)
     assert lines[:3] == ["2,464 flips, none ambiguous.", "108 atoms", "Flips 2,464 1,234 entered, 1,230 left"]
     assert lines[3:7] == ["Lists", "Sound.", "name pairs", "a 0"]
     # a table is cut, what stands on the page alone is left out
     assert "and 18 more" in lines[-2] and not any("Details" in line for line in lines)
     assert lines[-1] == "wrote runs/argon-crystal-108-1"
-    assert err == ""
 
 
 def test_run_as_json_is_one_document(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
     assert call("run", "argon/crystal-108", "--json") == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["flips_entered"] == 1_234
-    assert document["steps_per_second"] == 512.0
+    assert (document["flips_entered"], document["steps_per_second"]) == (1_234, 512.0)
     assert document["ase"]["force_max"] is None, "JSON has no NaN"
     assert document["folder"] == "runs/argon-crystal-108-1"
 
 
-@pytest.mark.parametrize(
-    ("severity", "expected"), [("info", 0), ("warning", 1), ("error", 1)]
-)  # fmt: skip
-def test_findings_decide_the_exit_code(
-    rollout: Recorder, capsys: pytest.CaptureFixture[str], severity: str, expected: int
-):
-    rollout.summary["findings"] = [
-        {"code": "x", "severity": severity, "title": "A title", "text": "Seen.", "remedy": "Do this."}
-    ]
+@pytest.mark.parametrize(("severity", "expected"), [("info", 0), ("warning", 1), ("error", 1)])
+def test_findings_decide_the_exit_code(rollout: Recorder, capsys, severity: str, expected: int):
+    finding = {"code": "x", "severity": severity, "title": "A title", "text": "Seen.", "remedy": "Do this."}
+    rollout.summary = {**SUMMARY, "findings": [finding]}
     assert call("run", "argon/crystal-108") == expected
-    out = capsys.readouterr().out
-    assert f"{severity}: A title" in out
-    assert "Do this." in out
+    lines = printed(capsys)
+    assert f"{severity}: A title" in lines and "Do this." in lines
 
 
 def test_a_run_that_did_not_end_is_a_finding(rollout: Recorder):
-    rollout.summary["status"] = "stopped"
+    rollout.summary = {**SUMMARY, "status": "stopped"}
     assert call("run", "argon/crystal-108") == 1
 
 
 def test_resume_needs_only_the_folder(rollout: Recorder):
     assert call("run", "--resume", "runs/x-1") == 0
     ((system, options),) = rollout.calls
-    assert system is None
-    assert options["out"] is None
-    assert options["resume"] == Path("runs/x-1")
+    assert system is options["out"] is None and options["resume"] == Path("runs/x-1")
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "words",
     [
-        ["run"],
-        ["run", "x", "--set", "no-equals-sign"],
-        ["run", "x", "--set", "a=1", "--set", "a=2"],
-        ["run", "x", "--steps", "0"],
-        ["run", "x", "--steps", "many"],
-        ["run", "x", "--no-such-option"],
-        ["run", "--resume", "a", "-o", "b"],
-        ["run", "--resume", "a", "--set", "a=1"],
-        ["no-such-verb"],
-        ["check", "energy"],
-        ["report"],
+        "run", "run x --set no-equals-sign", "run x --set a=1 --set a=2", "run x --steps 0",
+        "run x --steps many", "run x --no-such-option", "run --resume a -o b", "run --resume a --set a=1",
+        "no-such-verb", "check energy", "report", "report nowhere",
     ],
-)
-def test_mistakes_are_one_line_and_exit_2(
-    rollout: Recorder, capsys: pytest.CaptureFixture[str], arguments: list[str]
-):
-    assert call(*arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("mdnum: ")
-    assert err.count("\n") == 1
-    assert rollout.calls == []
-
-    assert call(*arguments, "--json") == 2
-    out, _ = capsys.readouterr()
-    assert json.loads(out)["error"]["exit_code"] == 2
+)  # fmt: skip
+def test_mistakes_are_one_line_and_exit_2(rollout: Recorder, capsys, words: str):
+    refused(capsys, *words.split())
+    assert not rollout.calls
 
 
 @pytest.mark.parametrize(
@@ -190,26 +123,19 @@ def test_mistakes_are_one_line_and_exit_2(
         (KeyboardInterrupt(), 130),
     ],
 )
-def test_errors_of_a_run_are_one_line(
-    rollout: Recorder, capsys: pytest.CaptureFixture[str], error: Exception, expected: int
-):
+def test_errors_of_a_run_are_one_line(rollout: Recorder, capsys, error: BaseException, expected: int):
     rollout.error = error
     assert call("run", "x", "--json") == expected
     out, err = capsys.readouterr()
-    assert err.startswith("mdnum: ")
-    assert err.count("\n") == 1
+    assert err.startswith("mdnum: ") and err.count("\n") == 1
     document = json.loads(out)["error"]
     if isinstance(error, InputError):
         assert document == {
-            "type": "InputError",
-            "message": "r_cut + skin is 9.5 Å",
-            "where": "a.toml",
-            "remedy": "Shrink it",
-            "exit_code": 2,
-        }
+            "type": "InputError", "message": "r_cut + skin is 9.5 Å", "where": "a.toml",
+            "remedy": "Shrink it", "exit_code": 2,
+        }  # fmt: skip
     if isinstance(error, OSError):
-        assert "No space left" in err
-        assert "series.parquet" in err
+        assert "No space left" in err and "series.parquet" in err
 
 
 def test_a_bug_keeps_its_traceback(rollout: Recorder):
@@ -302,76 +228,30 @@ def test_plain_makes_json_of_what_a_run_holds():
         plain(object())
 
 
-CRYSTAL = """
-about = "A crystal to try the command line on."
-units = "metal"
-[structure]
-builder = "fcc"
-symbol = "Ar"
-lattice_constant = 5.26
-repeat = [4, 4, 4]
-rattle = 0.05
-[potential]
-kind = "lennard-jones"
-sigma = 3.405
-epsilon = 0.0103235
-[cutoff]
-kind = "hard"
-radius = 8.5125
-[neighbors]
-skin = 1.0
-[dynamics]
-kind = "nve"
-timestep = 0.002
-temperature = 40.0
-steps = 100
-seed = 7
-"""
-
-
 @pytest.fixture
-def crystal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def crystal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A system file of one's own."""
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "crystal.toml"
-    path.write_text(CRYSTAL)
-    return path
+    assert call("systems", "copy", "argon/crystal-108", "mine") == 0
+    return "mine/crystal-108.toml"
 
 
-def test_systems_show_resolves_and_overrides(crystal: Path, capsys: pytest.CaptureFixture[str]):
-    assert call("systems", "show", "crystal.toml", "--set", "cutoff.kind=shifted") == 0
+def test_systems_are_shown_checked_and_copied(crystal: str, capsys: pytest.CaptureFixture[str]):
+    capsys.readouterr()
+    assert call("systems", "show", crystal, "--set", "cutoff.kind=shifted") == 0
     shown = tomllib.loads(capsys.readouterr().out)
     assert shown["cutoff"]["kind"] == "shifted"
     assert shown["precision"]["decision"] == "float64", "defaults are filled in"
-    assert call("systems", "show", "crystal.toml", "--set", "cutoff.kind=shifted", "--json") == 0
+    assert call("systems", "show", crystal, "--set", "cutoff.kind=shifted", "--json") == 0
     assert json.loads(capsys.readouterr().out) == shown
-
-
-def test_systems_check_says_fine_or_what_is_wrong(crystal: Path, capsys: pytest.CaptureFixture[str]):
-    assert call("systems", "check", "crystal.toml", "--json") == 0
-    assert json.loads(capsys.readouterr().out)["atoms"] == 256
-    assert call("systems", "check", "crystal.toml", "--set", "cutoff.radius=12") == 2
-    assert call("systems", "check", "crystal.toml", "--set", "cutoff.radus=8") == 2
-    err = capsys.readouterr().err
-    assert "radius" in err.splitlines()[-1], "the nearest known key"
-    assert call("systems", "check", "nowhere.toml") == 2
-
-
-def test_systems_list_and_copy_shipped_ones(crystal: Path, capsys: pytest.CaptureFixture[str]):
-    assert call("systems", "list", "--json") == 0
-    listed = json.loads(capsys.readouterr().out)["systems"]
-    assert "argon/liquid-864" in [row["name"] for row in listed]
-    assert all(row["about"] and row.get("atoms", row.get("balls")) > 0 for row in listed)
-    assert call("systems", "list") == 0
-    assert "argon/liquid-864" in capsys.readouterr().out
-
-    assert call("systems", "copy", "argon/liquid-864", "mine") == 0
-    assert Path("mine/liquid-864.toml").is_file()
-    assert call("systems", "check", "mine/liquid-864.toml") == 0
-    assert call("systems", "copy", "argon/liquid-864", "mine") == 2, "nothing is overwritten"
+    refused(capsys, "systems", "check", crystal, "--set", "cutoff.radius=12")
+    assert "radius" in refused(capsys, "systems", "check", crystal, "--set", "cutoff.radus=8")
+    refused(capsys, "systems", "check", "nowhere.toml")
+    refused(capsys, "systems", "copy", "argon/crystal-108", "mine")  # nothing is overwritten
 
 
 def test_check_prints_every_record_and_exits_by_agreement(
-    crystal: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    crystal: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     import mdnum.references.energy_check as checks
 
@@ -389,10 +269,10 @@ def test_check_prints_every_record_and_exits_by_agreement(
     for ok in (True, False):
         monkeypatch.setattr(checks, "check_energy", lambda system, ok=ok: asked.append(system) or Report(ok))
         expected = 0 if ok else 1
-        assert call("check", "energy", "crystal.toml", "--set", "cutoff.kind=shifted") == expected
+        assert call("check", "energy", crystal, "--set", "cutoff.kind=shifted") == expected
         out = capsys.readouterr().out
         assert all(word in out for word in ("first", "last", "1.25", "2.5"))
-        assert call("check", "energy", "crystal.toml", "--json") == expected
+        assert call("check", "energy", crystal, "--json") == expected
         assert json.loads(capsys.readouterr().out)["ok"] is ok
     assert asked[0].spec.cutoff.kind == "shifted"
 
@@ -416,35 +296,23 @@ def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeyp
         assert json.loads(capsys.readouterr().out)["rows"][0]["status"] == status
 
 
-def test_report_of_no_run_is_a_mistake(crystal: Path, capsys: pytest.CaptureFixture[str]):
-    assert call("report", "nowhere") == 2
-    assert capsys.readouterr().err.startswith("mdnum: ")
-
-
-def test_a_real_run_its_report_and_its_resumption(crystal: Path, capsys: pytest.CaptureFixture[str]):
-    assert call("run", "crystal.toml", "--steps", "30", "--save-every", "10", "-o", "here", "--json") in (
-        0,
-        1,
-    )
+def test_a_real_run_its_report_and_its_resumption(crystal: str, capsys: pytest.CaptureFixture[str]):
+    capsys.readouterr()
+    assert call("run", crystal, "--steps", "30", "--save-every", "10", "-o", "here", "--json") in (0, 1)
     document = json.loads(capsys.readouterr().out)
-    assert document["folder"] == "here"
-    assert document["steps"] == 30
-    assert document["ase"]["energy_rel"] < 1e-12
+    assert (document["folder"], document["steps"]) == ("here", 30) and document["ase"]["energy_rel"] < 1e-12
     assert document == {"folder": "here", **json.loads(Path("here/summary.json").read_text())}
     written = {path.name for path in Path("here").iterdir()}
     assert {"system.toml", "provenance.json", "flips.parquet", "trajectory.traj", "report.html"} <= written
-
-    assert call("run", "crystal.toml", "-o", "here") == 2, "a folder that holds a run is not written to"
-    assert "here" in capsys.readouterr().err
-
+    # a folder that holds a run is not written to
+    assert "here" in refused(capsys, "run", crystal, "-o", "here")
+    refused(capsys, "run", "--resume", "nowhere")
     Path("here/report.html").unlink()
     assert call("report", "here", "--json") == 0
     assert json.loads(capsys.readouterr().out)["report"] == "here/report.html"
     assert "<html" in Path("here/report.html").read_text(encoding="utf-8")
-
     assert call("run", "--resume", "here", "--steps", "40", "--no-check", "--no-report", "--json") in (0, 1)
     assert json.loads(capsys.readouterr().out)["steps"] == 40
-    assert call("run", "--resume", "nowhere") == 2
 
 
 _FLYING = """2

@@ -27,11 +27,9 @@ def copper(tmp_path: Path, monkeypatch) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("ase.calculators.emt:ETM",), "Did you mean EMT?"),
         (("nowhere.py",), "no such file"),
         ((EMT, "--checks", "curls"), "Did you mean curl?"),
         ((EMT, "-s", "no.xyz"), "no.xyz"),
-        ((f"{EMT}(open('x'))",), "not a literal"),
         ((EMT, "-s", "cu.extxyz", "--timestep", "0", "--checks", "dynamics"), "expected one above 0"),
     ],
 )

@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import Recorder, call, printed
 
-import mdnum.verbs
+import mdnum
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
 from mdnum.verbs import demos
 from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, table
 
 
-@dataclass
-class Recorder:
-    error: BaseException | None = None
-    calls: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
-
-    def __call__(self, system: Any, **options: Any) -> Any:
-        self.calls.append((system, options))
-        raise self.error or InputError("enough")
-
-
 @pytest.fixture
 def bounce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum ball` in an empty folder with the run replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum.verbs, "bounce", recorder)
+    monkeypatch.setattr(mdnum, "bounce", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 
@@ -43,42 +31,26 @@ def test_ball_passes_on_what_was_asked(bounce: Recorder):
         "--against", "precision.state=float32", "--against", "contact.k=3e4", "--no-report",
     )  # fmt: skip
     ((system, options),) = bounce.calls
-    assert system == "ball/drop"
-    assert isinstance(options.pop("progress"), ProgressBar)
+    assert system == "ball/drop" and isinstance(options.pop("progress"), ProgressBar)
     assert options == {
-        "out": Path("here"),
-        "steps": 20,
-        "overrides": {"contact.k": "2e4"},
+        "out": Path("here"), "steps": 20, "overrides": {"contact.k": "2e4"}, "report": False,
         "against": ["precision.state=float32", "contact.k=3e4"],
-        "report": False,
-    }
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "words",
     [
-        ["ball", "x", "--set", "no-equals-sign"],
-        ["ball", "x", "--steps", "0"],
-        ["ball", "--demo", "fork", "x"],
-        ["ball", "--demo", "fork", "--set", "a=1"],
-        ["ball", "--demo", "fork", "--against", "a=1"],
-        ["ball", "--demo", "fork", "--steps", "3"],
-        ["ball", "--demo", "forc"],
+        "x --set no-equals-sign", "x --steps 0", "--demo fork x", "--demo fork --set a=1",
+        "--demo fork --against a=1", "--demo fork --steps 3", "--demo forc",
     ],
-)
-def test_mistakes_are_one_line_and_exit_2(
-    bounce: Recorder, capsys: pytest.CaptureFixture[str], arguments: list[str]
-):
-    assert call(*arguments) == 2
+)  # fmt: skip
+def test_mistakes_are_one_line_and_exit_2(bounce: Recorder, capsys, words: str):
+    assert call("ball", *words.split()) == 2
     out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("mdnum: ")
-    assert err.count("\n") == 1
-    assert bounce.calls == []
-    if arguments[-1] == "forc":
+    assert out == "" and err.startswith("mdnum: ") and err.count("\n") == 1 and bounce.calls == []
+    if words.endswith("forc"):
         assert "Did you mean fork?" in err and all(name in err for name in demos.names())
-    assert call(*arguments, "--json") == 2
-    assert json.loads(capsys.readouterr().out)["error"]["exit_code"] == 2
 
 
 def test_errors_of_a_run_are_one_line(bounce: Recorder, capsys: pytest.CaptureFixture[str]):
@@ -104,19 +76,14 @@ def test_each_world_points_to_the_other(capsys: pytest.CaptureFixture[str], tmp_
 def test_ball_alone_lists_systems_and_demonstrations(capsys: pytest.CaptureFixture[str]):
     assert call("ball") == 0
     out = capsys.readouterr().out
-    assert "ball/zeno" in out and "argon" not in out
-    assert all(name in out for name in demos.names())
+    assert "ball/zeno" in out and "argon" not in out and all(name in out for name in demos.names())
     assert call("ball", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in document["demos"]] == demos.names()
     assert {row["name"]: row["balls"] for row in document["systems"]}["ball/batch-on-the-boundary"] == 9
 
 
-def test_systems_of_both_worlds_are_listed_shown_and_checked(capsys: pytest.CaptureFixture[str]):
-    assert call("systems", "list", "--json") == 0
-    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["systems"]}
-    assert rows["ball/drop"]["balls"] == 1
-    assert rows["argon/crystal-108"]["atoms"] == 108
+def test_a_ball_is_shown_and_checked(capsys: pytest.CaptureFixture[str]):
     assert call("systems", "show", "ball/drop", "--set", "contact.k=2e4", "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert (shown["contact"]["k"], shown["precision"]["reduction"]) == (2e4, "sequential")
@@ -153,7 +120,7 @@ def demo(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Demo]:
 
 def test_a_demonstration_for_people(demo: dict[str, Demo], capsys: pytest.CaptureFixture[str]):
     assert call("ball", "--demo", "fork", "-o", "page") == 0
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    lines = printed(capsys)
     for line in ("Why?", "large first 0.0009760856628", "ok it holds 1.5 1.5", "1 1.0000001"):
         assert line in lines
     assert "and 18 more, which report.html shows" in lines
@@ -201,10 +168,8 @@ def test_a_real_run_and_its_report(tmp_path: Path, monkeypatch, capsys: pytest.C
     assert code == 1, "decisions within rounding are a finding"
     document = json.loads(capsys.readouterr().out)
     assert document == {"folder": "here", **json.loads(Path("here/summary.json").read_text())}
-    assert document["iterations_total"] == 1
     # the sum sits on its tolerance; that the balls then lie at 0 exactly is no matter of rounding
     assert (document["ambiguous_stops"], document["ambiguous_contacts"]) == (1, 0)
-    assert document["gradient"][0]["gradient"]["k"] == pytest.approx(-8.198e-8, rel=1e-3)
     assert [variant["fork"] for variant in document["variants"]] == [None]
     page = Path("here/report.html").read_text(encoding="utf-8")
     assert call("report", "here", "--json") == 0

@@ -16,6 +16,7 @@ from mdnum.gradients import Problem, parameters
 from mdnum.gradients.differences import Ensemble, SmoothedDifferences
 from mdnum.gradients.losses import parse
 from mdnum.store import RunFolder
+from mdnum.store.files import write_text
 from mdnum.systems import build
 from mdnum.verbs import frame
 

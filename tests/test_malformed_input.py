@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 from command_line import call
 
+import mdnum
 from mdnum.errors import InputError, MdnumError, printable
+from mdnum.report.finding import Finding
 from mdnum.systems import load, toml
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "malformed_input.py"
@@ -117,18 +119,16 @@ def test_names_of_a_system_reach_no_terminal_raw(campaign: Any, tmp_path: Path, 
     from mdnum.cli import output
 
     output.print_table("\x1b[2J", ("a",), [["\x9bx"]])
-    output.print_findings([{"severity": "info", "title": "\x1b[31m", "text": "\u202e"}])
+    output.print_findings([Finding("X", "info", "\x1b[31m", "\u202e")])
     assert not {"\x1b", "\x9b", "\u202e"} & set(capsys.readouterr().out)
 
 
 def test_a_backend_that_jax_does_not_have_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys):
-    import mdnum.verbs
-
     def run(*_: Any, **__: Any) -> None:
         raise RuntimeError("Unable to initialize backend 'nonsense': Backend 'nonsense' is not in the list")
 
     monkeypatch.setenv("JAX_PLATFORMS", "nonsense")
-    monkeypatch.setattr(mdnum.verbs, "run", run)
+    monkeypatch.setattr(mdnum, "run", run)
     assert call("run", "x") == 2
     said = capsys.readouterr().err
     assert said.startswith("mdnum: jax cannot use JAX_PLATFORMS='nonsense'") and said.count("\n") == 1

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import typer
 
+import mdnum
 from mdnum.cli import output
-from mdnum.cli.progress import watched
 
 
+@output.question(output.changed)
 def grad(
-    system: str = typer.Argument(
-        metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
-    ),
+    system: str = output.SYSTEM_ARGUMENT,
     of: str | None = typer.Option(
         None, metavar="LOSS", help="What to differentiate: msd, vacf, potential, temperature, pressure, ..."
     ),
@@ -39,30 +38,10 @@ def grad(
         "--no-half-step",
         help="Do not make the gradient at half the time step too; then nothing is called trusted.",
     ),
-    settings: list[str] | None = output.SET_OPTION,
-    out: Path | None = typer.Option(
-        None, "-o", "--out", metavar="DIR", help="The gradient folder; runs/grad-NAME-N by default."
-    ),
-    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
-    as_json: bool = output.JSON_OPTION,
-) -> int:
+    how: Any = None,
+) -> Any:
     """Differentiate a loss through a rollout, compare the ways of doing it, and say how far to trust it."""
-    overrides = output.parse_overrides(settings)
-    from mdnum.verbs import grad as differentiate
-
-    with watched() as progress:
-        outcome = differentiate(
-            system,
-            of,
-            wrt or (),
-            steps=steps,
-            methods=methods or None,
-            replicas=replicas,
-            also=also or (),
-            half_step=not no_half_step,
-            out=out,
-            overrides=overrides,
-            report=not no_report,
-            progress=progress,
-        )
-    return output.print_outcome(outcome, as_json=as_json)
+    return mdnum.grad(
+        system, of, wrt or (), steps=steps, methods=methods or None, replicas=replicas, also=also or (),
+        half_step=not no_half_step, **how,
+    )  # fmt: skip

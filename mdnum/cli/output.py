@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,9 +35,11 @@ _MOST_ROWS = 12
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
 
 JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
-NO_REPORT_OPTION = typer.Option(False, "--no-report", help="Do not write report.html.")
 SET_OPTION = typer.Option(
     None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
+)
+SYSTEM_ARGUMENT = typer.Argument(
+    metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
 )
 
 
@@ -83,41 +86,74 @@ def refuse_beside_resume(given: Mapping[str, Any], what: str) -> None:
     refuse(asked, f"of a new {what}", "Leave it out beside --resume, or begin in a new folder")
 
 
-def answered(
-    verb: Callable[..., Outcome],
-    *words: Any,
-    no_report: bool,
-    as_json: bool,
-    remedy: Callable[[], str | None] | None = None,
-    **options: Any,
-) -> int:
-    """Calls a verb beside a progress bar and prints its answer; returns the exit code.
+def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
+    """Changes to a system file, as a verb takes them."""
+    return {"overrides": parse_overrides(settings)}
+
+
+def _kept(
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The new folder; one in runs by default."
+    ),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+) -> dict[str, Any]:
+    """Where the answer goes, as a verb takes it."""
+    return {"out": out, "report": not no_report}
+
+
+def question(
+    *groups: Callable[..., dict[str, Any]],
+    noted: Sequence[str] = (),
+    remedy: Callable[[Mapping[str, Any]], str | None] | None = None,
+) -> Callable[[Callable[..., Any]], Callable[..., int]]:
+    """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
 
     Args:
-        remedy: asked what to do after control-C.
-        words, options: of the verb.
-
-    Raises:
-        Stopped: control-C ended it without an answer.
+        groups: functions whose parameters are options of the command too; what they return, the new folder
+            and the progress are one dictionary of the function's, `how`. It may return a function instead of
+            an outcome, which is called with whether JSON was asked for.
+        noted: parameters that are folders to be read; what is not as it was written there is said on stderr.
+        remedy: asked what to do after control-C, with everything that was given.
     """
-    from mdnum.cli.progress import watched
-    from mdnum.store import RunFolder
 
-    resumed = options.get("resume")
-    # looked at before the folder is listed anew, and said where nothing is worse
-    notes = RunFolder.open(resumed).noted() if resumed is not None and resumed.is_dir() else []
-    stopped = False
-    with watched(remedy) as progress:
-        try:
-            outcome = verb(*words, report=not no_report, progress=progress, **options)
-        except KeyboardInterrupt as stop:
-            # what was found until then may be an answer
-            if (outcome := getattr(stop, "outcome", None)) is None:
-                raise
-            stopped = True
-    print_lines(notes)
-    code = print_outcome(outcome, as_json=as_json)
-    return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
+    def decorate(ask: Callable[..., Any]) -> Callable[..., int]:
+        def command(*, as_json: bool, **given: Any) -> int:
+            from mdnum.cli.progress import watched
+            from mdnum.store import RunFolder
+
+            how: dict[str, Any] = {}
+            for group in (*groups, _kept):
+                how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
+            folders = dict.fromkeys(given[name] for name in noted if given[name] is not None)
+            # looked at before a folder is listed anew, and said where nothing is worse
+            wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
+            stopped = False
+            with watched(lambda: remedy({**given, **how}) if remedy else None) as progress:
+                how["progress"] = progress
+                try:
+                    outcome: Any = ask(**given, how=how)
+                except KeyboardInterrupt as stop:
+                    # what was found until then may be an answer
+                    if (outcome := getattr(stop, "outcome", None)) is None:
+                        raise
+                    stopped = True
+            if not hasattr(outcome, "verdict"):
+                return outcome(as_json)
+            print_lines(wrong)
+            code = print_outcome(outcome, as_json=as_json)
+            return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
+
+        whole: Any = command
+        sources = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups, _kept)]
+        parameters = {name: each for one in sources for name, each in one.items() if name != "how"}
+        alone = inspect.Parameter.KEYWORD_ONLY
+        parameters["as_json"] = inspect.Parameter("as_json", alone, default=JSON_OPTION, annotation=bool)
+        whole.__signature__ = inspect.Signature([each.replace(kind=alone) for each in parameters.values()])
+        whole.__annotations__ = {name: each.annotation for name, each in parameters.items()}
+        whole.__name__, whole.__doc__ = ask.__name__, ask.__doc__
+        return command
+
+    return decorate
 
 
 def print_json(document: Mapping[str, Any]) -> int:

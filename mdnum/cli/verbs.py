@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
 
+import mdnum
 from mdnum.cli import output
 from mdnum.cli.fork import fork
 from mdnum.cli.grad import grad
@@ -29,12 +30,7 @@ app.add_typer(fork, name="fork")
 app.add_typer(systems, name="systems")
 app.add_typer(check, name="check")
 
-_SYSTEM = typer.Argument(metavar="SYSTEM", help="A name from `mdnum systems list`, or a TOML file.")
 _STEPS = typer.Option(None, min=1, help="Steps to run, instead of the system's own.")
-
-
-def _out(help: str) -> Any:
-    return typer.Option(None, "-o", "--out", metavar="DIR", help=help)
 
 
 def _show_version(wanted: bool) -> None:
@@ -57,51 +53,48 @@ def _top(
 # -- simulations
 
 
+def _resume_run(given: Mapping[str, Any]) -> str | None:
+    from mdnum.store.files import resumable
+
+    folder = given["resume"] or given["out"]
+    if folder is None or not folder.exists():
+        return None
+    kept = f"Continue with `mdnum run --resume {folder}`"
+    return kept if resumable(folder) else "Nothing of it was kept: give the command again"
+
+
 @app.command()
+@output.question(output.changed, noted=["resume"], remedy=_resume_run)
 def run(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
     ),
-    out: Path | None = _out("The run folder; runs/NAME-N by default."),
     steps: int | None = _STEPS,
     save_every: int | None = typer.Option(
         None, min=0, metavar="K", help="Write every K-th frame to trajectory.traj; 0 writes none."
     ),
-    settings: list[str] | None = output.SET_OPTION,
     resume: Path | None = typer.Option(None, metavar="DIR", help="Continue the run in this folder."),
     no_check: bool = typer.Option(False, "--no-check", help="Do not compare with ASE."),
-    no_report: bool = output.NO_REPORT_OPTION,
-    as_json: bool = output.JSON_OPTION,
-) -> int:
+    how: Any = None,
+) -> Any:
     """Simulate a system and record every flip."""
-    overrides = output.parse_overrides(settings)
     if resume is not None:
         given = {
-            "SYSTEM": system, "--out": None if out == resume else out, "--save-every": save_every,
-            "--set": overrides or None,
+            "SYSTEM": system, "--out": None if how["out"] == resume else how["out"],
+            "--save-every": save_every, "--set": how["overrides"] or None,
         }  # fmt: skip
         output.refuse_beside_resume(given, "run")
     elif system is None:
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
-    from mdnum.store.files import default_folder, resumable
-    from mdnum.verbs import run as simulate
+    else:
+        from mdnum.store.files import default_folder
 
-    folder = resume or out or default_folder(str(system))
-
-    def remedy() -> str | None:
-        if not folder.exists():
-            return None
-        kept = f"Continue with `mdnum run --resume {folder}`"
-        return kept if resumable(folder) else "Nothing of it was kept: give the command again"
-
-    return output.answered(
-        simulate, system, out=out if resume else folder, steps=steps, save_every=save_every,
-        overrides=overrides, resume=resume, check=not no_check, no_report=no_report, as_json=as_json,
-        remedy=remedy,
-    )  # fmt: skip
+        how["out"] = how["out"] or default_folder(system)
+    return mdnum.run(system, steps=steps, save_every=save_every, resume=resume, check=not no_check, **how)
 
 
 @app.command()
+@output.question(output.changed)
 def ball(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A ball's name from `mdnum systems list`, or the path of a TOML file."
@@ -109,34 +102,23 @@ def ball(
     demo: str | None = typer.Option(
         None, "--demo", metavar="NAME", help="Run a demonstration instead, or all of them: --demo all."
     ),
-    out: Path | None = _out("The run folder; runs/NAME-N by default."),
     steps: int | None = _STEPS,
-    settings: list[str] | None = output.SET_OPTION,
     against: list[str] | None = typer.Option(
         None, metavar="KEY=VALUE", help="Compare with the system with this key changed; repeatable."
     ),
-    no_report: bool = output.NO_REPORT_OPTION,
-    as_json: bool = output.JSON_OPTION,
-) -> int:
+    how: Any = None,
+) -> Any:
     """Bounce a ball and record every decision, or run a demonstration."""
-    shown: dict[str, Any] = {"out": out, "no_report": no_report, "as_json": as_json}
-    if demo is not None:
-        given = {"a system": system, "--steps": steps, "--set": settings, "--against": against}
-        if foreign := [name for name, value in given.items() if value]:
-            raise InputError(
-                f"a demonstration has its own balls, so it takes no {foreign[0].removeprefix('a ')}",
-                remedy="Leave one of them out",
-                where="--demo",
-            )
-        from mdnum.verbs.demos import demonstrate
-
-        return output.answered(demonstrate, demo, **shown)
-    if system is None:
-        return _balls(as_json)
-    overrides = output.parse_overrides(settings)
-    from mdnum.verbs import bounce
-
-    return output.answered(bounce, system, steps=steps, overrides=overrides, against=against or (), **shown)
+    if demo is None:
+        return _balls if system is None else mdnum.bounce(system, steps=steps, against=against or (), **how)
+    given = {"system": system, "--steps": steps, "--set": how.pop("overrides"), "--against": against}
+    if foreign := [name for name, value in given.items() if value]:
+        raise InputError(
+            f"a demonstration has its own balls, so it takes no {foreign[0]}",
+            remedy="Leave one of them out",
+            where="--demo",
+        )
+    return mdnum.demonstrate(demo, **how)
 
 
 def _balls(as_json: bool) -> int:
@@ -164,6 +146,7 @@ app.command()(grad)
 
 
 @app.command()
+@output.question()
 def flips(
     trajectory: str = typer.Argument(
         metavar="TRAJECTORY",
@@ -199,17 +182,12 @@ def flips(
     format: str | None = typer.Option(
         None, "--format", metavar="WORD", help="The file's format, where its name does not tell."
     ),
-    out: Path | None = _out("The new folder; runs/flips-NAME-N by default."),
-    no_report: bool = output.NO_REPORT_OPTION,
-    as_json: bool = output.JSON_OPTION,
-) -> int:  # fmt: skip
+    how: Any = None,
+) -> Any:  # fmt: skip
     """Find every pair that entered or left a cutoff between frames, and say what that tells and what not."""
-    from mdnum.verbs import flips as follow
-
-    return output.answered(
-        follow, trajectory, other, topology=topology, cutoffs=cutoffs or (), pairs=pairs or (),
-        nearest=nearest or (), most=most, between=between, window=window, format=format, out=out,
-        no_report=no_report, as_json=as_json,
+    return mdnum.flips(
+        trajectory, other, topology=topology, cutoffs=cutoffs or (), pairs=pairs or (),
+        nearest=nearest or (), most=most, between=between, window=window, format=format, **how,
     )  # fmt: skip
 
 
@@ -219,7 +197,14 @@ def _checks() -> str:
     return ", ".join(CHECKS)
 
 
+def _resume_audit(given: Mapping[str, Any]) -> str | None:
+    folder = given["resume"] or given["out"]
+    begun = folder is not None and (folder / "answers.json").exists()
+    return f"Continue with `mdnum audit --resume {folder}`" if begun else None
+
+
 @app.command()
+@output.question(noted=["resume"], remedy=_resume_audit)
 def audit(
     calculator: str | None = typer.Argument(
         None, metavar="CALCULATOR",
@@ -240,33 +225,29 @@ def audit(
     time: float | None = typer.Option(
         None, metavar="MINUTES", help="Ask nothing more after that; what was not asked is listed."
     ),
-    out: Path | None = _out("The audit folder; runs/audit-NAME-N by default."),
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Ask what the audit in this folder has not asked, of the same calculator."
     ),
-    no_report: bool = output.NO_REPORT_OPTION,
-    as_json: bool = output.JSON_OPTION,
-) -> int:  # fmt: skip
+    how: Any = None,
+) -> Any:  # fmt: skip
     """Ask any ASE calculator: is it smooth, invariant, conservative, free of memory, does it keep energy?
 
     Runs the Python that makes the calculator, with --resume what the folder names. No other verb but
     `conform` runs Python that it is given.
     """
-    from mdnum.verbs.audit import audit as ask
-
-    folder = resume or out
-
-    def remedy() -> str | None:
-        begun = folder is not None and (folder / "answers.json").exists()
-        return f"Continue with `mdnum audit --resume {folder}`" if begun else None
-
-    return output.answered(
-        ask, calculator, structure, checks=checks or None, temperature=temperature, timestep=timestep,
-        steps=steps, time=time, out=out, resume=resume, no_report=no_report, as_json=as_json, remedy=remedy,
+    return mdnum.audit_calculator(
+        calculator, structure, checks=checks or None, temperature=temperature, timestep=timestep,
+        steps=steps, time=time, resume=resume, **how,
     )  # fmt: skip
 
 
+def _resume_conform(given: Mapping[str, Any]) -> str:
+    name = given["resume"] or given["out"] or "DIR, which is the newest runs/conform-NAME-N"
+    return f"What was found is in the folder; resume it with `mdnum conform --resume {name}`"
+
+
 @app.command()
+@output.question(noted=["resume"], remedy=_resume_conform)
 def conform(
     pairs: str | None = typer.Argument(
         None, metavar="[LIST]",
@@ -296,32 +277,26 @@ def conform(
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Resume the examination in this folder, with its options."
     ),
-    out: Path | None = _out("The folder; runs/conform-NAME-N by default."),
-    no_report: bool = output.NO_REPORT_OPTION,
-    as_json: bool = output.JSON_OPTION,
-) -> int:  # fmt: skip
+    how: Any = None,
+) -> Any:  # fmt: skip
     """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale.
 
     Runs the Python of the list, with --resume of the list that the folder names. No other verb but `audit`
     runs Python that it is given.
     """
     if pairs is None and resume is None:
-        return _lists(as_json)
+        return _lists
     if resume is not None:
         given = {
             "LIST": pairs, "--cases": cases, "--seed": seed or None, "--full": full, "--precision": precision,
-            "--superset": superset or None, "--limits": limits, "--no-large": no_large or None, "--out": out,
+            "--superset": superset or None, "--limits": limits, "--no-large": no_large or None,
+            "--out": how["out"],
         }  # fmt: skip
         output.refuse_beside_resume(given, "examination")
-    from mdnum.verbs.conform import conform as examine
-
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
-    name = resume or out or "DIR, which is the newest runs/conform-NAME-N"
-    return output.answered(
-        examine, pairs, cases=cases, seed=seed, large=not no_large, full=full, precision=precision,
-        superset=superset or None, limits=words, time=time, out=out, resume=resume, no_report=no_report,
-        as_json=as_json,
-        remedy=lambda: f"What was found is in the folder; resume it with `mdnum conform --resume {name}`",
+    return mdnum.conform(
+        pairs, cases=cases, seed=seed, large=not no_large, full=full, precision=precision,
+        superset=superset or None, limits=words, time=time, resume=resume, **how,
     )  # fmt: skip
 
 
@@ -349,8 +324,7 @@ def _lists(as_json: bool) -> int:
 
 @app.command()
 def report(
-    folder: Path = typer.Argument(metavar="DIR", help="A run folder."),
-    as_json: bool = output.JSON_OPTION,
+    folder: Path = typer.Argument(metavar="DIR", help="A run folder."), as_json: bool = output.JSON_OPTION
 ) -> int:
     """Write the report of a run folder again."""
     from mdnum.verbs import frame
@@ -398,7 +372,7 @@ def list_systems(as_json: bool = output.JSON_OPTION) -> int:
 
 @systems.command()
 def show(
-    system: str = _SYSTEM,
+    system: str = output.SYSTEM_ARGUMENT,
     settings: list[str] | None = output.SET_OPTION,
     as_json: bool = output.JSON_OPTION,
 ) -> int:
@@ -409,7 +383,7 @@ def show(
 
 @systems.command("check")
 def check_system(
-    system: str = _SYSTEM,
+    system: str = output.SYSTEM_ARGUMENT,
     settings: list[str] | None = output.SET_OPTION,
     as_json: bool = output.JSON_OPTION,
 ) -> int:
@@ -421,7 +395,7 @@ def check_system(
 
 @systems.command()
 def copy(
-    system: str = _SYSTEM,
+    system: str = output.SYSTEM_ARGUMENT,
     target: Path = typer.Argument(Path(), metavar="[DIR]", help="Where to; here by default."),
     as_json: bool = output.JSON_OPTION,
 ) -> int:
@@ -455,7 +429,7 @@ def _compared(question: str, title: str, help: str) -> Callable[..., int]:
 
     @check.command(question, help=help)
     def compare(
-        system: str = _SYSTEM,
+        system: str = output.SYSTEM_ARGUMENT,
         settings: list[str] | None = output.SET_OPTION,
         as_json: bool = output.JSON_OPTION,
     ) -> int:

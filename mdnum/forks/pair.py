@@ -266,7 +266,7 @@ def _judged(
         first = len(free) - 1
         seed = first if seed is None else seed
         (name,) = ended
-        cause = f"run {name} ended in a {failed[name]} at step {first} and run {'AB'[name == 'A']} did not"
+        cause = {"run": name, "word": failed[name], "step": first, "other": "AB"[name == "A"]}
     dates = Dates(seed, first, splits["B"])
     together = [flip for flip in flips if flip.step == first]
     decision = None

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import comb
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -151,6 +151,8 @@ def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
 
 # --- dates, growth and verdict of a pair ----------------------------------------------------------------
 
+#: A code, and the values of its sentence.
+Reason = tuple[str, dict[str, Any]]
 Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
 #: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
@@ -298,14 +300,14 @@ class ForkVerdict:
         threshold: delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise;
             None where no pairs were counted.
         count: of the pair and its repeats, those that split later; None where none were counted.
-        reasons: the criteria, in words with their numbers.
+        reasons: the criteria: codes, each with its numbers.
     """
 
     word: Word
     free: int | None
     handed: int | None
     nats: float | None
-    reasons: tuple[str, ...]
+    reasons: tuple[Reason, ...]
     threshold: float | None = None
     count: Count | None = None
 
@@ -323,7 +325,7 @@ def judge(
     repeats: Sequence[Delay] = (),
     most: int = REPEATS,
     *,
-    ended: str | None = None,
+    ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
     """The verdict on a pair of runs.
 
@@ -335,76 +337,56 @@ def judge(
         tolerance: of the split, length.
         repeats: of the pair, the start perturbed by as much as the choice does.
         most: repeats that may be run in all.
-        ended: where the fork is that one run ended and the other did not: which and how, in words.
+        ended: where the fork is that one run ended and the other did not: values that say which and how.
     """
     last = len(free) - 1
     if ended is not None:
-        before = f"no decision differs in the {last} steps before"
-        return ForkVerdict("open", dates.split, None, None, (f"{ended}: that is the fork; {before}",))
+        return ForkVerdict("open", dates.split, None, None, (("ended", {**ended, "steps": last}),))
     if dates.seed is None:
-        return ForkVerdict("same", None, None, None, (f"no bit differs in {last} steps",))
+        return ForkVerdict("same", None, None, None, (("same", {"steps": last}),))
     if dates.fork is None:
-        text = f"no decision differs in {last} steps; the separation reaches {np.nanmax(free):.2g}"
-        reasons = (text,) if dates.split is not None else (text, *_outlook(free, tolerance))
+        reasons: tuple[Reason, ...] = (("no_fork", {"steps": last, "separation": float(np.nanmax(free))}),)
+        reasons += () if dates.split is not None else _outlook(free, tolerance)
         return ForkVerdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
-        reasons = _outlook(free, tolerance)
         other = None if handed is None else split_of(handed, tolerance)
-        if other is not None:
-            reasons += (
-                f"under the first run's decisions the runs do split, at step {other}: the decisions that "
-                "differ keep them together",
-            )
-        return ForkVerdict("open", None, other, None, reasons)
+        kept = () if other is None else (("together", {"step": other}),)
+        return ForkVerdict("open", None, other, None, (*_outlook(free, tolerance), *kept))
     if dates.split < dates.fork:
-        text = (
-            f"the runs had split at step {dates.split}, before any decision differed (step {dates.fork}): no "
-            "flip had a part in it"
-        )
-        return ForkVerdict("bystander", dates.split, None, None, (text,))
+        had: Reason = ("had_split", {"split": dates.split, "fork": dates.fork})
+        return ForkVerdict("bystander", dates.split, None, None, (had,))
     if handed is None:
-        text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
-        return ForkVerdict("open", dates.split, None, None, (text,))
+        return ForkVerdict("open", dates.split, None, None, (("not_run", {"split": dates.split}),))
     delay = Delay.of(free, handed, tolerance)
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
     if delay.handed is None:
         return _kept(dates.split, handed, tolerance, (delay, *repeats), most, rate)
     gained = delay.handed - dates.split
-    text = (
-        f"free, the runs split at step {dates.split}; under the first run's decisions at step "
-        f"{delay.handed}, {abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
-    )
-    return _counted((delay, *repeats), most, rate, gained, (text,))
+    values = {"split": dates.split, "imposed": delay.handed, "steps": abs(gained)}
+    return _counted((delay, *repeats), most, rate, gained, (("later" if gained >= 0 else "earlier", values),))
 
 
 def _counted(
-    delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[str, ...]
+    delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[Reason, ...]
 ) -> ForkVerdict:
     """The verdict where the runs split either way: how many of the pair and its repeats split later."""
     pair = delays[0]
     threshold = 0.0 if rate is None else NATS / rate
     nats = None if rate is None else rate * gained
     if nats is not None:
-        reasons += (f"the flips were worth {nats:.2g} e-foldings of the separation",)
+        reasons += (("worth", {"e_foldings": nats}),)
     found = count(delays, threshold, 1 + most)
-    later = "later" if rate is None else f"later by more than one e-folding ({threshold:.0f} steps)"
-    unseen = found.pairs - found.later - found.not_later
-    reasons += (
-        f"of the pair and {found.pairs - 1} repeats (all positions of B's start displaced at random by as "
-        "much as the choice separates the runs in their first 100 steps, an ulp at least) "
-        f"{found.later} split {later} without the flips and {found.not_later} do not"
-        + (f"; of {unseen} it was not seen" if unseen else ""),
-    )
-    made = found.delayed
+    counted = {"repeats": found.pairs - 1, "later": found.later, "not_later": found.not_later}
+    reasons += (("counted_any" if rate is None else "counted", {**counted, "threshold": threshold}),)
+    if unseen := found.pairs - found.later - found.not_later:
+        reasons += (("unseen", {"pairs": unseen}),)
+    made, need = found.delayed, found.needed
     word: Word = "undecided" if made is None else "accelerated" if made else "bystander"
-    if made is None:
-        need = found.needed
-        reasons += (
-            f"so few repeats cannot tell: at least {FEWEST} are needed"
-            if need is None
-            else f"that is not clear: {need[1]} of {need[0]} would be",
-        )
+    if made is None and need is None:
+        reasons += (("too_few", {"needed": FEWEST}),)
+    elif made is None and need is not None:
+        reasons += (("not_clear", {"need": need[1], "of": need[0]}),)
     return ForkVerdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
 
 
@@ -421,41 +403,27 @@ def _kept(
     seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
     reach = float(np.nanmax(handed)) if some.any() else 0.0
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
-    how = f"{below:.2g} e-foldings below the tolerance" if reach > 0 else "the same bits"
-    text = (
-        f"free, the runs split at step {free}; under the first run's decisions they do not up to step "
-        f"{seen}: the separation is {reach:.2g} at most, {how}"
-    )
+    values = {"split": free, "until": seen, "reach": reach, "below": below}
+    kept: Reason = ("kept" if reach > 0 else "kept_bits", values)
     if seen < PATIENCE * free:
-        more = (
-            f"only {seen - free} steps follow the split; run longer to tell a cause from a delay"
-            if seen > free
-            else "where it was ended"
-        )
-        return ForkVerdict("open", free, None, None, (text, more))
+        short: Reason = ("short", {"steps": seen - free}) if seen > free else ("cut_off", {})
+        return ForkVerdict("open", free, None, None, (kept, short))
     late = _expected(handed, tolerance, seen)
     if late is not None and late < _SAVED * free:
-        more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
-        return _counted(delays, most, rate, late - free, (text, more))
+        return _counted(delays, most, rate, late - free, (kept, ("late", {"step": round(late)})))
     if below < NATS:
-        more = "which is within one e-folding of it: no cause without a longer run"
-        return ForkVerdict("open", free, None, None, (text, more))
-    basis = (
-        f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, "
-        "and none on its way"
-    )
-    return ForkVerdict("cause", free, None, float("inf"), (text, basis))
+        return ForkVerdict("open", free, None, None, (kept, ("within", {})))
+    return ForkVerdict("cause", free, None, float("inf"), (kept, ("rests", {"ratio": seen / free})))
 
 
-def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[str, ...]:
+def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
     """How the separation stands at the end of a horizon without a split, and what is to be expected."""
-    seen = free[np.isfinite(free)]
-    text = f"after {len(free) - 1} steps the separation is {seen[-1]:.2g}, the tolerance {tolerance:.2g}"
+    seen = float(free[np.isfinite(free)][-1])
+    now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)
     if more is None:
-        return text, "it does not grow plainly enough in so few steps to predict a split"
-    rate = growth(free, tolerance).rate
-    return text, f"growing at {rate:.2g} a step it would split about {more:.0f} steps later"
+        return now, ("no_growth", {})
+    return now, ("growing", {"rate": growth(free, tolerance).rate, "steps": round(more)})
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:

@@ -127,33 +127,19 @@ class Scan:
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self, key: np.ndarray, step: np.ndarray, came: np.ndarray) -> None:
-        # flips are written in the order of their steps, which a stable sort keeps within each pair
+        # the last flip of each pair so far comes before those of this part, whose steps are in order too
+        count = np.r_[self._count, np.ones(len(key), np.int64)]
+        key, step, came = np.r_[self._key, key], np.r_[self._step, step], np.r_[self._inside, came]
         order = np.argsort(key, kind="stable")
-        key, step, came = key[order], step[order], came[order]
+        key, step, came, count = key[order], step[order], came[order], count[order]
         same = key[1:] == key[:-1]
-        self._add((step[1:] - step[:-1])[same], came[:-1][same], came[1:][same])
-        first = np.flatnonzero(np.r_[True, ~same])
-        last = np.r_[first[1:], len(key)] - 1
-        pairs = key[first]
-        at = np.searchsorted(self._key, pairs)
-        known = np.zeros(len(pairs), bool)
-        inner = at < len(self._key)
-        known[inner] = self._key[at[inner]] == pairs[inner]
-        seen = at[known]
-        self._add(step[first[known]] - self._step[seen], self._inside[seen], came[first[known]])
-        self._count[seen] += (last - first + 1)[known]
-        self._step[seen], self._inside[seen] = step[last[known]], came[last[known]]
-        new = ~known
-        self._count = np.insert(self._count, at[new], (last - first + 1)[new])
-        self._step = np.insert(self._step, at[new], step[last[new]])
-        self._inside = np.insert(self._inside, at[new], came[last[new]])
-        self._key = np.insert(self._key, at[new], pairs[new])
-
-    def _add(self, length: np.ndarray, inside: np.ndarray, then: np.ndarray) -> None:
-        """Stays that began inside or not, and where the flips lead that end them."""
+        length, inside, then = (step[1:] - step[:-1])[same], came[:-1][same], came[1:][same]
         self.alternates = self.alternates and not np.any(inside == then)
         for side in (0, 1):
             self._lengths[side] += np.bincount(length[inside == side], minlength=self._lengths.shape[1])
+        last = np.r_[~same, True]
+        self._count = np.add.reduceat(count, np.flatnonzero(np.r_[True, ~same]))
+        self._key, self._step, self._inside = key[last], step[last], came[last]
 
     def _keep_nearest(self, flips: Flips, ratio: np.ndarray) -> None:
         rows = {**flips, "ratio": ratio}

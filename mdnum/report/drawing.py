@@ -80,6 +80,8 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
                     axis.set_minor_formatter(NullFormatter())
                 elif isinstance(axis.get_major_formatter(), ScalarFormatter):
                     axis.set_major_formatter(_engineering())
+            # left of the legend
+            axes.yaxis.get_offset_text().set_horizontalalignment("right")
     return figure
 
 
@@ -151,18 +153,19 @@ def _plot(plot: Plot, figure: Canvas) -> None:
     for value, word in _apart(plot.verticals, bases["x"], axes.get_xlim()):
         axes.axvline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
         place = {"xy": (value, 0.98), "xycoords": axes.get_xaxis_transform(), "va": "top", "rotation": 90}
-        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right")
+        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right", gid=HALO)
     for value, word in _apart(plot.horizontals, bases["y"], axes.get_ylim()):
         axes.axhline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
         place = {"xy": (0.99, value), "xycoords": axes.get_yaxis_transform(), "va": "bottom"}
-        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right")
+        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right", gid=HALO)
     for setter, label, base in (
         (axes.set_xlabel, plot.x_label, bases["x"]),
         (axes.set_ylabel, plot.y_label, bases["y"]),
     ):
         text = f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label)
         setter(fill(text, 90 if setter == axes.set_xlabel else 40))
-    if len(plot.series) > 1 or plot.region is not None:
+    # a line alone is named too, unless the axis names it
+    if plot.region is not None or any(one.label != plot.y_label for one in plot.series):
         legend(axes)
 
 
@@ -211,7 +214,11 @@ def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
         # no more than eight decades on either side of zero
         setter("symlog", linthresh=max(np.abs(values[values != 0]).min(), largest * 1e-8))
     elif scale == "log" and np.any(values > 0):
-        setter("log", nonpositive="mask")
+        marks = plot.verticals if name == "x" else plot.horizontals
+        seen = np.concatenate([values, [value for value, _ in marks]])
+        # within a decade a logarithmic axis has no numbers on it
+        if plot.region or seen.min() <= 0 or seen.max() >= 10 * seen.min():
+            setter("log", nonpositive="mask")
 
 
 def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
@@ -240,9 +247,9 @@ def _region(axes: Axes, region: Region) -> None:
     x, y = (_edges(axis, log == "log") for axis, log in
             ((region.x, axes.get_xscale()), (region.y, axes.get_yscale())))  # fmt: skip
     for at, (color, word) in enumerate(zip(_CLASSES, region.words, strict=False)):
-        inside = np.pad(region.value == at, ((0, 0), (1, 1))).astype(int)
+        inside = (region.value == at).astype(int)
         axes.plot([], [], "s", color=color, alpha=0.5, label=word)
-        for row, steps in enumerate(np.diff(inside, axis=1)):
+        for row, steps in enumerate(np.diff(inside, axis=1, prepend=0, append=0)):
             # neighbors in a row are one rectangle: a cell each would make a page heavy
             starts, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
             bars = list(zip(x[starts], x[ends] - x[starts], strict=True))

@@ -74,16 +74,12 @@ def _anchor(title: str) -> str:
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
     """Findings that stand by themselves, each with those that name it as their cause."""
     findings = list(findings)
-    there = {finding.code for finding in findings}
-    heads = [finding for finding in findings if finding.cause not in there]
-    return [
-        (head, [one for one in findings if one.cause == head.code] if _first(head, heads) else [])
-        for head in heads
-    ]
-
-
-def _first(head: Finding, heads: list[Finding]) -> bool:
-    return next(one for one in heads if one.code == head.code) is head
+    codes = {finding.code for finding in findings}
+    below: dict[str, list[Finding]] = {}
+    for finding in findings:
+        below.setdefault(finding.cause, []).append(finding)
+    # of several with one code the first has them
+    return [(head, below.pop(head.code, [])) for head in findings if head.cause not in codes]
 
 
 def _render(template: str, **content: Any) -> str:

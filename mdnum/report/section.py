@@ -5,8 +5,9 @@ Nothing here draws or prints: `page` renders sections as HTML, `cli.output` prin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -52,6 +53,27 @@ def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20)
     """A table of dictionaries, its columns in the order in which they first occur."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
+
+
+def table_of(
+    rows: Iterable[Any],
+    columns: Mapping[str, str | Callable[[Any], Any]],
+    title: str = "",
+    shown: int = 20,
+    bad: Callable[[Any], Any] | None = None,
+) -> Table:
+    """A table with a row for each record.
+
+    Args:
+        rows: mappings.
+        columns: by their head, the key whose value they show, or a function of the record.
+        bad: whether the row of a record is marked.
+    """
+    rows = list(rows)
+    getters = [itemgetter(get) if isinstance(get, str) else get for get in columns.values()]
+    lines = [tuple(get(row) for get in getters) for row in rows]
+    marked = frozenset(k for k, row in enumerate(rows) if bad is not None and bad(row))
+    return Table(tuple(columns), lines, title, shown, marked)
 
 
 def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
@@ -105,6 +127,52 @@ class Series:
     mark: Mark = "line"
     role: Role = "first"
     dashed: bool = False
+
+
+#: Roles of lines that are drawn in order.
+ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
+
+
+def positive(values: np.ndarray) -> np.ndarray:
+    """Gaps where a logarithmic axis has no place: at zero, below it, and where there is no number."""
+    values = np.asarray(values, float)
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+
+
+def curves(
+    x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
+) -> tuple[Series, ...]:
+    """Lines in the order of the roles.
+
+    Args:
+        x: of all of them.
+        lines: by label.
+        log: for a logarithmic axis: values above 0, and no line without any.
+    """
+    if log:
+        lines = {label: positive(y) for label, y in lines.items() if np.any(np.nan_to_num(y) > 0)}
+    return tuple(
+        Series(label, x, y, mark, ROLES[k % len(ROLES)], dashed=k >= len(ROLES))
+        for k, (label, y) in enumerate(lines.items())
+    )
+
+
+def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
+    """The table of a folder that holds the points of its figures: a row for each.
+
+    Args:
+        lines: part, curve, label, x and y of each line.
+    """
+    lines = list(lines)
+    sizes = [len(line[3]) for line in lines]
+    words = zip(*(line[:3] for line in lines), strict=True) if lines else ((), (), ())
+    columns = {
+        name: np.repeat(np.array(column, dtype=str), sizes)
+        for name, column in zip(("part", "curve", "line"), words, strict=True)
+    }
+    for at, name in ((3, "x"), (4, "y")):
+        columns[name] = np.concatenate([np.asarray(line[at], float) for line in lines] or [np.zeros(0)])
+    return columns
 
 
 @dataclass(frozen=True)

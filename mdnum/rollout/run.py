@@ -312,7 +312,7 @@ def run(
     elif system is None:
         raise InputError("no system given", remedy="Name a system, or a folder to resume")
     else:
-        loaded = system if isinstance(system, System) else load(system, overrides, world="md")
+        loaded = load(system, overrides, world="md")
         rollout = _fresh(loaded, out, steps, save_every, progress, began)
     try:
         summary = rollout.run()

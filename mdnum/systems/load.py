@@ -48,12 +48,14 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
     return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
 
 
-def world_of(name: str | Path) -> str:
-    """ "md" or "ball", read from a system's file without checking it; "md" where that is no TOML.
+def world_of(name: Any) -> str:
+    """ "md" or "ball", of a loaded system or read from its file unchecked; "md" where that is no TOML.
 
     Raises:
         InputError: nothing of that name.
     """
+    if isinstance(name, System | BallSystem):
+        return "ball" if isinstance(name, BallSystem) else "md"
     try:
         return str(_world(find(name)[1]))
     except (ValueError, RecursionError):
@@ -340,16 +342,19 @@ def copy(name: str | Path, folder: str | Path) -> Path:
 # --- loading ------------------------------------------------------------------------------------------
 
 
+Named = System | BallSystem | str | Path
+
+
 @overload
-def load(name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["md"]) -> System: ...
+def load(name: Named, overrides: Mapping[str, Any] | None = None, *, world: Literal["md"]) -> System: ...
 @overload
 def load(
-    name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["ball"]
+    name: Named, overrides: Mapping[str, Any] | None = None, *, world: Literal["ball"]
 ) -> BallSystem: ...
 @overload
-def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Any: ...
+def load(name: Named, overrides: Mapping[str, Any] | None = None) -> Any: ...
 def load(
-    name: str | Path,
+    name: Named,
     overrides: Mapping[str, Any] | None = None,
     *,
     world: Literal["md", "ball"] | None = None,
@@ -357,7 +362,8 @@ def load(
     """A system by name or path, checked: a System, or a BallSystem where the file says `world = "ball"`.
 
     Args:
-        name: a shipped name, a path to a TOML file, or a folder that holds system.toml.
+        name: a shipped name, a path to a TOML file, a folder that holds system.toml, or a loaded system,
+            which is returned as it is.
         overrides: dotted key to value, as `--set` gives them: `{"cutoff.kind": "switched"}`; text is read as
             TOML would read it. Changing a kind drops the file's keys that the new kind does not have;
             changing the temperature or seed of an NVE run draws its velocities anew.
@@ -366,6 +372,12 @@ def load(
     Raises:
         InputError: anything that cannot be run, in one line.
     """
+    if isinstance(name, System | BallSystem):
+        if overrides:
+            remedy = "Load it with the overrides, or give its name"
+            raise InputError("overrides change a system while it is loaded", where=name.name, remedy=remedy)
+        _check_world(name.name, isinstance(name, BallSystem), world)
+        return name
     found, path = find(name)
     where = shown(path)
     try:
@@ -378,14 +390,18 @@ def load(
     values = read_overrides(overrides)
     source = Source(found, path, where, text, values)
     is_ball = _is_ball(data, where)
-    if world is not None and is_ball != (world == "ball"):
-        verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
-        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
+    _check_world(name, is_ball, world)
     root = BallSpec if is_ball else schema.SystemSpec
     apply_overrides(data, values, root)
     root.follow(data, values)
     spec = checked(root, data, source)
     return _ball(spec, source) if isinstance(spec, BallSpec) else _md(spec, source)
+
+
+def _check_world(name: str | Path, is_ball: bool, world: str | None) -> None:
+    if world is not None and is_ball != (world == "ball"):
+        verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
+        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
 
 
 def _is_ball(data: Mapping[str, Any], where: str) -> bool:

@@ -42,8 +42,8 @@ class Trajectory(ABC):
         64  # width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way
     )
     length: str = "Å"  # unit in words; "" where the file does not say
-    # unit in words; "frame" where the file has no times, whose numbers then stand for them (velocities are per
-    # ps there, if the file has any)
+    # unit in words; "frame" where the file has no times, whose numbers then stand for them (velocities are
+    # per ps there, if the file has any)
     time: str = "frame"
     table: AtomTable  # what is known of the atoms
     notes: tuple[str, ...] = ()  # what a reader of the results should know about the reading, each a sentence

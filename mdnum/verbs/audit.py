@@ -22,7 +22,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Key, Page, Plot, Section, Series, cell, pairs, records
+from mdnum.report.section import Code, Key, Page, Plot, Section, cell, curves, pairs, points_of, records
 from mdnum.report.words import count, heading, many, number
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
@@ -44,7 +44,6 @@ _TABLES = ("curves", "energies", "crossings")
 _BOLTZMANN = 8.617333262e-5
 #: A unit of a system with dimensions where text has one: not in the name of a file.
 _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
-_ROLES = ("first", "second", "third", "bad", "muted", "ink")
 
 
 def audit(
@@ -359,23 +358,17 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
     """Points of the figures, and what checks recorded."""
-    rows: list[tuple[str, str, str, float, float]] = []
-    tables: dict[str, dict[str, np.ndarray]] = {}
+    lines = [
+        (result.name, f"{result.name}-{place}", label, chart.x, values)
+        for result in state.shown
+        for place, chart in enumerate(result.charts, 1)
+        for label, values in chart.lines.items()
+    ]
+    tables = {"curves": points_of(lines)} if lines else {}
     for result in state.shown:
-        for place, chart in enumerate(result.charts, 1):
-            for line, values in chart.lines.items():
-                points = zip(chart.x, values, strict=True)
-                rows += [(result.name, f"{result.name}-{place}", line, x, y) for x, y in points]
         for name, columns in result.recorded.items():
             if next(iter(columns.values()), ()):
                 tables[name] = {column: np.array(values) for column, values in columns.items()}
-    if rows:
-        columns = zip(*rows, strict=True)
-        names = ("part", "curve", "line", "x", "y")
-        tables["curves"] = {
-            name: np.array(column, float if name in "xy" else str)
-            for name, column in zip(names, columns, strict=True)
-        }
     return tables
 
 
@@ -564,15 +557,12 @@ def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
 
 def _plot(result: CheckResult, place: int, given: units.Units) -> Plot:
     chart = result.charts[place]
-    few = len(chart.x) < 40
-    series = tuple(
-        Series(label, np.array(chart.x), np.array(line, float), "line+points" if few else "line", role)  # type: ignore[arg-type]
-        for (label, line), role in zip(_in_units(chart.lines, given).items(), _ROLES * 9, strict=False)
-    )
+    lines = {label: np.array(line, float) for label, line in _in_units(chart.lines, given).items()}
+    mark = "line+points" if len(chart.x) < 40 else "line"
     log_x = chart.log_y and "step" in chart.x_label and all(x > 0 for x in chart.x)
     words = {name: _in_units(getattr(chart, name), given) for name in ("title", "x_label", "y_label")}
     return Plot(
-        f"{result.name}-{place + 1}", **words, series=series,
+        f"{result.name}-{place + 1}", **words, series=curves(np.array(chart.x), lines, mark, log=False),
         x_scale="log" if log_x else "linear",
         y_scale="log" if chart.log_y else "linear",
         verticals=tuple((value, _in_units(word, given)) for word, value in chart.marks.items()),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
 from mdnum.verbs import frame
 from mdnum.verbs.ball_page import TEXTS, BallView, decision, page
-from mdnum.verbs.frame import Outcome, Progress, Verb
+from mdnum.verbs.frame import Keep, Outcome, Progress, Verb
 
 if TYPE_CHECKING:
     from mdnum.ball.problem import BallProblem
@@ -34,23 +34,17 @@ _NAMED = 4
 def bounce(
     system: BallSystem | str | Path,
     *,
-    out: str | Path | None = None,
     steps: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
     against: Sequence[str | Mapping[str, Any]] = (),
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a ball's system and its variants, record every contact and stop decision, and write a report.
 
     Args:
         system: a loaded system, a shipped name or the path of a system file.
-        out: the new run folder; default runs/<name>-<n>.
         steps: instead of the system's.
-        overrides: dotted keys to values, such as {"contact.k": 2e4}.
         against: further variants to compare with: "key=value", or several keys in a mapping.
-        report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures.
+        keep: see `frame.Keep`.
 
     Returns:
         the run's folder, summary and page; `result` is the `BallRun`.
@@ -61,15 +55,13 @@ def bounce(
     from mdnum.systems.build_ball import build_ball
     from mdnum.verbs import ball_record
 
-    simulation = build_ball(_loaded(system, overrides, against), steps=steps)
-    with frame.new_folder("ball", simulation.system.name, out, system=simulation.system) as folder:
-        began = time.perf_counter()
-        run, rate = _simulate(simulation.problem, progress)
-        made, apart = _differentiated(simulation, run, progress)
-        summary = ball_record.summarize(simulation, run) | made
-        summary |= {"steps_per_second": rate, "seconds": time.perf_counter() - began}
-        frame.store(folder, summary, ball_record.tables(run) | {"separations": apart})
-    return frame.finish(folder, report=report, result=run, progress=progress)
+    simulation = build_ball(_loaded(system, keep.get("overrides"), against), steps=steps)
+    with frame.answering("ball", simulation.system.name, simulation.system, **keep) as answer:
+        answer.result, rate = _simulate(simulation.problem, answer.log)
+        made, apart = _differentiated(simulation, answer.result, answer.log)
+        answer.summary = ball_record.summarize(simulation, answer.result) | made | {"steps_per_second": rate}
+        answer.tables = ball_record.tables(answer.result) | {"separations": apart}
+    return answer.outcome
 
 
 def _loaded(
@@ -77,19 +69,9 @@ def _loaded(
     overrides: Mapping[str, Any] | None,
     against: Sequence[str | Mapping[str, Any]],
 ) -> BallSystem:
-    from mdnum.systems import BallSystem, System, load
+    from mdnum.systems import load
 
-    if isinstance(system, System):
-        raise InputError("this system is molecular dynamics", where=system.name, remedy="Use mdnum.run")
-    if isinstance(system, BallSystem):
-        if overrides:
-            raise InputError(
-                "overrides change a system while it is loaded",
-                remedy="Load it with the overrides, or give its name",
-                where=system.name,
-            )
-    else:
-        system = load(system, overrides, world="ball")
+    system = load(system, overrides, world="ball")
     for changes in against:
         system = system.against(_changes(changes) if isinstance(changes, str) else changes)
     return system

@@ -13,7 +13,7 @@ from mdnum.report.analysis import margins_in_bounds
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs.frame import View
 
@@ -321,21 +321,20 @@ def _variants(view: BallView) -> Iterator[Any]:
             caption="Largest difference of heights between the run and each variant.",
         )  # fmt: skip
     slopes = list(variants[0]["gradient"])
-    cells = [
-        (
-            one["name"], one["seed"], one["fork"], "none differs" if one["fork"] is None else decision(one),
-            one["margin"], one["margin_there"], one["separation_end"], one["iterations_differ"],
-            number(one["loss"], 6),
-            *("0 (does not depend)" if not one["depends"].get(name, True)
-              else number(one["gradient"].get(name), 6) for name in slopes),
+
+    def slope(name: str) -> Callable[[Mapping[str, Any]], str]:
+        return lambda one: (
+            number(one["gradient"].get(name), 6) if one["depends"].get(name, True) else "0 (does not depend)"
         )
-        for one in variants
-    ]  # fmt: skip
-    heads = (
-        "variant", "seed", "fork", "decision", "margin here", "margin there", "separation at the end (m)",
-        "steps with other iterations", "loss", *(f"dloss/d{name}" for name in slopes),
-    )  # fmt: skip
-    yield Table(heads, cells)
+
+    yield table_of(variants, {
+        "variant": "name", "seed": "seed", "fork": "fork",
+        "decision": lambda one: "none differs" if one["fork"] is None else decision(one),
+        "margin here": "margin", "margin there": "margin_there",
+        "separation at the end (m)": "separation_end",
+        "steps with other iterations": "iterations_differ", "loss": lambda one: number(one["loss"], 6),
+        **{f"dloss/d{name}": slope(name) for name in slopes},
+    })  # fmt: skip
     yield TEXTS("variants")
 
 

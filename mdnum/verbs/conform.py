@@ -20,7 +20,7 @@ from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, Ca
 from mdnum.references.conformance.lists import LIMITS, PairList
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
+from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count, listed, many, number
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
@@ -449,20 +449,18 @@ def page(view: View, verdict: Verdict) -> Page:
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
     """A row for each area: of lists at one moment, and of lists in use."""
-    counts = ("asked", "right", "wrong", "no answer", "refused", "not asked")
+    columns: dict[str, Any] = {
+        "area": "area", "asked": "asked", "right": "passed",
+        "wrong": lambda row: row["failed"] - row["silent"] or None,
+        "no answer": lambda row: row["silent"] or None, "refused": lambda row: row["refused"] or None,
+        "not asked": lambda row: row["skipped"] or None, "about": "about",
+        "not answered": lambda row: "; ".join(
+            f"{one['why']} ({count(one['cases'])})" for one in row["why"][:3]
+        ),
+    }  # fmt: skip
     for title, used in (("a list asked once", False), ("a list in use", True)):
-        rows = [
-            (
-                row["area"], row["asked"], row["passed"], row["failed"] - row["silent"] or None,
-                row["silent"] or None, row["refused"] or None, row["skipped"] or None, row["about"],
-                "; ".join(f"{one['why']} ({count(one['cases'])})" for one in row["why"][:3]),
-            )
-            for row in summary["areas"]
-            if (row["area"] in _IN_USE) == used
-        ]  # fmt: skip
-        if rows:
-            bad = frozenset(n for n, row in enumerate(rows) if row[3] or row[4])
-            yield Table(("area", *counts, "about", "not answered"), rows, title, bad=bad)
+        if rows := [row for row in summary["areas"] if (row["area"] in _IN_USE) == used]:
+            yield table_of(rows, columns, title, bad=lambda row: row["failed"])
 
 
 def _figure(summary: Mapping[str, Any]) -> Figure:

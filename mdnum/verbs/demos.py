@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -20,11 +20,11 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import nearest
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs
+from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs, points_of
 from mdnum.report.words import typeset
 from mdnum.systems.load import shipped_folder
 from mdnum.verbs import frame
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Keep, Outcome, Verb, View
 
 __all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
 
@@ -86,20 +86,12 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
     return Table(tuple(columns), rows, title)
 
 
-def demonstrate(
-    name: str,
-    *,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
-) -> Outcome:
+def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     """Run a demonstration, or all of them.
 
     Args:
         name: of one, or "all".
-        out: the new folder; default runs/demo-<name>-<n>.
-        report: whether to write report.html.
-        progress: called between demonstrations.
+        keep: see `frame.Keep`; without overrides.
 
     Returns:
         its numbers, checks and curves; `result` is the list of `Demo`.
@@ -111,14 +103,24 @@ def demonstrate(
     asked = names() if name == "all" else [_known(name)]
     done: dict[str, Demo] = {}
     for number, one in enumerate(asked):
-        frame.say(progress, f"demonstration {one}", number, len(asked))
+        frame.say(keep.get("progress"), f"demonstration {one}", number, len(asked))
         done[one] = load(one)()
     documents = [_document(one, demo) for one, demo in done.items()]
-    summary = documents[0] if name != "all" else {"demos": documents}
-    with frame.new_folder("demos", f"demo-{name}", out) as folder:
-        ok = all(demo.ok for demo in done.values())
-        frame.store(folder, {**summary, "ok": ok}, {"curves": _curves(done)})
-    return frame.finish(folder, report=report, result=list(done.values()), progress=progress)
+    with frame.answering("demos", f"demo-{name}", **keep) as answer:
+        summary = documents[0] if name != "all" else {"demos": documents}
+        answer.summary = {**summary, "ok": all(demo.ok for demo in done.values())}
+        answer.tables, answer.result = (
+            {
+                "curves": points_of(
+                    (name, plot.name, line.label, line.x, line.y)
+                    for name, demo in done.items()
+                    for plot in demo.plots
+                    for line in plot.series
+                )
+            },
+            list(done.values()),
+        )
+    return answer.outcome
 
 
 # --- the scripts --------------------------------------------------------------------------------------
@@ -181,24 +183,6 @@ def _document(name: str, demo: Demo) -> dict[str, Any]:
             {key: one[key] for key in ("label", "mark", "role", "dashed")} for one in plot["series"]
         ]
     return document
-
-
-def _curves(demos: Mapping[str, Demo]) -> dict[str, np.ndarray]:
-    """A row per point of every line of every plot."""
-    parts: list[tuple[str, str, str, Series]] = [
-        (name, plot.name, series.label, series)
-        for name, demo in demos.items()
-        for plot in demo.plots
-        for series in plot.series
-    ]
-    sizes = [len(series.x) for *_, series in parts]
-    columns = {
-        key: np.repeat(np.array([part[at] for part in parts], dtype=str), sizes)
-        for at, key in enumerate(("part", "curve", "line"))
-    }
-    for key in ("x", "y"):
-        columns[key] = np.concatenate([np.asarray(getattr(part[3], key), float) for part in parts] or [[]])
-    return columns
 
 
 def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Iterator[Plot]:

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import FlipsView, about, ending, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
+from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 WINDOW = 5
 # displacement between frames over what velocities say, above which they cannot belong to the positions
 _TOO_FAR = 1.1
-# rows of the ledger held at once, and rows that wait to be handed over together: a call costs more than a row
-_PART_ROWS, _ROWS_HELD = 1_500_000, 20_000
+# rows of the ledger held at once
+_PART_ROWS = 1_500_000
 # an odd number, so that the parts of a crystal's regular labels are alike
 _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
@@ -53,9 +53,7 @@ def flips(
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
     format: str | None = None,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
 
@@ -73,9 +71,7 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
-        out: the new folder; default runs/flips-<name>-<n>.
-        report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures.
+        keep: see `frame.Keep`; without overrides.
 
     Raises:
         InputError: a file or an option cannot be used. A frame in the middle that cannot be read is no
@@ -94,28 +90,19 @@ def flips(
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
-        return compare(a, b, asked or _default_rules(a), between, out=out, report=report, progress=progress)
+        return compare(a, b, asked or _default_rules(a), between, **keep)
     opened = open_trajectory(trajectory, topology, format=format)
     asked = asked or _default_rules(opened)
     groups = selected(opened, between)
     sample = opened.sample()
     resolution = infer(sample, opened.bits, opened.format)
-    rows = _HeldRows()
+    rows = HeldRows()
     passes = follow(opened, asked, groups, resolution, rows.add)
     # no folder for a file whose first frame cannot be used
-    found, interrupted, began = next(passes), False, time.perf_counter()
-    with new_folder("flips", f"flips-{stem(opened)}", out) as folder:
-        log = logged(folder, progress)
-        with asked_to_stop() as stop:
-            while True:
-                rows.checkpoint(folder, found.frames)
-                told = {"phase": "run", "unit": "frames", "flips": rows.flips}
-                log(found.frames, opened.count or 0, told)
-                if interrupted := stop():
-                    break
-                if next(passes, None) is None or found.stopped is not None:
-                    break
-        rows.checkpoint(folder, found.frames, force=True)
+    found, began = next(passes), time.perf_counter()
+    with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
+        folder, log = answer.folder, answer.log
+        interrupted = rows.drain(folder, passes, found, opened.count or 0, log)
         read = time.perf_counter()
         frames = folder.read("frames")
         steps = _steps(frames, opened.time != "frame")
@@ -125,7 +112,7 @@ def flips(
             for number, one in enumerate(found.rules)
         ]
         leaps = found.leaps
-        summary = {
+        answer.result, answer.summary = found, {
             **about(opened, "flips", between),
             "box": sample[0].box.plain(),
             "frames": found.frames,
@@ -141,9 +128,7 @@ def flips(
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
         }  # fmt: skip
-        store(folder, summary, {})
-        folder.drop_checkpoint()
-        return finish(folder, report=report, result=found, progress=progress)
+    return answer.outcome
 
 
 VERBS = {"flips": Verb(judge, page, FlipsView)}
@@ -242,32 +227,6 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     if "the file ends" in error.message:
         return True
     return trajectory.in_file is not None and error.frame >= trajectory.in_file - 1
-
-
-class _HeldRows:
-    """Rows of a folder's tables, appended some hundred frames at a time."""
-
-    def __init__(self) -> None:
-        self._held: dict[str, list[dict[str, np.ndarray]]] = {}
-        self._count = self.flips = 0
-
-    def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
-        """Adds rows, equally long columns."""
-        self._held.setdefault(table, []).append(columns)
-        self._count += len(columns["rule"])
-        self.flips += len(columns["rule"]) * (table == "flips")
-
-    def checkpoint(self, folder: RunFolder, frames: int, force: bool = False) -> None:
-        """Hands over what is held where it is much, or where the folder is due to be made whole."""
-        due = force or folder.checkpoint_due()
-        if due or self._count > _ROWS_HELD:
-            for table, parts in self._held.items():
-                folder.append(
-                    table, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-                )
-            self._held, self._count = {}, 0
-        if due:
-            folder.checkpoint({"frames": frames}, force=True)
 
 
 def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:

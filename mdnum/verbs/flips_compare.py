@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker, atoms_of
-from mdnum.verbs.flips_shared import FlipsView, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.frame import Keep, Outcome, Verb, answering
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -38,10 +36,7 @@ def compare(
     b: Trajectory,
     asked: tuple[Rule, ...],
     between: tuple[str, str] | None,
-    *,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Where two trajectories diverge; see `mdnum.verbs.flips.flips`.
 
@@ -53,7 +48,7 @@ def compare(
             f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
             remedy="Compare trajectories of the same atoms",
         )
-    groups, began = selected(a, between), time.perf_counter()
+    groups = selected(a, between)
     resolutions = [infer(one.sample(), one.bits, one.format) for one in (a, b)]
     sets = [
         NeighborSets(rule, [
@@ -62,25 +57,14 @@ def compare(
         ])
         for rule in asked
     ]  # fmt: skip
-    held: list[tuple[str, dict[str, Any]]] = []
-    passes = follow_both(sets, atoms_of(groups), lambda table, rows: held.append((table, rows)))
+    rows = HeldRows()
+    passes = follow_both(sets, atoms_of(groups), rows.add)
     # no folder for files whose first frames cannot be used
-    found, interrupted = next(passes), False
-    with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
-        log = logged(folder, progress)
+    found = next(passes)
+    with answering("flips-compare", f"flips-{stem(a)}", **keep) as answer:
+        folder, log = answer.folder, answer.log
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
-        with asked_to_stop() as stop:
-            while True:
-                for table, rows in held:
-                    folder.append(table, rows)
-                held.clear()
-                folder.checkpoint({"frames": found.frames})
-                log(found.frames, total, {"phase": "run", "unit": "frames"})
-                if interrupted := stop():
-                    break
-                if next(passes, None) is None:
-                    break
-        folder.checkpoint({"frames": found.frames}, force=True)
+        interrupted = rows.drain(folder, passes, found, total, log)
         table = folder.read("apart")
         told = [
             {
@@ -89,28 +73,28 @@ def compare(
             }
             for one in sets
         ]  # fmt: skip
-        summary = {
-            **about(a, "flips-compare", between),
-            "other": name_of(b),
-            "other_file": str(b.path),
-            "other_format": b.format,
-            "same_species": _alike(a, b),
-            "rules": told,
-            "in_file": [one.count for one in (a, b)],
-            "times": [a.time, b.time],
-            "timed": a.time != "frame",
-            "interval": 1.0,
-            "resolution": resolutions[0],
-            "other_resolution": resolutions[1],
-            **{name: value for name, value in vars(found).items() if name != "stopped"},
-            # steps, units and numbers of frames are not compared with one another
-            "times_differ": found.times_differ if a.time == b.time else 0,
-            **ending(found.stopped, interrupted),
-            "seconds": time.perf_counter() - began,
-        }
-        store(folder, summary, {})
-        folder.drop_checkpoint()
-        return finish(folder, report=report, result=found, progress=progress)
+        answer.result, answer.summary = (
+            found,
+            {
+                **about(a, "flips-compare", between),
+                "other": name_of(b),
+                "other_file": str(b.path),
+                "other_format": b.format,
+                "same_species": _alike(a, b),
+                "rules": told,
+                "in_file": [one.count for one in (a, b)],
+                "times": [a.time, b.time],
+                "timed": a.time != "frame",
+                "interval": 1.0,
+                "resolution": resolutions[0],
+                "other_resolution": resolutions[1],
+                **{name: value for name, value in vars(found).items() if name != "stopped"},
+                # steps, units and numbers of frames are not compared with one another
+                "times_differ": found.times_differ if a.time == b.time else 0,
+                **ending(found.stopped, interrupted),
+            },
+        )
+    return answer.outcome
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
@@ -369,37 +353,26 @@ def _keys(view: ComparisonView) -> Iterator[Key]:
 
 
 def _rules(view: ComparisonView) -> Table:
-    columns = ("inside", "sets differ from frame", "pairs then", "undecidable", "for certain from frame")
-    rows = []
-    for one in view.summary["rules"]:
-        first = one["first"] or {}
-        rows.append(
-            (
-                view.rule(one),
-                *(first.get(name) for name in ("frame", "pairs", "ambiguous")),
-                one["certain"],
-            )
-        )
-    return Table(columns, rows)
+    never = dict.fromkeys(("frame", "pairs", "ambiguous"))
+    rows = [{**one, **(one["first"] or never)} for one in view.summary["rules"]]
+    return table_of(rows, {
+        "inside": view.rule, "sets differ from frame": "frame", "pairs then": "pairs",
+        "undecidable": "ambiguous", "for certain from frame": "certain",
+    })  # fmt: skip
 
 
 def _first_pairs(view: ComparisonView) -> Iterator[Table]:
     unit = f" ({view.unit})" if view.unit else ""
-    columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
+    columns: dict[str, Any] = {
+        "pair": lambda row: f"{row['i']}–{row['j']}", "inside in": lambda row: f"{row['inside']} only",
+        f"r in A{unit}": lambda row: f"{row['distance_a']:.10g}",
+        "r in B": lambda row: f"{row['distance_b']:.10g}",
+        "margin in A": "margin_a", "margin in B": "margin_b",
+    }  # fmt: skip
     for one in view.summary["rules"]:
-        rows = [
-            (
-                f"{row['i']}–{row['j']}", f"{row['inside']} only", f"{row['distance_a']:.10g}",
-                f"{row['distance_b']:.10g}", row["margin_a"], row["margin_b"],
-            )
-            for row in one["first_pairs"]
-        ]  # fmt: skip
-        if rows:
-            yield Table(
-                columns,
-                rows,
-                f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}",
-            )
+        if one["first_pairs"]:
+            title = f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}"
+            yield table_of(one["first_pairs"], columns, title)
 
 
 def _axis(

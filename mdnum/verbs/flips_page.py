@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, many, number, percent, plain
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, repeating, resolution
 
@@ -248,25 +248,14 @@ def _input(view: FlipsView, size: str) -> Iterator[tuple[str, str]]:
 
 
 def _rules(view: FlipsView) -> Table:
-    columns = (
-        "rule",
-        "pairs",
-        "flips",
-        "per frame",
-        "undecidable",
-        "median life",
-        "mean life by rate",
-        "chatter",
-    )
-    rows = [
-        (
-            view.rule(one), f"{count(one['pairs_first'])} to {count(one['pairs_last'])}", one["flips"],
-            one["flips_per_frame"], one["ambiguous"], view.life(one["lifetime"]),
-            view.duration(one["lifetime"]["mean_by_rate"]), percent(one["chatter"]["share"]),
-        )
-        for one in view.summary["rules"]
-    ]  # fmt: skip
-    return Table(columns, rows)
+    return table_of(view.summary["rules"], {
+        "rule": view.rule,
+        "pairs": lambda one: f"{count(one['pairs_first'])} to {count(one['pairs_last'])}",
+        "flips": "flips", "per frame": "flips_per_frame", "undecidable": "ambiguous",
+        "median life": lambda one: view.life(one["lifetime"]),
+        "mean life by rate": lambda one: view.duration(one["lifetime"]["mean_by_rate"]),
+        "chatter": lambda one: percent(one["chatter"]["share"]),
+    })  # fmt: skip
 
 
 def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
@@ -362,15 +351,13 @@ def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
 
 def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Table:
     frames = view.summary["frames"]
-    told = [
-        (
-            f"{one['first']}–{one['second']}", one["inside"] / frames, one["entered"] + one["left"],
-            view.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
-            view.duration(one["stay"], beyond="–"),
-        )
-        for one in rows[:_ROWS]
-    ]  # fmt: skip
-    return Table((title, "pairs inside", "flips", "rate", "mean stay by rate"), told)
+    return table_of(rows[:_ROWS], {
+        title: lambda one: f"{one['first']}–{one['second']}",
+        "pairs inside": lambda one: one["inside"] / frames,
+        "flips": lambda one: one["entered"] + one["left"],
+        "rate": lambda one: view.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
+        "mean stay by rate": lambda one: view.duration(one["stay"], beyond="–"),
+    })  # fmt: skip
 
 
 def _busiest(view: FlipsView) -> Browse | None:
@@ -405,7 +392,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         whole = view.table(table)
         return {name: values[whole["rule"] == place] for name, values in whole.items()}
 
-    def plot(name: str, title: str, x: str, y: str, series: list[Series], **more: Any) -> Plot:
+    def plot(name: str, title: str, x: str, y: str, series: Iterable[Series], **more: Any) -> Plot:
         return Plot(name, title, x, y, tuple(series), caption=TEXTS(f"caption_{name}"), **more)
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
@@ -425,7 +412,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
     if view.summary["frames"] > 2:
         table = rows("lifetimes")
         lags = table["frames"] * (view.summary["interval"] if view.timed else 1.0)
-        lines: list[tuple[str, str, Any, bool]] = [
+        shares: list[tuple[str, str, Any, bool]] = [
             ("lifetime (seen to begin)", "survival", "first", False),
             (f"gaps up to {view.summary['window']} frames overlooked", "intermittent", "first", True),
             ("still inside, of those found inside", "residence", "second", False),
@@ -433,7 +420,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         ]
         series = [
             Series(words, lags[1:], table[name][1:], role=role, dashed=dashed)
-            for words, name, role, dashed in lines
+            for words, name, role, dashed in shares
             if np.isfinite(table[name][1:]).any()
         ]
         if series:
@@ -449,21 +436,15 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         yield "Between the frames", drawn
     if one["chatter"]["undone"]:
         after = np.arange(1, one["chatter"]["window"] + 1)
-        kinds: list[tuple[str, str, Any]] = [
-            ("left again", "inside", "first"),
-            ("entered again", "outside", "second"),
-        ]
-        series = [
-            Series(words, after, np.array(one["chatter"][name][1:], float), mark="line+points", role=role)
-            for words, name, role in kinds
-        ]
+        back = {"left again": one["chatter"]["inside"], "entered again": one["chatter"]["outside"]}
+        lines = {label: np.array(counts[1:], float) for label, counts in back.items()}
+        series = curves(after, lines, "line+points", log=False)
         title = "Flips that the same pair reverses"
         yield "Between the frames", plot("chatter", title, "after so many frames", "flips", series)
     if moving and np.any(frames["fewest"] != frames["most"]):
-        around: list[tuple[str, str, Any]] = [
-            ("most", "most", "second"), ("mean", "neighbors", "first"), ("fewest", "fewest", "third"),
-        ]  # fmt: skip
-        series = [Series(words, x, frames[name].astype(float), role=role) for words, name, role in around]
+        around = {"mean": "neighbors", "most": "most", "fewest": "fewest"}
+        lines = {label: frames[name].astype(float) for label, name in around.items()}
+        series = curves(x, lines, log=False)
         yield "Neighbors", plot("neighbors", "Neighbors of an atom", label, "neighbors", series)
     table = rows("neighbors")
     if len(table["neighbors"]) > 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +11,15 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.report.finding import Texts
 from mdnum.report.words import listed, number, plain
-from mdnum.verbs.frame import View
+from mdnum.store import RunFolder
+from mdnum.verbs.frame import Progress, View, asked_to_stop
 
 if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
+# rows that wait to be handed over together: a call costs more than a row
+_ROWS_HELD = 20_000
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
@@ -67,6 +70,49 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
         "interrupted": interrupted,
         "status": "stopped" if stopped is not None or interrupted else "complete",
     }
+
+
+class HeldRows:
+    """Rows of a folder's tables, appended some hundred frames at a time."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, list[Mapping[str, np.ndarray]]] = {}
+        self._count = self.flips = 0
+
+    def add(self, table: str, columns: Mapping[str, np.ndarray]) -> None:
+        """Adds rows, equally long columns."""
+        self._held.setdefault(table, []).append(columns)
+        rows = len(next(iter(columns.values())))
+        self._count += rows
+        self.flips += rows * (table == "flips")
+
+    def drain(self, folder: RunFolder, passes: Iterator[Any], found: Any, of: int, log: Progress) -> bool:
+        """Reads frames until there are no more, or control-C is pressed; returns whether it was.
+
+        Args:
+            passes: one for each frame, which adds rows.
+            found: what it goes by, with `frames` read so far, and `stopped` where the rest cannot be read.
+            of: how many there are, 0 if not known.
+        """
+        with asked_to_stop() as stop:
+            while True:
+                self._hand_over(folder, found.frames)
+                counts = {"flips": self.flips} if self.flips else {}
+                log(found.frames, of, {"phase": "run", "unit": "frames", **counts})
+                if (asked := stop()) or next(passes, None) is None or found.stopped is not None:
+                    self._hand_over(folder, found.frames, force=True)
+                    return asked
+
+    def _hand_over(self, folder: RunFolder, frames: int, force: bool = False) -> None:
+        """Hands over what is held where it is much, or where the folder is due to be made whole."""
+        due = force or folder.checkpoint_due()
+        if due or self._count > _ROWS_HELD:
+            for table, parts in self._held.items():
+                whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                folder.append(table, whole)
+            self._held, self._count = {}, 0
+        if due:
+            folder.checkpoint({"frames": frames}, force=True)
 
 
 class FlipsView(View):

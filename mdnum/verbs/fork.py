@@ -6,10 +6,10 @@ are compared or followed again (`fork_folders`), or ensembles are (`fork_benign`
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
-from mdnum.report.section import Figure, Key, Page, Section, Table, pairs
+from mdnum.report.section import Figure, Key, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
-from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
+from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
-from mdnum.verbs.frame import Outcome, Progress, View
+from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -47,10 +47,7 @@ def fork(
     lyapunov: bool = True,
     minimal: bool = False,
     pin: str | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a system and its twin that differs in one choice, and say where and why they diverge.
 
@@ -71,10 +68,7 @@ def fork(
             together; it takes up to 80 runs.
         pin: a decision to override with A's in one more run of B: "fork", a pair "3-75", or a pair over a
             window "3-75:600..700". minimal and pin are of molecular dynamics.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
-        report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.Fork`, and where all choices were screened a list of
@@ -86,108 +80,77 @@ def fork(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    system = of_any(system, overrides)
-    table, own_split = system.spec.fork, split
-    if table is not None:
-        vary = table.vary if vary is None else vary
-        steps = table.steps if steps is None else steps
-        split = table.split if split is None else split
+    loaded: System | BallSystem = load(system, keep.pop("overrides", None))
+    own = loaded.spec.fork
     asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
+    if own is not None:
+        vary = own.vary if vary is None else vary
+        asked = replace(
+            asked, steps=own.steps if steps is None else steps, split=own.split if split is None else split
+        )
     check(asked)
     if vary == ALL:
-        given = {"split": own_split is not None, "repeats": repeats is not None, "minimal": minimal,
+        given = {"split": split is not None, "repeats": repeats is not None, "minimal": minimal,
                  "counterfactual": not counterfactual, "back": back is not None,
                  "pin": pin is not None}  # fmt: skip
         frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
-        return fork_screen(system, steps=steps, out=out, report=report, progress=progress)
-    if isinstance(system, BallSystem):
+        return fork_screen(loaded, steps=asked.steps, **keep)
+    if isinstance(loaded, BallSystem):
         remedy = 'A decision of a ball is overridden by itself by the choice "contact=STEP:BALL"'
         given = {"minimal": minimal, "pin": pin is not None}
-        frame.refuse(given, f"of molecular dynamics, and {system.name} is a ball", remedy)
-        system = system if steps is None else system.for_steps(steps)
+        frame.refuse(given, f"of molecular dynamics, and {loaded.name} is a ball", remedy)
+        loaded = loaded if asked.steps is None else loaded.for_steps(asked.steps)
     elif pin is not None:
         from mdnum.forks.replays import parse_pin
 
-        parse_pin(pin, len(system.atoms))
-    word = vary or "precision"
-    choice = parse(word)
-    labels = {
-        "choice": word,
-        "choice_about": choice.describe(world_of(system)),
-        "must_hold": choice.must_hold,
-    }
-    frame.say(progress, "compile")
-    twin = twin_of(choice, system)
-    return followed(system, twin, labels, asked, lambda made: {}, out, report, progress)
+        parse_pin(pin, len(loaded.atoms))
+    word, world = vary or "precision", world_of(loaded)
+    choice = parse(word, world)
+    labels = {"choice": word, "choice_about": choice.describe(world), "must_hold": choice.must_hold}
+    frame.say(keep.get("progress"), "compile")
+    return followed(loaded, twin_of(choice, loaded), labels, asked, **keep)
 
 
 def fork_screen(
-    system: System | BallSystem | str | Path,
-    *,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    system: System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Follow the free runs of every choice, and rank the choices by when they fork.
 
     Counterfactuals are left to the choices that turn out to matter.
 
     Args:
-        system, out, overrides, report: as for `fork`.
+        system: as for `fork`.
         steps: last step; default that of the [fork] table, or the system's own.
-        progress: called with choices done, how many there are, and the name of the next as the phase.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a list of `mdnum.forks.pair.Screened`.
     """
     from mdnum.forks.pair import screen
+    from mdnum.systems import load
 
-    began = time.perf_counter()
-    system = of_any(system, overrides)
-    if steps is None and system.spec.fork is not None:
-        steps = system.spec.fork.steps
+    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    if steps is None and loaded.spec.fork is not None:
+        steps = loaded.spec.fork.steps
     check(PairQuestion(steps))
-    with frame.new_folder("screen", f"fork-{system.name}", out, system=system) as folder:
+    with frame.answering("screen", f"fork-{loaded.name}", loaded, **keep) as answer:
 
         def note(done: int, count: int, name: str) -> None:
-            folder.log(f"{done:4d} of {count}  {name}")
-            if progress is not None:
-                progress(done, count, {"phase": f"{name} ({done + 1} of {count})"})
+            answer.log(done, count, {"phase": f"{name} ({done + 1} of {count})"})
 
-        rows = screen(system, steps, progress=note)
-        ran = [row for row in rows if row.reason_unavailable is None]
-        summary = basics(system, steps) | {
-            "ranking": [
-                {
-                    "choice": row.choice, "difference": row.difference, "first_bit": row.first_bit,
-                    "fork": row.fork, "split": row.split, "must_hold": row.must_hold, "held": row.held,
-                    "steps": row.steps, "failed": row.failed,
-                }
-                for row in ran
-            ],
-            "not_applicable": [
-                {"choice": row.choice, "reason": row.reason_unavailable} for row in rows if row not in ran
-            ],
-            "seconds": time.perf_counter() - began,
-        }  # fmt: skip
-        frame.store(folder, summary, {})
-    return frame.finish(folder, report=report, result=rows, progress=progress)
+        answer.result = screen(loaded, steps, progress=note)
+        ran = [row for row in answer.result if row.reason_unavailable is None]
+        left = [row for row in answer.result if row.reason_unavailable is not None]
+        answer.summary = basics(loaded, steps) | {
+            "ranking": [plain(row) | {"held": row.held} for row in ran],
+            "not_applicable": [{"choice": row.choice, "reason": row.reason_unavailable} for row in left],
+        }
+    return answer.outcome
 
 
-def fork_folders(
-    a: str | Path,
-    b: str | Path,
-    *,
-    replay: bool = False,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
-    **asked: Any,
-) -> Outcome:
+def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked: Any) -> Outcome:
     """Compare two finished runs of one world: what was different, and where they diverge.
 
     Args:
@@ -195,10 +158,8 @@ def fork_folders(
         replay: follow both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
             summary then says whether the replay diverges where the stored tables do: it has their bits where
             versions and processor are the same. Else nothing is run: dates are those of the stored tables.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        report, progress: as for `fork`.
-        asked: of a replay, steps, split, repeats, counterfactual, back, lyapunov, minimal and pin of `fork`;
-            no more steps than both runs have.
+        asked: out, report and progress; of a replay also steps, split, repeats, counterfactual, back,
+            lyapunov, minimal and pin of `fork`, and no more steps than both runs have.
 
     Returns:
         its result is a `mdnum.forks.folders.FolderFork`, of a replay a `mdnum.forks.Fork`.
@@ -210,17 +171,15 @@ def fork_folders(
     from mdnum.forks.folders import compare_folders, twin_of
     from mdnum.systems.load import load
 
-    began = time.perf_counter()
-    frame.say(progress, "compare")
+    keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
+    frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
     system: Any = load(found.a)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
-        with frame.new_folder("compare", f"fork-{system.name}", out, system=system) as folder:
-            row = plain(found)
-            row["seconds"] = time.perf_counter() - began
-            frame.store(folder, basics(system, found.steps) | row, {})
-        return frame.finish(folder, report=report, result=found, progress=progress)
+        with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:
+            answer.result, answer.summary = found, basics(system, found.steps) | plain(found)
+        return answer.outcome
     if found.world != "md":
         raise InputError(
             "runs of a ball are not followed again",
@@ -229,32 +188,23 @@ def fork_folders(
         )
     question = PairQuestion(**asked)
     check(question)
-    last = found.steps if question.steps is None else min(question.steps, found.steps)
+    last = min(found.steps, question.steps or found.steps)
 
     def stored(made: Fork) -> dict[str, Any]:
         known = found.fork if found.fork is not None and found.fork <= made.steps else None
         return {
-            "runs": [found.a, found.b],
-            "differences": found.differences,
+            "runs": [found.a, found.b], "differences": found.differences,
             "stored": {"steps": found.steps, "first_bit": found.first_bit, "fork": known},
             "reproduced": known == made.dates.fork,
-        }
+        }  # fmt: skip
 
     labels = {"choice": "replay", "choice_about": TEXTS("replay"), "must_hold": False}
-    frame.say(progress, "compile")
-    twin, question = twin_of(found), PairQuestion(**{**asked, "steps": last})
-    return followed(system, twin, labels, question, stored, out, report, progress)
+    frame.say(keep.get("progress"), "compile")
+    return followed(system, twin_of(found), labels, replace(question, steps=last), stored, **keep)
 
 
 def fork_benign(
-    system: System | str | Path,
-    vary: str,
-    *,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    system: System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Whether a choice changes anything that would be measured: an ensemble-consistency test.
 
@@ -262,7 +212,7 @@ def fork_benign(
         system: of molecular dynamics, as for `fork`.
         vary: the choice.
         steps: at which the ensembles are compared; default calibrated.
-        out, overrides, report, progress: as for `fork`.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.benign.Benign`.
@@ -270,59 +220,54 @@ def fork_benign(
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
 
-    began = time.perf_counter()
-    system = of_md(system, overrides, "benign")
-    twin = twin_of(parse(vary), system)
-    with frame.new_folder("benign", f"fork-{system.name}", out, system=system) as folder:
-        found = benign(twin, steps=steps, progress=progress)
-        summary = basics(system, found.window) | {"choice": vary, "difference": twin.difference}
-        summary |= {**plain(found), "seconds": time.perf_counter() - began}
-        frame.store(folder, summary, {})
-    return frame.finish(folder, report=report, result=found, progress=progress)
+    system = of_md(system, keep.get("overrides"), "benign")
+    twin = twin_of(parse(vary, "md"), system)
+    with frame.answering("benign", f"fork-{system.name}", system, **keep) as answer:
+        answer.result = found = benign(twin, steps=steps, progress=answer.log)
+        what = {"choice": vary, "difference": twin.difference}
+        answer.summary = basics(system, found.window) | what | plain(found)
+    return answer.outcome
 
 
 # -- pages ---------------------------------------------------------------------------------------------
 
 
 def _page(view: View, what: str, about: str, keys: list[Key], sections: list[Section]) -> Page:
-    rows = [*size(view), ("Took", f"{number(view.summary['seconds'], 2)} s")]
+    rows = [*size(view), view.took]
     sections = [*sections, Section("What was run", [pairs(rows)])]
-    title = f"{view.name}: {what}"
-    return Page(title, about, keys, sections, view.system_toml, view.folder.provenance)
+    return view.page(f"{view.name}: {what}", about, keys, sections)
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
     """The page of all choices side by side."""
-    s, rows = view.summary, view.summary["ranking"]
+    s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
     held = [row for row in rows if row["must_hold"]]
     kept = sum(row["first_bit"] is None for row in held)
     keys = [
-        Key("Choices", count(len(rows)), f"{count(len(s['not_applicable']))} more do not apply"),
+        Key("Choices", count(len(rows)), f"{count(len(left))} more do not apply"),
         Key("Fork", count(sum(row["fork"] is not None for row in rows)), f"in {many(s['steps'], 'step')}"),
         Key("Split", count(sum(row["split"] is not None for row in rows)), "beyond the tolerance"),
         Key("No bit differs", count(sum(row["first_bit"] is None for row in rows)), "the same trajectory"),
         Key("Must hold", f"{count(kept)} of {count(len(held))}", "held bit for bit"),
     ]
-    lines = [
-        (row["choice"], row["first_bit"], row["fork"], row["split"],
-         "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken",
-         row["failed"] or row["difference"])
-        for row in rows
-    ]  # fmt: skip
-    bad = frozenset(k for k, row in enumerate(rows) if row in held and row["first_bit"] is not None)
-    columns = ("choice", "first bit", "fork", "split", "must hold", "difference")
+
+    def holds(row: Mapping[str, Any]) -> str:
+        return "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken"
+
+    table = table_of(rows, {
+        "choice": "choice", "first bit": "first_bit", "fork": "fork", "split": "split", "must hold": holds,
+        "difference": lambda row: row["failed"] or row["difference"],
+    }, shown=100, bad=lambda row: holds(row) == "broken")  # fmt: skip
     alt = "; ".join(f"{row['choice']}: {count(row['fork'])}" for row in rows if row["fork"] is not None)
     figure = Figure(
         "ranking", TEXTS("ranking_caption"), f"Step at which each choice forks. {alt or 'None does'}.",
         lambda canvas: _ranking(rows, s["steps"], canvas), 0.9 + 0.24 * len(rows),
     )  # fmt: skip
-    sections = [
-        Section(RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True)
-    ]
-    if left := s["not_applicable"]:
-        table = Table(("choice", "reason"), [(row["choice"], row["reason"]) for row in left], shown=100)
-        sections.append(Section("Choices that do not apply", [table], terminal=True))
-    return _page(view, "all choices", TEXTS("screen_about"), keys, sections)
+    others = table_of(left, {"choice": "choice", "reason": "reason"}, shown=100)
+    return _page(view, "all choices", TEXTS("screen_about"), keys, [
+        Section(RANKING, [TEXTS("ranking"), table, figure], terminal=True),
+        Section("Choices that do not apply", [others] * bool(left), terminal=True),
+    ])  # fmt: skip
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
@@ -359,21 +304,18 @@ def page_compare(view: View, verdict: Verdict) -> Page:
             ("fork", "Fork", "a stored decision differs"),
         )
     ]
-    different = differences(s) if s["differences"] else TEXTS("folders_0_causes")
-    sections = [Section("What was different", [different], terminal=True)]
-    if s["decisions"]:
-        rows = [
-            (flip["run"], "–".join(map(str, flip["subject"])), "yes" if flip["entered"] else "no",
-             flip["margin"], flip["bound"], flip["ambiguous"])
-            for flip in s["decisions"]
-        ]  # fmt: skip
-        label = "pair" if s["channel"] == "pair" else "ball"
-        columns = ("only in", label, "enters", "margin", "bound", "ambiguous")
-        sections.append(Section("Decisions at the fork", [Table(columns, rows)], terminal=True))
-    if s["iterations"]:
-        table = Table(("in A", "in B"), [s["iterations"]])
-        sections.append(Section("Iterations at the fork", [table], terminal=True))
-    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", keys, sections)
+    different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
+    decisions = table_of(s["decisions"], {
+        "only in": "run", s["channel"] if s["channel"] == "pair" else "ball":
+            lambda flip: "–".join(map(str, flip["subject"])),
+        "enters": "entered", "margin": "margin", "bound": "bound", "ambiguous": "ambiguous",
+    })  # fmt: skip
+    iterations = Table(("in A", "in B"), [s["iterations"]])
+    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", keys, [
+        Section("What was different", [different], terminal=True),
+        Section("Decisions at the fork", [decisions] * bool(s["decisions"]), terminal=True),
+        Section("Iterations at the fork", [iterations] * bool(s["iterations"]), terminal=True),
+    ])  # fmt: skip
 
 
 def page_benign(view: View, verdict: Verdict) -> Page:
@@ -385,14 +327,13 @@ def page_benign(view: View, verdict: Verdict) -> Page:
         Key("Components", count(s["components"]), f"limit {number(s['limit'], 3)} standard deviations"),
         Key("Fails on A itself", f"{count(failed)} of {count(of)}", "verdicts on runs that were held out"),
     ]
-    sections = []
-    if s["failing"]:
-        table = Table(("feature", "standard deviations"), list(s["failing"].items()))
-        sections.append(Section("What tells B from A", [table], terminal=True))
-    scores = [(k + 1, *row) for k, row in enumerate(s["scores"])]
+    failing = Table(("feature", "standard deviations"), list(s["failing"].items()))
     names = tuple(f"component {k + 1}" for k in range(s["components"]))
-    sections.append(Section("Components", [TEXTS("components"), Table(("run", *names), scores)]))
-    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), keys, sections)
+    scores = Table(("run", *names), [(k + 1, *row) for k, row in enumerate(s["scores"])])
+    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), keys, [
+        Section("What tells B from A", [failing] * bool(s["failing"]), terminal=True),
+        Section("Components", [TEXTS("components"), scores]),
+    ])  # fmt: skip
 
 
 VERBS = {

@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curves, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
-from mdnum.verbs.fork_pair import basics, of_any, of_md
-from mdnum.verbs.frame import Outcome, Progress, View
+from mdnum.verbs.fork_pair import basics, last_step, of_md
+from mdnum.verbs.frame import Answer, Keep, Outcome, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from mdnum.forks.exact.certify import Certificate
-    from mdnum.forks.processes import Variant, Variants
+    from mdnum.forks.processes import Variant
     from mdnum.systems import BallSystem, System
 
 TEXTS = Texts(__file__)
 
 #: Steps of each program, unless others are asked for: enough for every cause to show.
 PROGRAM_STEPS = 200
-_ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 #: A share of what double precision gains that counts as nothing, and bits of error that do.
 _NOTHING, _NO_BITS = 0.05, 1.0
 _NARROW = ("float16", "bfloat16")
@@ -42,10 +38,7 @@ def fork_certify(
     *,
     steps: int | None = None,
     policies: Mapping[str, Any] | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """When runs in each precision leave the history in exact arithmetic.
 
@@ -55,10 +48,7 @@ def fork_certify(
         steps: last step; default the system's own.
         policies: precisions to rank, by name: dtypes by role, such as {"state": "float32"}; default
             `MD_POLICIES` or `BALL_POLICIES` of `mdnum.forks.exact.certify`.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values.
-        report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.exact.certify.Certificate`.
@@ -68,88 +58,75 @@ def fork_certify(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.exact.certify import certify
-    from mdnum.systems import BallSystem, build
+    from mdnum.forks.exact.program import unsupported
+    from mdnum.systems import BallSystem, build, load
 
-    began = time.perf_counter()
-    system = of_any(system, overrides)
-    if steps is not None and steps < 1:
-        raise InputError(f"steps = {steps}; expected at least 1")
-    ball, simulation = None, None
+    loaded = load(system, keep.get("overrides"))
+    last, ball = last_step(loaded, steps), isinstance(loaded, BallSystem)
     # what cannot be is refused before there is a folder; a ball takes no time
-    if isinstance(system, BallSystem):
-        ball = certify(system, steps, policies, progress)
-    else:
-        from mdnum.forks.exact.program import unsupported
-
-        simulation = build(system)
-        if (error := unsupported(simulation)) is not None:
-            raise error
-    with frame.new_folder("certify", f"fork-{system.name}", out, system=system) as folder:
-        note = frame.logged(folder, progress, frame.STEPWISE)
-        found = ball or certify(system, steps, policies, note)
-        tables: dict[str, Any] = {}
-        summary = basics(system, found.steps) | _certified(found, tables)
+    found: Any = certify(loaded, last, policies, keep.get("progress")) if ball else None
+    simulation: Any = None if ball else build(loaded)
+    if simulation is not None and (error := unsupported(simulation)) is not None:
+        raise error
+    with frame.answering("certify", f"fork-{loaded.name}", loaded, **keep) as answer:
+        answer.result = found = found or certify(loaded, last, policies, answer.log)
+        answer.summary = basics(loaded, last) | {"steps_per_bit": found.steps_per_bit}
+        answer.summary["policies"] = _ranking(answer)
         if simulation is not None:
-            summary |= _exact_md(found)
-            summary["ambiguous"] = _ambiguous(simulation, found, note, tables)
-        frame.store(folder, summary | {"seconds": time.perf_counter() - began}, tables)
-    return frame.finish(folder, report=report, result=found, progress=progress)
+            exact = found.exact
+            answer.summary |= {
+                "bits": exact.bits, "restarts": exact.restarts, "flips": exact.tape.flips,
+                "smallest_margin": exact.margin.min(), "smallest_margin_step": exact.margin.argmin(),
+                "log2_radius_end": exact.radius[-1], "bits_per_step": exact.bits_per_step,
+                "ms_per_step": 1000 * exact.seconds / (last + 1), "ambiguous": _ambiguous(simulation, answer),
+            }  # fmt: skip
+    return answer.outcome
 
 
-def _certified(found: Certificate, tables: dict[str, Any]) -> dict[str, Any]:
-    rows, table = [], []
-    for row in found.ranking:
+def _ranking(answer: Answer) -> list[dict[str, Any]]:
+    """Precisions for the summary; the same into a table, with their separations from the exact run."""
+    ranking, rows, table = answer.result.ranking, [], []
+    for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
         i, j = [*(decision.subject if decision else ()), -1, -1][:2]
-        shared = {
-            "horizon": row.horizon, "i": i, "j": j, "margin": plain(row.margin), "gain": plain(row.gain),
-            "closer_bits": plain(row.closer), "growth_rate": None if growth is None else plain(growth.rate),
-            "failed": row.failed,
-        }  # fmt: skip
+        shared = {"horizon": row.horizon, "i": i, "j": j, "margin": row.margin, "gain": row.gain,
+                  "closer_bits": row.closer, "growth_rate": growth.rate if growth else np.nan,
+                  "failed": row.failed}  # fmt: skip
         rows.append({
             "name": row.name, **row.roles, **shared, "channel": decision.channel if decision else "",
             "subject": decision.subject if decision else None,
             "separation_end": None if separation is None else separation[-1],
             "reason_unavailable": row.reason_unavailable,
         })  # fmt: skip
-        missing = {name: np.nan if shared[name] is None else shared[name]
-                   for name in ("margin", "gain", "closer_bits", "growth_rate")}  # fmt: skip
         horizon = -1 if row.horizon is None else row.horizon
-        table.append({"policy": row.name, "force": "", **row.roles, **shared, **missing, "horizon": horizon})
-    tables["policies"] = {name: [row[name] for row in table] for name in table[0]}
-    ran = [(row.name, row.separation) for row in found.ranking if row.separation is not None]
-    tables["policy_separations"] = {
-        "policy": np.concatenate([np.full(len(separation), name) for name, separation in ran]),
-        "step": np.concatenate([np.arange(len(separation)) for _, separation in ran]),
-        "separation": np.concatenate([separation for _, separation in ran]),
-    }  # fmt: skip
-    return {"steps_per_bit": plain(found.steps_per_bit), "policies": rows}
+        table.append({"policy": row.name, "force": "", **row.roles, **shared, "horizon": horizon})
+    ran = {row.name: row.separation for row in ranking if row.separation is not None}
+    answer.tables = {"policies": table, "policy_separations": _lines("policy", ran)}
+    return plain(rows)
 
 
-def _exact_md(found: Certificate) -> dict[str, Any]:
-    exact = found.exact
+def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
+    """Separations by step one below the other, each with its name in a column."""
     return {
-        "bits": exact.bits, "restarts": exact.restarts, "flips": exact.tape.flips,
-        "smallest_margin": exact.margin.min(), "smallest_margin_step": exact.margin.argmin(),
-        "log2_radius_end": exact.radius[-1], "bits_per_step": exact.bits_per_step,
-        "ms_per_step": 1000 * exact.seconds / (found.steps + 1),
-    }  # fmt: skip
+        name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
+        "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
+        "separation": np.concatenate(list(lines.values())),
+    } if lines else {}  # fmt: skip
 
 
-def _ambiguous(simulation: Any, found: Certificate, note: Progress, tables: dict[str, Any]) -> dict[str, Any]:
+def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
     """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.forks.exact.program import with_policy
     from mdnum.numerics import PrecisionPolicy
 
-    numbers, rows = {}, []
-    for k, row in enumerate(found.ranking):
-        note(k, len(found.ranking), {"phase": "bounding decisions", "unit": "policies"})
-        one = certified_horizon(with_policy(simulation, PrecisionPolicy(**row.roles)), found.steps)
-        numbers[row.name] = {"total": one.total, "horizon": one.horizon, "wrong": one.wrong}
-        rows += [{"policy": row.name, **vars(decision)} for decision in one.decisions]
-    if rows:
-        tables["ambiguous"] = {name: [row[name] for row in rows] for name in rows[0]}
+    numbers, rows, ranking = {}, [], answer.result.ranking
+    for k, row in enumerate(ranking):
+        frame.say(answer.log, "bounding decisions", k, len(ranking), unit="policies")
+        sure = certified_horizon(with_policy(simulation, PrecisionPolicy(**row.roles)), answer.result.steps)
+        numbers[row.name] = {"total": sure.total, "horizon": sure.horizon, "wrong": sure.wrong}
+        rows += [{"policy": row.name, **vars(decision)} for decision in sure.decisions]
+    answer.tables["ambiguous"] = rows
     return numbers
 
 
@@ -164,13 +141,11 @@ def judge_certify(view: View) -> Verdict:
         first = min(left, key=lambda row: row["horizon"])
         values |= {"first": first["name"], "step": first["horizon"], "last": rows[0]["name"],
                    "last_step": rows[0]["horizon"]}  # fmt: skip
-    found = []
-    for row in rows:
-        if row["failed"]:
-            found.append(TEXTS.finding("RUN_FAILED", section="Ranking", **row))
-    for name, one in (s.get("ambiguous") or {}).items():
-        if one["wrong"] is not None:
-            found.append(TEXTS.finding("WRONG_DECISION", section="Ranking", name=name, step=one["wrong"]))
+    found = [TEXTS.finding("RUN_FAILED", section="Ranking", **row) for row in rows if row["failed"]]
+    found += [
+        TEXTS.finding("WRONG_DECISION", section="Ranking", name=name, step=one["wrong"])
+        for name, one in (s.get("ambiguous") or {}).items() if one["wrong"] is not None
+    ]  # fmt: skip
     return conclude(found, headline=TEXTS(f"certify_{kind}", **values), best="info" if left else "good")
 
 
@@ -209,74 +184,69 @@ def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
 
 def page_certify(view: View, verdict: Verdict) -> Page:
     """The page of a ranking of precisions."""
-    s, ball = view.summary, "balls" in view.summary
-    rows, unit = s["policies"], view.units.length
+    s, ball, unit = view.summary, "balls" in view.summary, view.units.length
+    rows, ambiguous, steps = s["policies"], s.get("ambiguous") or {}, s["steps"]
     roles = [role for role in ("state", "force", "arithmetic", "decision", "accumulate") if role in rows[0]]
     kept = sum(row["horizon"] is None and row["reason_unavailable"] is None for row in rows)
     keys = [
-        Key("Keep to it", f"{count(kept)} of {count(len(rows))}", f"for {many(s['steps'], 'step')}"),
+        Key("Keep to it", f"{count(kept)} of {count(len(rows))}", f"for {many(steps, 'step')}"),
         Key("One more bit", number(s["steps_per_bit"]), "steps gained, by the growth seen"),
     ]
     if not ball:
-        step, per = count(s["smallest_margin_step"]), f"{number(s['ms_per_step'], 2)} ms"
+        closest = f"{unit}², in the exact run, step {count(s['smallest_margin_step'])}"
         keys += [
-            Key(
-                "Closest decision", number(s["smallest_margin"], 2), f"{unit}², in the exact run, step {step}"
-            ),
+            Key("Closest decision", number(s["smallest_margin"], 2), closest),
             Key("Exact flips", count(s["flips"]), "in time, all proven"),
             Key("Carried", f"{count(s['bits'])} bits", f"{count(s['restarts'])} restarts with more"),
-            Key("Exact step", per, f"{number(s['seconds'], 2)} s in all"),
+            Key("Exact step", f"{number(s['ms_per_step'], 2)} ms", f"{number(s['seconds'], 2)} s in all"),
         ]
-    ambiguous = s.get("ambiguous") or {}
-    counts = ("ambiguous", "from step") if ambiguous else ()
-    columns = ("precision", "leaves the exact history at", "decision", "margin", "bits closer",
-               "growth a step", f"separation at the end ({unit})", *counts, "")  # fmt: skip
-    lines = []
-    for row in rows:
-        doubt = ambiguous.get(row["name"]) or {"total": None, "horizon": None}
-        reason, subject = row["reason_unavailable"], row["subject"]
-        at = (
-            "–"
-            if reason
-            else f"beyond {count(s['steps'])}"
-            if row["horizon"] is None
-            else count(row["horizon"])
-        )
-        which = None if subject is None else f"{row['channel']} {'–'.join(map(str, subject))}"
-        counted = (doubt["total"], doubt["horizon"]) if ambiguous else ()
-        lines.append((row["name"], at, which, row["margin"], row["closer_bits"], row["growth_rate"],
-                      row["separation_end"], *counted, reason or row["failed"]))  # fmt: skip
-    dtypes = Table(
-        ("precision", *roles), [(row["name"], *(row[role] for role in roles)) for row in rows], "Dtypes"
-    )
-    kept_by = "; ".join(f"{line[0]} {line[1]}" for line in lines)
+
+    def leaves(row: Mapping[str, Any]) -> str:
+        if row["reason_unavailable"]:
+            return "–"
+        return f"beyond {count(steps)}" if row["horizon"] is None else count(row["horizon"])
+
+    def doubt(name: str) -> Any:
+        return lambda row: (ambiguous.get(row["name"]) or {}).get(name)
+
+    ranking = table_of(rows, {
+        "precision": "name", "leaves the exact history at": leaves,
+        "decision": lambda row: row["subject"] and f"{row['channel']} {'–'.join(map(str, row['subject']))}",
+        "margin": "margin", "bits closer": "closer_bits", "growth a step": "growth_rate",
+        f"separation at the end ({unit})": "separation_end",
+        **({"ambiguous": doubt("total"), "from step": doubt("horizon")} if ambiguous else {}),
+        "": lambda row: row["reason_unavailable"] or row["failed"],
+    }, shown=100)  # fmt: skip
+    dtypes = table_of(rows, {"precision": "name", **{role: role for role in roles}}, "Dtypes")
+    kept_by = "; ".join(f"{row['name']} {leaves(row)}" for row in rows)
     figure = Figure(
-        "ranking", TEXTS("ranking_caption"), f"Steps kept of {s['steps']}, by precision: {kept_by}.",
+        "ranking", TEXTS("ranking_caption"), f"Steps kept of {steps}, by precision: {kept_by}.",
         lambda canvas: _bars(s, canvas), 0.8 + 0.34 * len(rows),
     )  # fmt: skip
-    table, series = view.table("policy_separations"), []
-    for k, row in enumerate(rows):
-        mine = table["policy"] == row["name"]
-        separation = table["separation"][mine]
-        if np.any(separation > 0):
-            shown = np.where(separation > 0, separation, np.nan)
-            role = _ROLES[k % len(_ROLES)]
-            series.append(Series(row["name"], table["step"][mine], shown, role=role, dashed=k >= len(_ROLES)))
+    series = _drawn(view.table("policy_separations"), {row["name"]: row["name"] for row in rows})
     plots = [Plot(
         "separations", "Separation of real runs from the exact one", "step",
-        f"largest distance from the exact place ({unit})", tuple(series), y_scale="log",
+        f"largest distance from the exact place ({unit})", series, y_scale="log",
         caption=TEXTS("separations_caption"),
-    )] if series else []  # fmt: skip
-    world = "ball" if ball else "md"
-    what = [*size(view), ("Exact", TEXTS(f"exact_{world}")), ("Took", f"{number(s['seconds'], 2)} s")]
-    sections = [
-        Section("Ranking", [Table(columns, lines, shown=100), *_gains(s, roles)], terminal=True),
+    )] * bool(series)  # fmt: skip
+    what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), view.took]
+    return view.page(f"{view.name}: precisions", TEXTS("certify_about"), keys, [
+        Section("Ranking", [ranking, *_gains(s, roles)], terminal=True),
         Section("Steps kept", [figure, dtypes]),
         Section("Separation from the exact run", plots),
-        Section("What was run", [pairs(what), *([TEXTS("ambiguous")] if ambiguous else [])]),
-    ]
-    return Page(f"{view.name}: precisions", TEXTS("certify_about"), keys,
-                [one for one in sections if one.parts], view.system_toml, view.folder.provenance)  # fmt: skip
+        Section("What was run", [pairs(what), *[TEXTS("ambiguous")] * bool(ambiguous)]),
+    ])  # fmt: skip
+
+
+def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[Series, ...]:
+    """A line for each of some names of a table of `_lines`."""
+    names = next(iter(table.values()))
+    steps = np.unique(table["step"])
+    lines = {label: np.full(len(steps), np.nan) for label in labels.values()}
+    for name, label in labels.items():
+        mine = names == name
+        lines[label][np.searchsorted(steps, table["step"][mine])] = table["separation"][mine]
+    return curves(steps, lines)
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
@@ -303,10 +273,7 @@ def fork_processes(
     *,
     steps: int | None = None,
     which: Sequence[Variant] | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a system jitted, eagerly, in a batch, in a gradient and under flags of XLA, and find which agree.
 
@@ -314,10 +281,7 @@ def fork_processes(
         system: a loaded system, a shipped name or the path of a system file; pair potentials only.
         steps: of each program; default 200, or the system's own where they are fewer.
         which: the variants; default `mdnum.forks.processes.VARIANTS`.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values, such as {"precision.force": "float32"}.
-        report: write report.html.
-        progress: called now and then with variants done, how many there are, and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.processes.Variants`.
@@ -327,62 +291,44 @@ def fork_processes(
         FolderError: the folder cannot be used.
         MdnumError: not one of the variants ran.
     """
-    from mdnum.forks.choices.base import is_pairwise
     from mdnum.forks.processes import VARIANTS, variants
 
-    began = time.perf_counter()
-    loaded = of_md(system, overrides, "processes")
-    last = min(PROGRAM_STEPS, loaded.spec.dynamics.steps) if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
-    if not is_pairwise(loaded):
-        raise InputError(
-            "the programs of a many-body potential are not compared",
-            where=loaded.name,
-            remedy="Use a system with a pair potential",
-        )
-    asked = VARIANTS if which is None else tuple(which)
-    with frame.new_folder("processes", f"fork-{loaded.name}", out, system=loaded) as folder:
-        note = frame.logged(folder, progress, frame.STEPWISE)
+    loaded = of_md(system, keep.get("overrides"), "processes", pairwise=True)
+    last, asked = last_step(loaded, steps, PROGRAM_STEPS), VARIANTS if which is None else tuple(which)
+    with frame.answering("processes", f"fork-{loaded.name}", loaded, **keep) as answer:
 
         def ended(done: int, of: int, name: str) -> None:
-            note(done, of, {"phase": "running in processes of their own", "unit": "variants"})
+            frame.say(answer.log, "running in processes of their own", done, of, unit="variants")
             if name:
-                folder.log(f"  {name} has ended")
+                answer.folder.log(f"  {name} has ended")
 
         ended(0, len(asked), "")
-        found = variants(loaded, last, asked, ended)
-        tables: dict[str, Any] = {}
-        summary = basics(loaded, found.steps) | {"steps_asked": last} | _programs(found, tables)
-        frame.store(folder, summary | {"seconds": time.perf_counter() - began}, tables)
-    return frame.finish(folder, report=report, result=found, progress=progress)
-
-
-def _programs(found: Variants, tables: dict[str, Any]) -> dict[str, Any]:
-    rows = []
-    for row in found.rows:
-        one = row.variant
-        rows.append({
-            "variant": one.name, "program": one.program, "flags": " ".join(one.flags),
-            "reduction": one.reduction or "", "cluster": None if row.failed else row.cluster,
+        answer.result = found = variants(loaded, last, asked, ended)
+        rows = [{
+            "variant": row.variant.name, "program": row.variant.program, "flags": " ".join(row.variant.flags),
+            "reduction": row.variant.reduction or "", "cluster": None if row.failed else row.cluster,
             "first_bit": row.first_bit, "steps": len(row.hashes), "separation": row.separation,
             "seconds": row.seconds, "hash": row.hashes[-1] if row.hashes else "", "failed": row.failed,
-        })  # fmt: skip
-    table = [
-        {**row, **{key: -1 if row[key] is None else row[key] for key in ("cluster", "first_bit")}}
-        for row in rows
-    ]
-    tables["variants"] = {name: [row[name] for row in table] for name in table[0]}
-    sized = [row for row in found.rows if len(row.separations)]
-    if sized:
-        tables["variant_separations"] = {
-            "variant": np.concatenate([np.full(len(row.separations), row.variant.name) for row in sized]),
-            "step": np.concatenate([np.arange(1, len(row.separations) + 1) for row in sized]),
-            "separation": np.concatenate([row.separations for row in sized]),
+        } for row in found.rows]  # fmt: skip
+        answer.summary = basics(loaded, found.steps) | {
+            "steps_asked": last, "reference": found.reference, "clusters": found.clusters,
+            "causes": [_cause(**cause) for cause in found.causes],
+            "failed_variants": [row["variant"] for row in rows if row["failed"]], "variants": rows,
+        }  # fmt: skip
+        apart = {row.variant.name: row.separations for row in found.rows if len(row.separations)}
+        answer.tables = {
+            "variants": [
+                {**row, **{key: -1 if row[key] is None else row[key] for key in ("cluster", "first_bit")}}
+                for row in rows
+            ],
+            "variant_separations": _lines("variant", apart, first=1),
         }
-    failed = [row.variant.name for row in found.rows if row.failed]
-    return {"reference": found.reference, "clusters": found.clusters, "causes": found.causes,
-            "failed_variants": failed, "variants": rows}  # fmt: skip
+    return answer.outcome
+
+
+def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: Any) -> str:
+    what = TEXTS(f"cause_of_{program}") if program else ""
+    return TEXTS(f"cause_{code}", names=", ".join(names), what=what, **values)
 
 
 def judge_processes(view: View) -> Verdict:
@@ -406,65 +352,46 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     s, length = view.summary, view.units.length
     ran = [row for row in s["variants"] if not row["failed"]]
     seeds = [row["first_bit"] for row in ran if row["first_bit"] is not None]
-    failed = len(s["failed_variants"])
+    failed, furthest = len(s["failed_variants"]), max(row["separation"] for row in ran)
     keys = [
         Key("Programs", count(len(ran)), f"{count(failed)} more did not run" if failed else "all ran"),
         Key("Trajectories", count(len(s["clusters"])), "that differ in a bit"),
         Key("With the reference", count(len(s["clusters"][0])), f"{s['reference']} included"),
-        Key(
-            "First bit", f"step {count(min(seeds))}" if seeds else "–", "differs" if seeds else "none differs"
-        ),
-        Key(
-            "Separation", number(max(row["separation"] for row in ran)), f"{length}, at the last step at most"
-        ),
-    ]
-    rows = []
-    for row in sorted(s["variants"], key=lambda row: (row["cluster"] is None, row["cluster"] or 0)):
-        about = TEXTS(f"program_{row['program']}") + (
-            f"; force sums {row['reduction']}" * bool(row["reduction"])
-        )
-        leaves = "reference" if row["variant"] == s["reference"] else row["first_bit"]
-        cluster = None if row["cluster"] is None else row["cluster"] + 1
-        rows.append((cluster, row["variant"], row["failed"] or about, row["flags"],
-                     None if row["failed"] else leaves, row["steps"] or None,
-                     row["separation"], row["hash"][:12], row["seconds"]))  # fmt: skip
-    columns = (
-        "cluster",
-        "program",
-        "",
-        "flags",
-        "first differing bit",
-        "steps",
-        f"separation ({length})",
-        "hash",
-        "s",
-    )
-    table, series = view.table("variant_separations"), []
-    for k, names in enumerate(s["clusters"]):
-        longest = max((table["variant"] == name for name in names), key=np.count_nonzero)
-        step, separation = table["step"][longest], table["separation"][longest]
-        if k and np.any(separation > 0):
-            shown = np.where(separation > 0, separation, np.nan)
-            series.append(Series("; ".join(names), step, shown, role=_ROLES[(k - 1) % len(_ROLES)]))
+        Key("First bit", f"step {count(min(seeds))}" if seeds else "–",
+            "differs" if seeds else "none differs"),
+        Key("Separation", number(furthest), f"{length}, at the last step at most"),
+    ]  # fmt: skip
+
+    def program(row: Mapping[str, Any]) -> str:
+        sums = f"; force sums {row['reduction']}" * bool(row["reduction"])
+        return row["failed"] or TEXTS(f"program_{row['program']}") + sums
+
+    def leaves(row: Mapping[str, Any]) -> Any:
+        return "reference" if row["variant"] == s["reference"] else row["first_bit"]
+
+    rows = sorted(s["variants"], key=lambda row: (row["cluster"] is None, row["cluster"] or 0))
+    programs = table_of(rows, {
+        "cluster": lambda row: None if row["cluster"] is None else row["cluster"] + 1,
+        "program": "variant", "": program, "flags": "flags",
+        "first differing bit": leaves,
+        "steps": lambda row: row["steps"] or None, f"separation ({length})": "separation",
+        "hash": lambda row: row["hash"][:12], "s": "seconds",
+    })  # fmt: skip
+    table = view.table("variant_separations")
+    # the longest of each cluster stands for it
+    longest = {max(names, key=lambda name: np.count_nonzero(table["variant"] == name)): "; ".join(names)
+               for names in s["clusters"][1:]}  # fmt: skip
+    series = _drawn(table, longest)
     plots = [Plot(
         "separations", "Separation of programs from the reference", "step",
-        f"largest distance from the reference ({length})", tuple(series), y_scale="log",
+        f"largest distance from the reference ({length})", series, y_scale="log",
         caption=TEXTS("programs_caption"),
-    )] if series else []  # fmt: skip
-    causes = [_cause(**cause) for cause in s["causes"]]
-    what = [*size(view), ("Programs", TEXTS("programs")), ("Took", f"{number(s['seconds'], 2)} s")]
-    sections = [
-        Section("Programs", [*causes, Table(columns, rows)], terminal=True),
+    )] * bool(series)  # fmt: skip
+    return view.page(f"{view.name}: programs", TEXTS("programs_about"), keys, [
+        Section("Programs", [*s["causes"], programs], terminal=True),
         Section("Separation from the reference", plots),
-        Section("What was run", [pairs(what)]),
-    ]
-    return Page(f"{view.name}: programs", TEXTS("programs_about"), keys,
-                [one for one in sections if one.parts], view.system_toml, view.folder.provenance)  # fmt: skip
-
-
-def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: Any) -> str:
-    what = TEXTS(f"cause_of_{program}") if program else ""
-    return TEXTS(f"cause_{code}", names=", ".join(names), what=what, **values)
+        Section("What was run", [pairs([*size(view), ("Programs", TEXTS("programs")), view.took])]),
+    ])  # fmt: skip
 
 
 VERBS = {

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
-from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.finding import Texts, Verdict, conclude
+from mdnum.report.section import Key, Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
-from mdnum.verbs.fork_pair import basics, few_steps, of_any, of_md
-from mdnum.verbs.frame import Outcome, Progress, View
+from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_md
+from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
     from mdnum.forks.boundaries import Boundary
@@ -45,10 +44,7 @@ def fork_map(
     most: int | None = None,
     loss: Loss | None = None,
     confirm: bool = True,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Where the history of a run's decisions changes along a number, to adjacent floats.
 
@@ -62,10 +58,7 @@ def fork_map(
         loss: of the final state, called with the simulation, unwrapped positions and velocities; default the
             mean squared displacement from the start. That of a ball is the file's.
         confirm: whether to run both sides of every boundary again in a fresh process.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
-        report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.boundaries.BoundaryMap`.
@@ -76,58 +69,51 @@ def fork_map(
     """
     from mdnum.forks.boundaries import boundaries, checked
     from mdnum.forks.worlds import program_of
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    began = time.perf_counter()
-    system = of_any(system, overrides)
-    if isinstance(system, BallSystem):
+    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    if isinstance(loaded, BallSystem):
         if loss is not None:
             raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
-        system = system if steps is None else system.for_steps(steps)
-        last, kind = system.spec.integrator.steps, str(system.spec.loss.kind)
-        lost = {"loss": kind.replace("-", " "), "loss_unit": "m²" if kind == "residual-penetration" else "m"}
+        loaded = loaded if steps is None else loaded.for_steps(steps)
+        last, kind = last_step(loaded, steps), str(loaded.spec.loss.kind)
+        lost = kind.replace("-", " "), "m²" if kind == "residual-penetration" else "m"
     else:
-        last = few_steps(system, steps)
-        lost = {"loss": "mean squared displacement", "loss_unit": f"{system.units.length}²"}
+        last = last_step(loaded, steps, FEW_STEPS)
+        lost = "mean squared displacement", f"{loaded.units.length}²"
         if loss is not None:
-            lost = {"loss": getattr(loss, "__name__", "loss"), "loss_unit": ""}
+            lost = getattr(loss, "__name__", "loss"), ""
     # what cannot be is refused before there is a folder
-    spelled = checked(program_of(system), key, low, high)
-    with frame.new_folder("map", f"fork-{system.name}", out, system=system) as folder:
-        found = boundaries(
-            system, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
-            progress=frame.logged(folder, progress, frame.STEPWISE),
+    spelled = checked(program_of(loaded), key, low, high)
+    with frame.answering("map", f"fork-{loaded.name}", loaded, **keep) as answer:
+        answer.result = found = boundaries(
+            loaded, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
+            progress=answer.log,
         )  # fmt: skip
-        edges = [_row(edge) for edge in found.boundaries]
-        intervals = plain(found.intervals)
-        starts = [one["low"] for one in intervals]
-        pieces = np.searchsorted(starts, found.at, side="right") - 1
-        points = {
-            "at": found.at, "history": np.array([one["history"] for one in intervals])[pieces],
-            "loss": found.loss, "energy": found.energy,
-        }  # fmt: skip
+        edges, intervals = [_row(edge) for edge in found.boundaries], plain(found.intervals)
+        at = np.searchsorted([one["low"] for one in intervals], found.at, side="right") - 1
         jumps = [abs(edge.jump) for edge in found.boundaries if np.isfinite(edge.jump)]
-        summary = basics(system, last) | {
-            "key": spelled.key, "key_unit": spelled.unit, "value": spelled.value, **lost,
-            "low": found.low, "high": found.high, "histories": found.histories, "complete": found.complete,
-            "resolution": found.resolution, "evaluations": found.evaluations, "failed_runs": found.failed,
-            "confirm": confirm,
+        answer.summary = basics(loaded, last) | {
+            "key": spelled.key, "key_unit": spelled.unit, "value": spelled.value, "loss": lost[0],
+            "loss_unit": lost[1], "low": found.low, "high": found.high, "histories": found.histories,
+            "complete": found.complete, "resolution": found.resolution, "evaluations": found.evaluations,
+            "failed_runs": found.failed, "confirm": confirm,
             "confirmed": sum(edge.confirmed is True for edge in found.boundaries) if confirm else None,
             "jump_largest": max(jumps, default=None),
             "separation_largest": max((edge.separation for edge in found.boundaries), default=None),
             "boundaries": edges, "intervals": intervals, "unresolved": found.unresolved,
-            "compiles": found.number.compiles, "seconds": time.perf_counter() - began,
+            "compiles": found.number.compiles,
         }  # fmt: skip
-        tables: dict[str, Any] = {"points": points}
-        for name, rows, left in (
-            ("boundaries", edges, ("who", "way", "channel")),
-            ("intervals", intervals, ()),
-        ):
-            if rows:
-                columns = [column for column in rows[0] if column not in left]
-                tables[name] = {column: [row[column] for row in rows] for column in columns}
-        frame.store(folder, summary, tables)
-    return frame.finish(folder, report=report, result=found, progress=progress)
+        said = ("who", "way", "channel")
+        answer.tables = {
+            "points": {
+                "at": found.at, "history": np.array([one["history"] for one in intervals])[at],
+                "loss": found.loss, "energy": found.energy,
+            },
+            "boundaries": [{name: edge[name] for name in edge if name not in said} for edge in edges],
+            "intervals": intervals,
+        }  # fmt: skip
+    return answer.outcome
 
 
 def _row(edge: Boundary) -> dict[str, Any]:
@@ -135,21 +121,19 @@ def _row(edge: Boundary) -> dict[str, Any]:
     below, above = edge.below, edge.above
     first, second = [*edge.subject, -1, -1][:2]
     side = "above" if above.decided else "below"
+    who, way, gradients = f"ball {first}", f"touches {side}", {}
     if edge.channel == "pair":
         who, way = "–".join(map(str, edge.subject)), f"in {side}"
-    elif edge.channel == "contact":
-        who, way = f"ball {first}", f"touches {side}"
     else:
-        who = f"ball {first}" if edge.subject else "solver"
-        way = f"{below.decided} → {above.decided}"
-    gradients = {"gradient_below": below.gradient, "gradient_above": above.gradient}
+        gradients = {"gradient_below": below.gradient, "gradient_above": above.gradient}
+    if edge.channel == "stop":
+        who, way = who if edge.subject else "solver", f"{below.decided} → {above.decided}"
     return {
         "below": below.at, "above": above.at, "step": edge.step, "i": first, "j": second, "who": who,
         "way": way, "channel": edge.channel,
         "inside": above.decided < below.decided if edge.channel == "stop" else bool(above.decided),
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,
-        "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump,
-        **(gradients if edge.channel != "pair" else {}),
+        "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump, **gradients,
         "energy_below": below.energy, "energy_above": above.energy, "separation": edge.separation,
         "confirmed": {True: "yes", False: "no", None: "not asked"}[edge.confirmed],
     }  # fmt: skip
@@ -162,30 +146,26 @@ def judge_map(view: View) -> Verdict:
     all_failed = bool(failed) and failed == s["evaluations"]
     ends = {name: repr(s[name]) for name in ("low", "high", "value")}
     values = {**s, **ends, "n": len(edges), "more": len(left), "unit": view.units.length}
-    kind = "failing" if all_failed and edges else "failed" if all_failed else (
-        ("change" if edges else "same") + ("_more" if left else ""))  # fmt: skip
-    evidence = [] if all_failed else list(_map_evidence(s, values))
-    own, away = s["value"], ""
+    kind = ("change" if edges else "same") + ("_more" if left else "")
+    kind = kind if not all_failed else "failing" if edges else "failed"
+    own, away, found = s["value"], "", []
     if own is not None and not s["low"] <= own <= s["high"]:
         nearest = min(abs(s["low"] - own), abs(s["high"] - own))
-        far = nearest > max(s["high"] - s["low"], 0.1 * abs(own))
-        away = TEXTS(f"{'far_' if far else ''}{'above' if own < s['low'] else 'below'}", **values)
-    found = []
+        far = "far_" * (nearest > max(s["high"] - s["low"], 0.1 * abs(own)))
+        away = TEXTS(f"{far}{'above' if own < s['low'] else 'below'}", **values)
     moved = [repr(edge["above"]) for edge in edges if edge["confirmed"] == "no"]
     if moved:
-        ball = ["ball"] * ("balls" in s)
-        places = ", ".join(moved[:4])
-        found.append(
-            TEXTS.finding("NOT_REPRODUCED", *ball, section="Boundaries", n=len(moved), places=places)
-        )
+        ball, places = ["ball"] * ("balls" in s), ", ".join(moved[:4])
+        found += [TEXTS.finding("NOT_REPRODUCED", *ball, section="Boundaries", n=len(moved), places=places)]
     if edges and not s["confirm"]:
-        found.append(TEXTS.finding("NOT_CONFIRMED", section="Boundaries"))
+        found += [TEXTS.finding("NOT_CONFIRMED", section="Boundaries")]
     wide = [low for low, high in left if np.nextafter(low, np.inf) < high]
     if wide:
-        found.append(TEXTS.finding("MORE_BOUNDARIES", more=len(wide), n=len(edges), at=repr(wide[0])))
+        found += [TEXTS.finding("MORE_BOUNDARIES", more=len(wide), n=len(edges), at=repr(wide[0]))]
     if failed:
         variants = ["all"] * all_failed + ["away"] * bool(away)
-        found.append(TEXTS.finding("RUNS_FAILED", *variants, failed=failed, runs=s["evaluations"], away=away))
+        found += [TEXTS.finding("RUNS_FAILED", *variants, failed=failed, runs=s["evaluations"], away=away)]
+    evidence = [] if all_failed else _map_evidence(s, values)
     best = "info" if edges or left else "good"
     return conclude(found, evidence, headline=TEXTS(f"map_{kind}", **values), best=best)
 
@@ -207,72 +187,51 @@ def _map_evidence(s: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[s
 
 def page_map(view: View, verdict: Verdict) -> Page:
     """The page of a map."""
-    s, ball = view.summary, "balls" in view.summary
-    edges, unit, length = s["boundaries"], s["key_unit"], view.units.length
-    sure = s["confirmed"]
-    more = f"{count(len(s['unresolved']))} more not searched" if s["unresolved"] else "to adjacent floats"
+    s, unit, length = view.summary, view.summary["key_unit"], view.units.length
+    edges, sure, left = s["boundaries"], s["confirmed"], s["unresolved"]
     keys = [
-        Key("Boundaries", count(len(edges)), more),
+        Key("Boundaries", count(len(edges)),
+            f"{count(len(left))} more not searched" if left else "to adjacent floats"),
         Key("Histories", count(s["histories"]), "distinct, of all decisions"),
         Key("Largest jump", number(s["jump_largest"]), f"{s['loss_unit']}, of the {s['loss']}"),
-        Key(
-            "Final states", number(s["separation_largest"]), f"{length}, separation across a boundary at most"
-        ),
-        Key(
-            "Confirmed",
-            "–" if sure is None else f"{count(sure)} of {count(len(edges))}",
-            "in a fresh process",
-        ),
+        Key("Final states", number(s["separation_largest"]),
+            f"{length}, separation across a boundary at most"),
+        Key("Confirmed", "–" if sure is None else f"{count(sure)} of {count(len(edges))}",
+            "in a fresh process"),
         Key("Runs", count(s["evaluations"]), f"{number(s['seconds'], 2)} s in all"),
-    ]
+    ]  # fmt: skip
     at = [edge["above"] for edge in edges]
     numbered = len(at) > 1 and bool(np.diff(at).min() < _ROOM * (s["high"] - s["low"]))
     figures = list(_map_figures(view, numbered))
-    ends = ("derivative below", "above") if ball else (f"separation ({length})",)
-    rows = [
-        (k + 1, repr(edge["below"]), repr(edge["above"]), edge["step"], edge["who"], edge["way"],
-         edge["also"], edge["margin_below"], edge["margin_above"], edge["bound"], edge["jump"],
-         *((edge["gradient_below"], edge["gradient_above"]) if ball else (edge["separation"],)),
-         edge["confirmed"])
-        for k, edge in enumerate(edges)
-    ]  # fmt: skip
-    columns = ("", "below", "above", "step", "decision", "differs", "others", "margin below", "margin above",
-               "bound", f"jump ({s['loss_unit']})", *ends, "confirmed")  # fmt: skip
-    intervals = [
-        (
-            repr(one["low"]),
-            repr(one["high"]),
-            one["history"] + 1,
-            one["loss_low"],
-            one["loss_high"],
-            one["runs"],
-        )
-        for one in s["intervals"]
-    ]
-    named = ("from", "to", "history", f"{s['loss']} at its low end", "at its high end", "runs")
+    boundaries = table_of([{"n": k, **edge} for k, edge in enumerate(edges, 1)], {
+        "": "n", "below": lambda edge: repr(edge["below"]),
+        "above": lambda edge: repr(edge["above"]), "step": "step", "decision": "who", "differs": "way",
+        "others": "also", "margin below": "margin_below", "margin above": "margin_above", "bound": "bound",
+        f"jump ({s['loss_unit']})": "jump",
+        **({"derivative below": "gradient_below", "derivative above": "gradient_above"} if "balls" in s
+           else {f"separation ({length})": "separation"}),
+        "confirmed": "confirmed",
+    })  # fmt: skip
+    intervals = table_of(s["intervals"], {
+        "from": lambda one: repr(one["low"]), "to": lambda one: repr(one["high"]),
+        "history": lambda one: one["history"] + 1, f"{s['loss']} at its low end": "loss_low",
+        "at its high end": "loss_high", "runs": "runs",
+    })  # fmt: skip
     own = "" if s["value"] is None else f"; the system’s own is {s['value']!r}"
     what = [
         *size(view), ("Number", f"{_with_unit(s['key'], unit)} from {s['low']!r} to {s['high']!r}{own}"),
         ("Loss", f"{_with_unit(s['loss'], s['loss_unit'])} of the last step"),
-        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")),
-        ("Took", f"{number(s['seconds'], 2)} s"),
+        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), view.took,
     ]  # fmt: skip
-    left = [(repr(low), repr(high)) for low, high in s["unresolved"]]
-    sections = [
+    stretches = table_of(left, {"from": lambda one: repr(one[0]), "to": lambda one: repr(one[1])})
+    return view.page(f"{view.name}: along {s['key']}", TEXTS("map_about"), keys, [
         Section(f"Along {s['key']}", figures[:2]),
-        Section(
-            "Boundaries",
-            [TEXTS("boundaries"), Table(columns, rows)] if rows else [TEXTS("none")],
-            terminal=True,
-        ),
+        Section("Boundaries", [TEXTS("boundaries"), boundaries] if edges else [TEXTS("none")], terminal=True),
         Section("What changes at each boundary", figures[2:]),
-        Section("Intervals", [TEXTS("intervals"), Table(named, intervals)]),
-        Section("Not searched", [TEXTS("unresolved"), Table(("from", "to"), left)] if left else []),
+        Section("Intervals", [TEXTS("intervals"), intervals]),
+        Section("Not searched", [TEXTS("unresolved"), stretches] if left else []),
         Section("What was run", [pairs(what)]),
-    ]
-    sections = [one for one in sections if one.parts]
-    title = f"{view.name}: along {s['key']}"
-    return Page(title, TEXTS("map_about"), keys, sections, view.system_toml, view.folder.provenance)
+    ])  # fmt: skip
 
 
 def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
@@ -289,16 +248,12 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
     )
     label = _with_unit(s["key"], s["key_unit"])
     breaks = np.flatnonzero(np.diff(points["history"])) + 1
-    caption = TEXTS("map_caption_numbered" if numbered else "map_caption")
+    # a stretch whose ends differ and that was not searched holds jumps, and nobody knows where
+    searched = np.isin(at[breaks - 1], [edge["below"] for edge in edges])
 
     def pieces(name: str, values: np.ndarray, title: str, less: str) -> Plot:
-        series = [
-            Series(
-                "one history", np.insert(at, breaks, np.nan), np.insert(values, breaks, np.nan), "line+points"
-            )
-        ]
-        # a stretch whose ends differ and that was not searched holds jumps, and nobody knows where
-        searched = np.isin(at[breaks - 1], [edge["below"] for edge in edges])
+        x, y = (np.insert(one, breaks, np.nan) for one in (at, values))
+        series = [Series("one history", x, y, "line+points")]
         named: tuple[tuple[np.ndarray, str, Role], ...] = (
             (~searched, "not searched", "muted"), (searched, "jump", "bad"),
         )  # fmt: skip
@@ -308,6 +263,7 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
                         for v in (at, values))  # fmt: skip
                 series.append(Series(text, x, y, role=role, dashed=role == "muted"))
         loss_label = _with_unit(s["loss"], s["loss_unit"]) + less
+        caption = TEXTS("map_caption_numbered" if numbered else "map_caption")
         return Plot(name, title, label, loss_label, tuple(series), verticals=marks, caption=caption)
 
     yield pieces("map", loss, f"The {s['loss']} at step {s['steps']:,}", "")
@@ -319,21 +275,17 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
         fit = np.polynomial.polynomial.polyfit(x[finite], loss[finite], _TREND, w=weight[finite])
         rest = loss - np.polynomial.polynomial.polyval(x, fit)
         yield pieces("detail", rest, f"The {s['loss']}, less its trend", ", less a cubic")
-    else:
-        yield from ()
-    if len(edges) < 2:
-        return
-    where = np.array([edge["above"] for edge in edges])
-    jump, separation = (
-        np.abs([np.nan if edge[name] is None else edge[name] for edge in edges])
-        for name in ("jump", "separation")
-    )
-    series = [Series(_with_unit("jump of the loss", s["loss_unit"]), where, jump, "points", "bad")]
-    if np.isfinite(separation).any():
-        text = f"separation of the final states ({view.units.length})"
-        series.append(Series(text, where, separation, "points", "muted"))
-    yield Plot("jumps", "What changes at each boundary", label, "across the boundary", tuple(series),
-               y_scale="log", caption=TEXTS("jumps_caption"))  # fmt: skip
+    if len(edges) > 1:
+        where = np.array([edge["above"] for edge in edges])
+        jump, separation = (
+            np.abs(np.array([edge[name] for edge in edges], float)) for name in ("jump", "separation")
+        )
+        series = curves(where, {
+            _with_unit("jump of the loss", s["loss_unit"]): jump,
+            f"separation of the final states ({view.units.length})": separation,
+        }, "points")  # fmt: skip
+        yield Plot("jumps", "What changes at each boundary", label, "across the boundary", series,
+                   y_scale="log", caption=TEXTS("jumps_caption"))  # fmt: skip
 
 
 def _with_unit(text: str, unit: str) -> str:
@@ -344,14 +296,7 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def fork_forecast(
-    system: System | str | Path,
-    size: float,
-    *,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    system: System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Which decisions a random displacement of the start would flip first, from one tangent run.
 
@@ -359,10 +304,7 @@ def fork_forecast(
         system: a loaded system, a shipped name or the path of a system file; pair potentials only.
         size: of the displacement: how far the furthest atom is moved, length.
         steps: last step; default the system's own.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values.
-        report: write report.html.
-        progress: called at each phase with a dictionary that names it.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.linearized.Forecast`.
@@ -376,116 +318,87 @@ def fork_forecast(
 
     if not 0 < size < float("inf"):
         raise InputError(f"a displacement of {size:g}; expected a length above 0")
-    began = time.perf_counter()
-    loaded = of_md(system, overrides, "forecast")
-    simulation = build(loaded)
-    if not simulation.pairwise:
-        raise InputError(
-            "decisions of a many-body potential are not forecast",
-            where=loaded.name,
-            remedy="Use a system with a pair potential",
-        )
-    last = loaded.spec.dynamics.steps if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
-    with frame.new_folder("forecast", f"fork-{loaded.name}", out, system=loaded) as folder:
-        frame.logged(folder, progress, frame.STEPWISE)(0, 0, {"phase": "carrying a tangent along"})
-        found = forecast(simulation, last)
+    loaded = of_md(system, keep.get("overrides"), "forecast", pairwise=True)
+    last, simulation = last_step(loaded, steps), build(loaded)
+    with frame.answering("forecast", f"fork-{loaded.name}", loaded, **keep) as answer:
+        frame.say(answer.log, "carrying a tangent along")
+        answer.result = found = forecast(simulation, last)
         flips = {"first": found.first(size, _LISTED), "nearest": found.nearest(_LISTED)}
         good = found.good_until(size)
-        examined = int(found.listed[: good.step + 1].sum())
-        summary = basics(loaded, last) | {
+        answer.summary = basics(loaded, last) | {
             "size": size, **flips, "until": good.step, "ends": good.ends, "kicks": found.kicks,
-            "examined": examined, "linear": LINEAR * simulation.r_cut, "ulp": found.ulp,
-            "seconds": time.perf_counter() - began,
+            "examined": int(found.listed[: good.step + 1].sum()), "linear": LINEAR * simulation.r_cut,
+            "ulp": found.ulp,
         }  # fmt: skip
-        rows = [{"asked": name, **vars(flip)} for name, listed in flips.items() for flip in listed]
         least = np.argmin(found.reach, axis=2, keepdims=True)
         reach = np.take_along_axis(found.reach, least, axis=2)[:, :, 0]
         sign, step = np.argmin(reach, axis=0), np.arange(reach.shape[1])
         pair = found.pairs[sign, step, least[sign, step, 0]]
-        tables: dict[str, Any] = {
+        answer.tables = {
             "reach": {"step": step, "positive": reach[0], "negative": reach[1], "i": pair[:, 0],
-                      "j": pair[:, 1], "furthest": found.furthest}
+                      "j": pair[:, 1], "furthest": found.furthest},
+            "foretold": [{"asked": name, **vars(flip)} for name in flips for flip in flips[name]],
         }  # fmt: skip
-        if rows:
-            tables["foretold"] = {name: [row[name] for row in rows] for name in rows[0]}
-        frame.store(folder, summary, tables)
-    return frame.finish(folder, report=report, result=found, progress=progress)
+    return answer.outcome
 
 
 def judge_forecast(view: View) -> Verdict:
     """What a displacement is expected to flip first, and how far that is good."""
-    s = view.summary
-    first, nearest, ends = s["first"], s["nearest"], s["ends"]
-    values = {**s, "unit": view.units.length, "after": s["until"] + 1, "first": None}
-    kind = "flips" if first else "none" if s["until"] < 0 else "nothing" if ends == "end" else "nothing_until"
-    evidence = (
-        [TEXTS("nearest", **values, **nearest[0], needed=abs(nearest[0]["amplitude"]))] if nearest else []
-    )
-    if s["until"] >= 0:
-        evidence.append(TEXTS(f"good_{ends}", **values))
-    found: list[Finding] = []
+    s, unit = view.summary, view.units.length
+    first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
+    values = {**s, "unit": unit, "after": until + 1}
+    kind = "flips" if first else "none" if until < 0 else "nothing" if ends == "end" else "nothing_until"
+    evidence, found = [], []
+    if nearest:
+        evidence += [TEXTS("nearest", **values, **nearest[0], needed=abs(nearest[0]["amplitude"]))]
+    if until >= 0:
+        evidence += [TEXTS(f"good_{ends}", **values)]
     if ends in ("size", "close", "list"):
-        variants = ["none"] * (s["until"] < 0)
-        found.append(TEXTS.finding(f"FORECAST_ENDS_{ends.upper()}", *variants, until=s["until"]))
+        found += [TEXTS.finding(f"FORECAST_ENDS_{ends.upper()}", *["none"] * (until < 0), until=until)]
     if s["size"] < 8 * s["ulp"]:
-        found.append(TEXTS.finding("BELOW_ROUNDING", ulp=s["ulp"], unit=view.units.length))
+        found += [TEXTS.finding("BELOW_ROUNDING", ulp=s["ulp"], unit=unit)]
     headline = TEXTS(f"forecast_{kind}", **{**values, **(first[0] if first else {})})
     return conclude(found, evidence, headline=headline, best="info" if first or ends != "end" else "good")
 
 
 def page_forecast(view: View, verdict: Verdict) -> Page:
     """The page of a forecast."""
-    s, length = view.summary, view.units.length
-    first, nearest, until = s["first"], s["nearest"], s["until"]
+    s, length, until = view.summary, view.units.length, view.summary["until"]
+    first, near = (next(iter(s[name]), None) for name in ("first", "nearest"))
+    examined = many(s["examined"], "decision")
     keys = [
         Key("Displacement", number(s["size"], 2), f"{length}, of the furthest atom"),
-        Key("First flip", f"step {count(first[0]['step'])}" if first else "–", "expected"),
-        Key("Nearest decision", number(abs(nearest[0]["amplitude"]), 2) if nearest else "–",
-            f"{length} flip it"),
-        Key("In ulps", number(nearest[0]["ulps"], 2) if nearest else "–", "of the largest start coordinate"),
+        Key("First flip", f"step {count(first['step'])}" if first else "–", "expected"),
+        Key("Nearest decision", number(near and abs(near["amplitude"]), 2), f"{length} flip it"),
+        Key("In ulps", number(near and near["ulps"], 2), "of the largest start coordinate"),
         Key("Good until", f"step {count(until)}" if until >= 0 else "–",
-            f"of {count(s['steps'])}; {many(s['examined'], 'decision')} of listed pairs examined"),
+            f"of {count(s['steps'])}; {examined} of listed pairs examined"),
     ]  # fmt: skip
-    columns = ("step", "pair", f"displacement ({length})", "ulps of the start", "margin")
-    listed = []
-    for title, flips in (("Flips first", first), ("Nearest to flipping", nearest)):
-        rows = [
-            (one["step"], f"{one['i']}–{one['j']}", one["amplitude"], one["ulps"], one["margin"])
-            for one in flips
-        ]
-        if rows:
-            listed.append(Table(columns, rows, title))
-    table, series = view.table("reach"), []
-    named: tuple[tuple[str, str, Role], ...] = (
-        ("positive", "forward along it", "first"), ("negative", "backward along it", "second"),
-    )  # fmt: skip
-    for name, label, role in named:
-        size_of = np.abs(table[name])
-        if np.any(np.isfinite(size_of) & (size_of > 0)):
-            shown = np.where(np.isfinite(size_of) & (size_of > 0), size_of, np.nan)
-            series.append(Series(label, table["step"], shown, "points", role))
+    columns = {
+        "step": "step", "pair": lambda one: f"{one['i']}–{one['j']}", f"displacement ({length})": "amplitude",
+        "ulps of the start": "ulps", "margin": "margin",
+    }  # fmt: skip
+    titles = {"first": "Flips first", "nearest": "Nearest to flipping"}
+    table = view.table("reach")
+    series = curves(table["step"], {
+        "forward along it": np.abs(table["positive"]), "backward along it": np.abs(table["negative"]),
+    }, "points")  # fmt: skip
     plots = []
     if series:
         with np.errstate(divide="ignore", over="ignore"):
-            limit = s["linear"] / table["furthest"]
-        limit = np.where(limit > 0, limit, np.nan)
-        series.append(Series("too large for a forecast above", table["step"], limit, role="muted"))
+            limit = positive(s["linear"] / table["furthest"])
+        series += (Series("too large for a forecast above", table["step"], limit, role="muted"),)
         plots.append(Plot(
             "reach", "Displacement of the start that flips a decision", "step",
-            f"displacement of the start ({length})", tuple(series), y_scale="log",
+            f"displacement of the start ({length})", series, y_scale="log",
             horizontals=((float(s["size"]), "asked for"),), caption=TEXTS("reach_caption"),
         ))  # fmt: skip
-    what = [*size(view), ("Direction", TEXTS("direction")), ("Took", f"{number(s['seconds'], 2)} s")]
-    sections = [
+    return view.page(f"{view.name}: forecast", TEXTS("forecast_about"), keys, [
         Section("Displacements that flip a decision", plots),
-        Section("Decisions", listed, terminal=True),
-        Section("What was run", [pairs(what)]),
-    ]
-    sections = [one for one in sections if one.parts]
-    return Page(f"{view.name}: forecast", TEXTS("forecast_about"), keys, sections, view.system_toml,
-                view.folder.provenance)  # fmt: skip
+        Section("Decisions", [table_of(s[name], columns, title) for name, title in titles.items() if s[name]],
+                terminal=True),
+        Section("What was run", [pairs([*size(view), ("Direction", TEXTS("direction")), view.took])]),
+    ])  # fmt: skip
 
 
 VERBS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,20 @@ from matplotlib.patches import Circle
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Verdict
-from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.section import (
+    Figure,
+    Key,
+    Page,
+    Plot,
+    Role,
+    Section,
+    Series,
+    Table,
+    curves,
+    pairs,
+    positive,
+    table_of,
+)  # fmt: skip
 from mdnum.report.words import count, listed, many, number, plain
 from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
 
@@ -34,8 +47,8 @@ _ARROW = 0.5
 def page(view: View, verdict: Verdict) -> Page:
     """The page of a pair of runs."""
     s = view.summary
-    sections = [
-        Section("Separation", [part for part in (_separation(view),) if part]),
+    return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), _keys(view), [
+        Section("Separation", list(_separation(view))),
         Section(DECISION, [*_decision(view), *_around(view)], terminal=True),
         Section(TWO_BY_TWO, list(_two_by_two(s)), terminal=True),
         Section("One decision overridden", list(_pinned(view)), terminal=True),
@@ -44,13 +57,8 @@ def page(view: View, verdict: Verdict) -> Page:
         Section("Growth", list(_growth(view)), terminal=True),
         Section("After the fork", list(_after(view))),
         Section("Decisions that differ", list(_flips(view))),
-        Section(WHAT, list(_what(view, s))),
-    ]
-    sections = [one for one in sections if one.parts]
-    title = f"{view.name}: {s['choice']}"
-    return Page(
-        title, str(s["difference"]), list(_keys(view)), sections, view.system_toml, view.folder.provenance
-    )
+        Section(WHAT, list(_what(view))),
+    ])  # fmt: skip
 
 
 def _keys(view: View) -> Iterator[Key]:
@@ -68,65 +76,57 @@ def _keys(view: View) -> Iterator[Key]:
     guess = "" if s["predicted_split"] is None else f"; split expected at step {count(s['predicted_split'])}"
     poor = ", but no single exponential" if fits is not None and fits < FITS else guess
     yield Key("Growth rate", number(s["growth_rate_time"]), f"per {time}{poor}")
-    least = next((one for one in s["shares"] if one["what"] == "decisions" and one["reference"] == "A"), {})
     worth = number(s["e_foldings"])
     if s["e_foldings"] is None and s["effect"] == "cause":
         # no split in sight: the share is at least what was followed
-        worth = f"> {number(least['e_foldings'])}" if least.get("e_foldings") else "∞"
+        shares = (one for one in s["shares"] if one["what"] == "decisions" and one["reference"] == "A")
+        least = next(shares, {}).get("e_foldings")
+        worth = f"> {number(least)}" if least else "∞"
     yield Key("The flips were worth", worth, "e-foldings: growth rate × steps gained")
     stops = f", {count(s['cross_stops'])} of them numbers of {s['counted']}" if "cross_stops" in s else ""
     yield Key("Decisions that differ", count(s["cross_flips"]), f"made in one run only{stops}")
 
 
-def _dates(s: Mapping[str, Any], *, all_of_them: bool = False) -> tuple[tuple[float, str], ...]:
-    names = (("first_bit", "first bit"),) * all_of_them + (("fork", "fork"), ("split", "split"))
-    return tuple((float(s[name]), label) for name, label in names if s.get(name) is not None)
-
-
-def _positive(values: np.ndarray) -> np.ndarray:
-    """Without zeros, which a logarithmic axis has no place for."""
-    return np.where(values > 0, values, np.nan)
+def _dates(s: Mapping[str, Any], *names: str) -> tuple[tuple[float, str], ...]:
+    return tuple((float(s[name]), name.replace("_", " ")) for name in names if s.get(name) is not None)
 
 
 def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
     return name in table and bool(np.any(np.nan_to_num(table[name]) > 0))
 
 
-def _separation(view: View) -> Plot | None:
+def _separation(view: View) -> Iterator[Plot]:
     """The separation of A from B, free and under imposed decisions, with the three dates."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
-        return None
-    step = table["step"]
+        return
     # a repeat is close to the run that it repeats and must not hide it: it comes first
     repeats = [name for name in table if name.startswith("repeat_")]
-    series = [
-        Series("" if k else "B again, start perturbed", step, _positive(table[name]), role="muted")
-        for k, name in enumerate(repeats)
-    ]
-    named: tuple[tuple[str, str, Role], ...] = (
+    named: list[tuple[str, str, Role]] = [
+        *((name, "" if k else "B again, start perturbed", "muted") for k, name in enumerate(repeats)),
         ("free", "A and B, free", "first"), ("imposed", "A and B under A’s decisions", "second"),
         ("back", "B and A under B’s decisions", "third"), ("pinned", "A and B, decision overridden", "bad"),
-    )  # fmt: skip
-    for name, label, role in named:
-        if _has(table, name):
-            # before the fork the lines lie upon one another
-            series.append(Series(label, step, _positive(table[name]), role=role, dashed=name != "free"))
-    verticals, guess = _dates(s, all_of_them=True), s["predicted_split"]
-    shown = guess is not None and guess <= _BEYOND * s["steps"]
+    ]  # fmt: skip
+    # before the fork the lines lie upon one another
+    dashed = ("imposed", "back", "pinned")
+    series = [
+        Series(label, table["step"], positive(table[name]), role=role, dashed=name in dashed)
+        for name, label, role in named
+        if _has(table, name)
+    ]
+    verticals, guess = _dates(s, "first_bit", "fork", "split"), s["predicted_split"] or 0
+    shown = 0 < guess <= _BEYOND * s["steps"]
     if shown:
-        verticals += ((float(guess or 0), "split expected"),)
+        verticals += ((float(guess), "split expected"),)
     fit = s["growth"]["B"]
     if fit["rate"] is not None and fit["r_squared"] >= FITS:
-        at = np.linspace(fit["first"], (guess or 0) if shown else fit["last"], 60)
+        at = np.linspace(fit["first"], guess if shown else fit["last"], 60)
         line = np.exp(fit["intercept"] + fit["rate"] * at)
         series.append(Series("growth, fitted", at, line, role="ink", dashed=True))
-    ball = "balls" in s
-    return Plot(
+    what = "largest difference of heights" if "balls" in s else "largest distance of an atom from itself"
+    yield Plot(
         "separation", "Separation of the two runs", f"step (of {plain(s['timestep'])} {view.units.time})",
-        f"{'largest difference of heights' if ball else 'largest distance of an atom from itself'} "
-        f"({view.units.length})",
-        tuple(series), y_scale="log", verticals=verticals,
+        f"{what} ({view.units.length})", tuple(series), y_scale="log", verticals=verticals,
         horizontals=((float(s["tolerance"]), "split tolerance"),),
         caption=TEXTS("separation_caption" if _has(table, "imposed") else "separation_caption_free"),
     )  # fmt: skip
@@ -188,17 +188,15 @@ def _around(view: View) -> Iterator[Any]:
             verticals=((float(d["step"]), "fork"),), horizontals=((0.0, "floor"),),
             caption=TEXTS("around_caption"),
         )  # fmt: skip
-        return
-    table = view.table("neighborhood")
-    if len(table["atom"]) > 1:
-        i, j = table["atom"][:2].tolist()
-        alt = f"{many(len(table['atom']) - 2, 'atom')} around the pair {i}–{j} in A and in B, projected."
-        yield Figure("atoms", TEXTS("atoms_caption"), alt, lambda figure: _atoms(view, table, figure), 4.0)
+    elif len(atoms := view.table("neighborhood")["atom"]) > 1:
+        pair = f"{atoms[0]}–{atoms[1]}"
+        alt = f"{many(len(atoms) - 2, 'atom')} around the pair {pair} in A and in B, projected."
+        yield Figure("atoms", TEXTS("atoms_caption"), alt, lambda figure: _atoms(view, figure), 4.0)
 
 
-def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
+def _atoms(view: View, figure: Canvas) -> None:
     """A and B side by side, each with the pair in the plane and its cutoff around the first atom."""
-    d = view.summary["decision"]
+    d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
     )
@@ -237,24 +235,24 @@ def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
 
 def _two_by_two(s: Mapping[str, Any]) -> Iterator[Any]:
     """Whose arithmetic, whose decisions: when each run splits from A and from B, and what each is worth."""
-    cells, rows = s["table"], {}
-    for cell in cells:
-        key = cell["arithmetic"], cell["decisions"]
+    lines: dict[tuple[str, str], dict[str, str]] = {}
+    for cell in s["table"]:
+        arithmetic, decisions, whose = cell["arithmetic"], cell["decisions"], cell["reference"]
         at = f"> {count(cell['until'])}" if cell["split"] is None else count(cell["split"])
-        same = key == (cell["reference"],) * 2
-        rows.setdefault(key, {})[cell["reference"]] = f"is {cell['reference']}" if same else at
-    if len(rows) < 3 or all(cell["split"] is None for cell in cells):
+        same = arithmetic == decisions == whose
+        key = arithmetic, "its own" if arithmetic == decisions else f"{decisions}’s"
+        lines.setdefault(key, {})[whose] = f"is {whose}" if same else at
+    if len(lines) < 3 or all(cell["split"] is None for cell in s["table"]):
         return
-    lines = [(a, "its own" if a == d else f"{d}’s", at.get("A"), at.get("B")) for (a, d), at in rows.items()]
     repeated = s["repeated"]
-    for whose, name in (("its own", "free"), ("A’s", "imposed")):
+    for whose, name in (("its own", "free"), ("A’s", "imposed")) if repeated else ():
         seen = [one[name] for one in repeated if one[name] is not None]
         unseen = [f"{len(repeated) - len(seen)} of {len(repeated)} not seen to"] * (len(seen) < len(repeated))
         steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
-        if repeated:
-            lines.append(("B, start perturbed", whose, "; ".join(steps + unseen), None))
+        lines["B, start perturbed", whose] = {"A": "; ".join(steps + unseen)}
     yield TEXTS("two_by_two")
-    yield Table(("arithmetic", "decisions", "splits from A at", "from B at"), lines)
+    rows = [(*key, at.get("A"), at.get("B")) for key, at in lines.items()]
+    yield Table(("arithmetic", "decisions", "splits from A at", "from B at"), rows)
     worth: dict[str, dict[str, str]] = {}
     for one in s["shares"]:
         more = "> " if one["at_least"] else ""
@@ -284,21 +282,26 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
     minimal = s.get("minimal")
     if minimal is None:
         return
-    reason = minimal["reason"]
-    values = {**minimal, "reason": reason[:1].upper() + reason[1:]}
-    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_missing", **values)
+    if not minimal["tests"]:
+        yield TEXTS("minimal_refused", **minimal)
+        return
+    yield f"{minimal['reason']} {TEXTS('minimal_tests', **minimal)}"
+
+    def spells(pair: Mapping[str, Any]) -> str:
+        spans = [
+            f"from {count(first)} on" if end is None
+            else count(first) if end == first + 1
+            else f"{count(first)} to {count(end - 1)}"
+            for first, end in pair["differs"]
+        ]  # fmt: skip
+        more = f", and {many(len(spans) - 3, 'time')} more" if len(spans) > 3 else ""
+        return ", ".join(spans[:3]) + more
+
     if minimal["pairs"]:
-        rows = []
-        for pair in minimal["pairs"]:
-            spells = [
-                f"from {count(first)} on" if end is None
-                else count(first) if end == first + 1
-                else f"{count(first)} to {count(end - 1)}"
-                for first, end in pair["differs"]
-            ]  # fmt: skip
-            more = f", and {many(len(spells) - 3, 'time')} more" if len(spells) > 3 else ""
-            rows.append((f"{pair['i']}–{pair['j']}", ", ".join(spells[:3]) + more))
-        yield Table(("pair", "decided differently, steps"), rows)
+        yield table_of(
+            minimal["pairs"],
+            {"pair": lambda pair: f"{pair['i']}–{pair['j']}", "decided differently, steps": spells},
+        )
 
 
 def _certain(view: View) -> Iterator[Any]:
@@ -318,21 +321,19 @@ def _certain(view: View) -> Iterator[Any]:
     if until is not None:
         kind = "throughout" if until >= s["steps"] else "until" if until >= 0 else "never"
         rows.append(("Protected", TEXTS(f"protected_{kind}", until=until)))
-    if s.get("shadow"):
-        other = "B" if s["shadow"] == "A" else "A"
-        rows.append(
-            ("Shadow horizon", TEXTS("shadow", step=s["shadow_horizon"], wide=s["shadow"], other=other))
-        )
+    if wide := s.get("shadow"):
+        values = {"step": s["shadow_horizon"], "wide": wide, "other": "B" if wide == "A" else "A"}
+        rows.append(("Shadow horizon", TEXTS("shadow", **values)))
     if not rows:
         return
     yield TEXTS("certain")
     yield pairs(rows)
     table = view.table("separation")
     if _has(table, "nearest_a") and _has(table, "free"):
-        verticals = _dates(s)
+        verticals = _dates(s, "fork", "split")
         if until is not None and 0 <= until < s["steps"]:
             verticals = ((float(until), "protected"), *verticals)
-        nearest, moved = _positive(table["nearest_a"]), _positive(2 * table["free"])
+        nearest, moved = positive(table["nearest_a"]), positive(2 * table["free"])
         series = (
             Series("nearest pair of A to its cutoff", table["step"], nearest, mark="points", role="muted"),
             Series("twice the separation of A and B", table["step"], moved, role="first"),
@@ -368,37 +369,27 @@ def _growth(view: View) -> Iterator[Any]:
 def _after(view: View) -> Iterator[Plot]:
     """What differs at each step: decisions, those that were overridden, energies."""
     s, table = view.summary, view.table("separation")
-    length, dates = view.units.length, _dates(s)
-    for name, title, label in (
+    step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
+    named = [
         ("cross", "Decisions that the two runs make differently", "decisions that differ"),
         ("overridden", "Decisions overridden in the run under A’s decisions", "decisions overridden"),
-    ):
-        if _has(table, name):
-            values = _positive(table[name].astype(float))
-            wide = np.nanmax(values) > 30
-            series = (Series(label, table["step"], values, mark="points"),)
-            yield Plot(
-                name, title, "step", label, series, y_scale="log" if wide else "linear", verticals=dates,
-                caption=TEXTS(f"{name}_caption"),
-            )  # fmt: skip
-    if _has(table, "furthest") and "balls" not in s:
-        series = (Series("", table["step"], _positive(table["furthest"]), mark="points"),)
-        yield Plot(
-            "furthest", "Distance of overridden pairs from their cutoff", "step",
-            f"furthest from its cutoff ({length})", series, y_scale="log", verticals=dates,
-            horizontals=((float(s["tolerance"]), "split tolerance"),), caption=TEXTS("furthest_caption"),
-        )  # fmt: skip
-    named: tuple[tuple[str, str, Role], ...] = (
-        ("energy_b", "B, free", "first"), ("energy_imposed", "B under A’s decisions", "second"),
-    )  # fmt: skip
-    off: list[tuple[str, Role, np.ndarray]] = [
-        (label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named
+        ("furthest", "Distance of overridden pairs from their cutoff", f"furthest from it ({length})"),
     ]
-    lines = [Series(label, table["step"], _positive(y), role=role) for label, role, y in off if np.any(y > 0)]
+    for name, title, label in named[: 2 if "balls" in s else 3]:
+        if _has(table, name):
+            values, far = positive(table[name]), name == "furthest"
+            log = far or np.nanmax(values) > 30
+            yield Plot(
+                name, title, "step", label, (Series(label, step, values, mark="points"),),
+                y_scale="log" if log else "linear", verticals=dates, caption=TEXTS(f"{name}_caption"),
+                horizontals=((float(s["tolerance"]), "split tolerance"),) * far,
+            )  # fmt: skip
+    off = {"B, free": table["energy_b"], "B under A’s decisions": table["energy_imposed"]}
+    lines = curves(step, {label: np.abs(energy - table["energy_a"]) for label, energy in off.items()})
     if lines:
-        unit = f"|energy − energy of A| ({view.units.energy})"
-        yield Plot("energy", "Difference of total energies", "step", unit, tuple(lines), y_scale="log",
-                   verticals=dates, caption=TEXTS("energy_caption"))  # fmt: skip
+        yield Plot("energy", "Difference of total energies", "step",
+                   f"|energy − energy of A| ({view.units.energy})", lines, y_scale="log", verticals=dates,
+                   caption=TEXTS("energy_caption"))  # fmt: skip
 
 
 def _flips(view: View) -> Iterator[Any]:
@@ -444,7 +435,8 @@ def size(view: View) -> list[tuple[str, str]]:
     return [*rows, ("Size", text + kind)]
 
 
-def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
+def _what(view: View) -> Iterator[Any]:
+    s, kind = view.summary, "split_ball" if "balls" in view.summary else "split_md"
     rows = [
         *size(view),
         ("Choice", f"{s['choice']}: {s['choice_about']}"),
@@ -454,25 +446,20 @@ def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
         rows.append(("Replay", TEXTS("reproduced" if s["reproduced"] else "not_reproduced")))
     if s.get("must_hold"):
         rows.append(("Must hold", TEXTS("must_hold")))
-    split = TEXTS(
-        "split_ball" if "balls" in s else "split_md", tolerance=s["tolerance"], unit=view.units.length
-    )
-    rows.append(("Split", split))
+    rows.append(("Split", TEXTS(kind, tolerance=s["tolerance"], unit=view.units.length)))
     if s["imposed_until"] is None:
         rows.append(("Counterfactual", TEXTS("no_counterfactual")))
     if s["count"] and s["count"]["pairs"] > 1:
         rows.append(("Chance", TEXTS("chance", repeats=s["count"]["pairs"] - 1, agreeing=agreeing(s))))
-    yield pairs([*rows, ("Took", f"{number(s['seconds'], 2)} s")])
-    if s.get("differences"):
-        yield differences(s)
-    elif s["changes"]:
-        changed = [(key, _value(a), _value(b)) for key, (a, b) in s["changes"].items()]
-        yield Table(("key", "in A", "in B"), changed, "What differs in the system file")
+    yield pairs([*rows, view.took])
+    changed = s.get("differences") or [(key, *values) for key, values in s["changes"].items()]
+    if changed:
+        yield differences(changed, "" if s.get("differences") else "What differs in the system file")
 
 
-def differences(s: Mapping[str, Any]) -> Table:
-    """What was different about two finished runs."""
-    return Table(("key", "in A", "in B"), [(key, _value(a), _value(b)) for key, a, b in s["differences"]])
+def differences(rows: Sequence[Sequence[Any]], title: str = "") -> Table:
+    """What was different about two runs: key, in A, in B."""
+    return Table(("key", "in A", "in B"), [(key, _value(a), _value(b)) for key, a, b in rows], title)
 
 
 def _value(value: Any) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.verbs import frame
 from mdnum.verbs.fork_verdict import TEXTS
-from mdnum.verbs.frame import Outcome, Progress
+from mdnum.verbs.frame import Answer, Keep, Outcome, Progress
 
 if TYPE_CHECKING:
     from mdnum.forks import Fork, Twin
@@ -27,7 +25,7 @@ FEW_STEPS = 500
 _SHARE, _FEWEST, _MOST = 0.25, 400, 2_000
 #: Steps before and after the fork of which the deciding ball's heights are kept.
 _BEFORE, _AFTER = 40, 80
-#: Columns of separation.parquet by the series that they hold; those of molecular dynamics alone come last.
+#: Columns of separation.parquet by the series that they hold, and those of molecular dynamics alone.
 _SERIES = {
     "free": "B", "imposed": "B|A", "back": "A|B", "cross": "cross", "overridden": "overridden",
     "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_imposed": "energy B|A",
@@ -55,63 +53,39 @@ class PairQuestion:
 # -- what questions about forks share ------------------------------------------------------------------
 
 
-def of_any(
-    system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None
-) -> System | BallSystem:
-    """A system of either world.
-
-    Raises:
-        InputError: there is none, or it is loaded already and there are overrides.
-    """
-    from mdnum.systems import BallSystem, System, load
-
-    if not isinstance(system, System | BallSystem):
-        return load(system, overrides)
-    if overrides:
-        raise InputError(
-            "overrides change a system while it is loaded",
-            remedy="Load it with the overrides, or give its name",
-            where=system.name,
-        )
-    return system
-
-
-def is_ball(system: Any) -> bool:
-    """Whether a system, or what is there under a name, is a ball."""
-    from mdnum.systems import BallSystem, System
-    from mdnum.systems.load import world_of
-
-    if isinstance(system, System | BallSystem):
-        return isinstance(system, BallSystem)
-    return world_of(system) == "ball"
-
-
-def few_steps(system: System, steps: int | None) -> int:
-    """The last step: the one asked for, else the system's own, but no more than a few hundred.
+def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
+    """The last step: the one asked for, else the system's own, but no more than `most`.
 
     Raises:
         InputError: steps below 1.
     """
-    last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+    from mdnum.systems.load import world_of
+
+    own = (system.spec.integrator if world_of(system) == "ball" else system.spec.dynamics).steps
+    last = steps if steps is not None else own if most is None else min(most, own)
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
     return last
 
 
-def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str) -> System:
+def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False) -> System:
     """A system of molecular dynamics, the only ones that a question is asked of.
 
     Args:
         question: whose sentence "ball_<question>" says what a ball offers in its place.
+        pairwise: whether it is asked of pair potentials alone; "many_body_<question>" then says so.
 
     Raises:
-        InputError: it is a ball, or none.
+        InputError: it is a ball, has a many-body potential, or is no system.
     """
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    loaded = of_any(system, overrides)
+    loaded = load(system, overrides)
     if isinstance(loaded, BallSystem):
         raise InputError("this system is a ball", where=loaded.name, remedy=TEXTS(f"ball_{question}"))
+    if pairwise and loaded.spec.cutoff is None:
+        remedy = "Use a system with a pair potential"
+        raise InputError(TEXTS(f"many_body_{question}"), where=loaded.name, remedy=remedy)
     return loaded
 
 
@@ -119,20 +93,18 @@ def basics(system: System | BallSystem, steps: int | None) -> dict[str, Any]:
     """What every summary says of the system; steps default to its own."""
     from mdnum.systems import BallSystem
 
-    head = {"system": system.name, "about": system.spec.about}
+    spec: Any = system.spec
+    own = spec.integrator if isinstance(system, BallSystem) else spec.dynamics
+    last = own.steps if steps is None else steps
+    head: dict[str, Any] = {"system": system.name, "about": spec.about}
     if isinstance(system, BallSystem):
-        kind = system.spec.integrator.kind
-        own = system.spec.integrator
-        head |= {
-            "balls": system.balls, "contact_kind": system.spec.contact.kind, "integrator": kind,
-            "counted": "impacts" if kind == "event-located" else "iterations", "units": "ball",
-        }  # fmt: skip
+        counted = "impacts" if own.kind == "event-located" else "iterations"
+        head |= {"balls": system.balls, "contact_kind": spec.contact.kind, "integrator": own.kind,
+                 "counted": counted, "units": "ball"}  # fmt: skip
     else:
-        own = system.spec.dynamics
         head |= {"atoms": len(system.atoms), "units": system.units.name}
-    asked = own.steps if steps is None else steps
     return {
-        **head, "steps": asked, "steps_asked": asked, "timestep": float(own.timestep), "status": "complete",
+        **head, "steps": last, "steps_asked": last, "timestep": float(own.timestep), "status": "complete",
         "findings": [],
     }  # fmt: skip
 
@@ -156,71 +128,54 @@ def followed(
     twin: Twin,
     labels: Mapping[str, Any],
     asked: PairQuestion,
-    further: Callable[[Fork], dict[str, Any]],
-    out: str | Path | None,
-    report: bool,
-    progress: Progress | None,
+    further: Callable[[Fork], dict[str, Any]] = lambda made: {},
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Follow a twin and leave a fork folder.
 
     Args:
-        labels: entries of the summary on what is varied; further: those that need the pair.
+        labels: entries of the summary on what is varied.
+        further: gives those that need the pair.
     """
     from mdnum.forks import fork as follow
     from mdnum.forks.pair import counterfactuals
 
-    began = time.perf_counter()
-    is_ball = hasattr(system, "balls")
-    options = {name: getattr(asked, name) for name in ("counterfactual", "back", "repeats")}
+    options: dict[str, Any] = {
+        "counterfactual": asked.counterfactual,
+        "back": asked.back,
+        "repeats": asked.repeats,
+    }
     counterfactuals(twin, **options)
-    with frame.new_folder("fork", f"fork-{system.name}", out, system=system) as folder:
-        made = follow(
-            twin,
-            asked.steps,
-            split=asked.split,
-            progress=frame.logged(folder, progress, frame.STEPWISE),
-            **options,
-        )
-        summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
-        tables = {"separation": _separation(made, is_ball)}
-        if is_ball:
-            summary |= {"decision": _decision(made), **_ball_flips(made, tables)}
-        else:
-            summary |= _of_md(made, asked, tables, progress)
-        summary |= {**_predicted(made, summary), **further(made), "seconds": time.perf_counter() - began}
-        frame.store(folder, summary, tables)
-    return frame.finish(folder, report=report, result=made, progress=progress)
+    with frame.answering("fork", f"fork-{system.name}", system, **keep) as answer:
+        made = follow(twin, asked.steps, split=asked.split, progress=answer.log, **options)
+        answer.result = made
+        answer.summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
+        answer.tables["separation"] = _separation(made)
+        own = _of_md(made, asked, answer) if made.twin.a.streams else _of_ball(made, answer.tables)
+        answer.summary |= own | _predicted(made, own) | further(made)
+    return answer.outcome
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
     """What the summary of any pair says: dates, verdict, growth, the table of two by two."""
-    from mdnum.forks.pair import FLIPS_KEPT
-
-    step, free, verdict = made.twin.a.timestep, made.series["B"], made.verdict
+    step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.seed, "fork": made.dates.fork, "split": made.dates.split}
-    count = None
-    if verdict.count is not None:
-        count = {**plain(verdict.count), "threshold": verdict.threshold, "needed": verdict.count.needed}
-
-    def of(name: str, reduce: Callable[[np.ndarray], Any]) -> Any:
-        values = made.series.get(name)
-        return None if values is None or not np.isfinite(values).any() else reduce(values)
-
+    free, imposed, overridden = (
+        values[np.isfinite(values)] for values in
+        (made.series.get(name, np.zeros(0)).astype(float) for name in ("B", "B|A", "overridden"))
+    )  # fmt: skip
+    count = verdict.count and {
+        **plain(verdict.count), "threshold": verdict.threshold, "needed": verdict.count.needed,
+    }  # fmt: skip
+    free_runs = made.failed.keys() & {"A", "B"}
     return {
-        "difference": made.twin.difference,
-        "changes": made.twin.changes,
-        "steps": made.steps,
-        "steps_asked": made.asked,
-        **dates,
+        "difference": made.twin.difference, "changes": made.twin.changes, "steps": made.steps,
+        "steps_asked": made.asked, **dates,
         **{f"{name}_time": None if at is None else at * step for name, at in dates.items()},
-        "tolerance": made.tolerance,
-        "effect": verdict.word,
-        "reasons": verdict.reasons,
-        "e_foldings": verdict.nats,
-        "count": count,
-        "growth_rate": made.growth["B"].rate,
-        "growth_rate_time": made.growth["B"].rate / step,
-        "r_squared": made.growth["B"].r_squared,
+        "tolerance": made.tolerance, "effect": verdict.word,
+        "reasons": [{"code": code, **values} for code, values in verdict.reasons],
+        "e_foldings": verdict.nats, "count": count, "growth_rate": growth.rate,
+        "growth_rate_time": growth.rate / step, "r_squared": growth.r_squared,
         "growth": {name: _fit(fit, made.series[name]) for name, fit in made.growth.items()},
         "splits": {name: made.splits[name] for name in ("B", "B|A", "A|B") if name in made.splits},
         "table": made.table,
@@ -230,28 +185,25 @@ def _numbers(made: Fork) -> dict[str, Any]:
             for one in made.shares
         ],
         "repeated": [{"free": one.free, "imposed": one.handed} for one in made.repeats],
-        "imposed_until": of("B|A", lambda values: int(np.flatnonzero(np.isfinite(values))[-1])),
-        "imposed_largest": of("B|A", np.nanmax),
-        "separation_end": of("B", lambda values: values[np.isfinite(values)][-1]),
-        "separation_largest": float(np.nanmax(free)) if np.isfinite(free).any() else None,
-        "overridden": of("overridden", lambda values: int(np.nansum(values))),
-        "cross_flips": made.flips_total,
-        "cross_flips_kept": min(made.flips_total, FLIPS_KEPT),
-        "failed": {name: word for name, word in made.failed.items() if name in ("A", "B")},
-        "failed_imposed": {name: word for name, word in made.failed.items() if name not in ("A", "B")},
-        "status": "failed" if made.failed.keys() & {"A", "B"} else "complete",
+        "imposed_until": len(imposed) - 1 if len(imposed) else None,
+        "imposed_largest": imposed.max() if len(imposed) else None,
+        "separation_end": free[-1] if len(free) else None,
+        "separation_largest": free.max() if len(free) else None,
+        "overridden": int(overridden.sum()) if len(overridden) else None,
+        "cross_flips": made.flips_total, "cross_flips_kept": len(made.flips),
+        "failed": {name: word for name, word in made.failed.items() if name in free_runs},
+        "failed_imposed": {name: word for name, word in made.failed.items() if name not in free_runs},
+        "status": "failed" if free_runs else "complete",
     }  # fmt: skip
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
     """A fit as a line: separation = exp(intercept + rate * step) between first and last."""
     if not np.isfinite(fit.rate):
-        return {"rate": None, "r_squared": None, "first": None, "last": None, "intercept": None}
+        return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
-    values = separation[step]
-    usable = np.isfinite(values) & (values > 0)
-    intercept = float(np.mean(np.log(values[usable]) - fit.rate * step[usable]))
-    return {**vars(fit), "intercept": intercept}
+    step = step[np.nan_to_num(separation[step]) > 0]
+    return {**vars(fit), "intercept": np.mean(np.log(separation[step]) - fit.rate * step)}
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -268,200 +220,182 @@ def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
     return {"predicted_split": None, "predicted_by": None}
 
 
-def _separation(made: Fork, is_ball: bool) -> dict[str, Any]:
-    series, rows = made.series, len(made.series["step"])
+def _separation(made: Fork) -> dict[str, Any]:
+    series, step = made.series, made.series["step"]
     columns = {
-        name: series.get(key, np.full(rows, np.nan))
+        name: series.get(key, np.full(len(step), np.nan))
         for name, key in _SERIES.items()
-        if not (is_ball and name in _MD_ALONE)
+        if made.twin.a.streams or name not in _MD_ALONE
     }
-    head = {"step": series["step"], "time": series["step"] * made.twin.a.timestep}
-    return head | columns | {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
+    repeats = {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
+    return {"step": step, "time": step * made.twin.a.timestep, **columns, **repeats}
 
 
 def _decision(made: Fork) -> dict[str, Any] | None:
     """The decision at the fork, in plain values."""
-    found = made.decision
-    if found is None:
+    decision = made.decision
+    if decision is None:
         return None
-    length, space = found.margin, {"contact": "height", "stop": "residual"}.get(found.channel)
-    subject = {"ball": found.subject[0] if found.subject else None}
-    margins, bounds, doubtful, protects = found.margins, found.bounds, found.ambiguous_in, 1
-    if found.channel == "pair":
-        i, j = found.subject
+    length, space, protects = (
+        decision.margin,
+        {"contact": "height", "stop": "residual"}.get(decision.channel),
+        1,
+    )
+    subject: dict[str, Any] = {"ball": decision.subject[0] if decision.subject else None}
+    if decision.channel == "pair":
+        i, j = decision.subject
         a, b = (program.simulation for program in (made.twin.a, made.twin.b))
-        run = b if found.run == "B" else a
+        run = b if decision.run == "B" else a
         kind = int(a.type_of(np.array([i]), np.array([j]))[0])
         thresholds = [one.decider.thresholds[kind].value for one in (a, b, run)]
         space, protects = run.decider.space, 2
         if space == "r2":
             # the margin of r² is this factor times that of r
-            length = found.margin / (2.0 * run.decider.r_cut[kind])
-        quantity = thresholds[2] - found.margin
-        distance, *cutoffs = (
-            float(np.sqrt(value)) if space == "r2" else value for value in (quantity, *thresholds[:2])
-        )
-        subject = {"i": i, "j": j, "distance": distance, "margin_length": length}
-        subject["cutoffs"] = dict(zip("AB", cutoffs, strict=True))
-    before = found.separation
-    known = np.isfinite(length) and before > 0
+            length = decision.margin / (2.0 * run.decider.r_cut[kind])
+        root = np.sqrt if space == "r2" else float
+        distance, *cutoffs = (float(root(x)) for x in (thresholds[2] - decision.margin, *thresholds[:2]))
+        subject = {"i": i, "j": j, "distance": distance, "margin_length": length,
+                   "cutoffs": dict(zip("AB", cutoffs, strict=True))}  # fmt: skip
+    before = decision.separation
     return {
-        "channel": found.channel, "step": found.step, "run": found.run, **subject, "entered": found.entered,
-        "decided": {"A": found.a, "B": found.b}, "space": space, "margin": found.margin,
-        "bound": found.bound, "ambiguous": found.ambiguous, "margins": margins, "bounds": bounds,
-        "ambiguous_in": doubtful, "separation_before": before, "also": found.also,
-        "protected": abs(length) / before if known else None, "protects": protects,
+        "channel": decision.channel, "step": decision.step, "run": decision.run, **subject,
+        "entered": decision.entered, "decided": {"A": decision.a, "B": decision.b}, "space": space,
+        "margin": decision.margin, "bound": decision.bound, "ambiguous": decision.ambiguous,
+        "margins": decision.margins, "bounds": decision.bounds, "ambiguous_in": decision.ambiguous_in,
+        "separation_before": before, "also": decision.also,
+        "protected": abs(length) / before if np.isfinite(length) and before > 0 else None,
+        "protects": protects,
     }  # fmt: skip
 
 
-def _of_md(
-    made: Fork, asked: PairQuestion, tables: dict[str, Any], progress: Progress | None
-) -> dict[str, Any]:
+def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
     """Entries and tables of a pair of molecular dynamics."""
     from mdnum.forks.certified import certified
     from mdnum.forks.replays import neighborhood
 
-    frame.say(progress, "the atoms at the fork", made.steps)
-    around = neighborhood(made)
-    decision = _decision(made)
+    frame.say(answer.log, "the atoms at the fork", made.steps)
+    tables, around, decision = answer.tables, neighborhood(made), _decision(made)
     if decision is not None and around is not None:
-        decision["margins"] = dict(zip("AB", around.margins, strict=True))
-        decision["bounds"] = dict(zip("AB", around.bounds, strict=True))
-        decision["ambiguous_in"] = [
-            name for name, margin in decision["margins"].items() if abs(margin) <= decision["bounds"][name]
-        ]
-    summary: dict[str, Any] = {"decision": decision, "r_cut": made.twin.a.simulation.r_cut}
-    found, firsts = certified(made), {}
-    for name in found.horizon:
-        doubts = made.doubts[name]._asdict()
-        firsts[name] = {key: values[0] for key, values in doubts.items()} if len(doubts["step"]) else None
-    runs = found.horizon.items()
-    summary |= {
-        "certified_horizon": {name: one.step for name, one in runs} or None,
-        "ambiguous": {name: one.decisions for name, one in runs},
-        "ambiguous_steps": {name: one.steps for name, one in runs},
-        "ambiguous_first": firsts,
-        "lists_complete": {name: one.complete for name, one in runs},
-        "protected_until": found.protected,
-        "shadow": found.shadow,
-        "shadow_horizon": found.shadow_step,
-    }
+        margins, bounds = (dict(zip("AB", pair, strict=True)) for pair in (around.margins, around.bounds))
+        doubtful = [name for name, margin in margins.items() if abs(margin) <= bounds[name]]
+        decision |= {"margins": margins, "bounds": bounds, "ambiguous_in": doubtful}
+        tables["neighborhood"] = {"atom": around.atoms}
+        for head, vectors in (("", around.positions), ("d", around.moved)):
+            tables["neighborhood"] |= {f"{head}{name}": vectors[:, k] for k, name in enumerate("xyz")}
+    sure = certified(made)
+    doubts = {name: made.doubts[name]._asdict() for name in sure.horizon}
+    summary: dict[str, Any] = {
+        "decision": decision, "r_cut": made.twin.a.simulation.r_cut,
+        "certified_horizon": {name: one.step for name, one in sure.horizon.items()} or None,
+        "ambiguous": {name: one.decisions for name, one in sure.horizon.items()},
+        "ambiguous_steps": {name: one.steps for name, one in sure.horizon.items()},
+        "ambiguous_first": {
+            name: {key: values[0] for key, values in rows.items()} if len(rows["step"]) else None
+            for name, rows in doubts.items()
+        },
+        "lists_complete": {name: one.complete for name, one in sure.horizon.items()},
+        "protected_until": sure.protected, "shadow": sure.shadow, "shadow_horizon": sure.shadow_step,
+    }  # fmt: skip
     names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
     tables["cross_flips"] = {name: [getattr(flip, name) for flip in made.flips] for name in names}
-    doubts = [{"run": np.full(len(one.step), name), **one._asdict()} for name, one in made.doubts.items()]
-    names = ("run", "step", "i", "j", "margin", "bound")
-    tables["ambiguous_pairs"] = {name: np.concatenate([one[name] for one in doubts]) for name in names}
-    if around is not None:
-        vectors = {name: around.positions[:, k] for k, name in enumerate("xyz")}
-        vectors |= {f"d{name}": around.moved[:, k] for k, name in enumerate("xyz")}
-        tables["neighborhood"] = {"atom": around.atoms, **vectors}
+    tables["ambiguous_pairs"] = {
+        name: np.concatenate([getattr(rows, name) for rows in made.doubts.values()])
+        for name in ("step", "i", "j", "margin", "bound")
+    }
+    runs = [np.full(len(rows.step), name) for name, rows in made.doubts.items()]
+    tables["ambiguous_pairs"]["run"] = np.concatenate(runs)
     if asked.lyapunov:
-        frame.say(progress, "the Lyapunov exponent", made.steps)
+        frame.say(answer.log, "the Lyapunov exponent", made.steps)
         summary |= _exponent(made)
     if asked.minimal:
-        summary["minimal"] = _minimal(made, progress)
+        summary["minimal"] = _minimal(made, answer.log)
     if asked.pin is not None:
-        frame.say(progress, "a decision overridden", made.steps)
+        frame.say(answer.log, "a decision overridden", made.steps)
         summary["pinned"] = _pinned(made, asked.pin, tables["separation"])
     return summary
 
 
-def _ball_flips(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
+def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
     """Entries and tables of a pair of a ball: decisions that differ, the deciding ball around the fork."""
     names = ("step", "channel", "ball", "a", "b", "margin_a", "margin_b", "bound_a", "bound_b", "run")
-    column = {name: np.array([getattr(flip, name) for flip in made.flips]) for name in names}
-    if made.flips:
-        in_a, yes = column["run"] == "A", np.ones(len(made.flips), bool)
-        sided = {
-            name: np.where(in_a, column[f"{name}_a"], column[f"{name}_b"]) for name in ("margin", "bound")
-        }
-        subject = {"i": column["ball"], "j": np.full(len(yes), -1)}
-        tables["cross_flips"] = column | sided | subject | {"differs": yes, "entered": yes}
+    flips = [{name: getattr(flip, name) for name in names} for flip in made.flips]
+    tables["cross_flips"] = [
+        {**flip, **{name: flip[f"{name}_{flip['run'].lower()}"] for name in ("margin", "bound")},
+         "i": flip["ball"], "j": -1, "differs": True, "entered": True}
+        for flip in flips
+    ]  # fmt: skip
     if made.decision is not None:
         # the first ball, where they decide together
         at, ball = made.decision.step, made.decision.subject[0] if made.decision.subject else 0
-        step = np.arange(max(0, at - _BEFORE), min(made.steps, at + _AFTER) + 1)
-        rows = []
-        for name in "AB":
-            run = made.runs[name]
-            rows.append({
-                "step": step, "run": np.full(len(step), name), "ball": np.full(len(step), ball),
-                "y": run.y[step, ball].astype(np.float64), "v": run.v[step, ball].astype(np.float64),
-                "contact": np.r_[False, run.contact[:, ball]][step],
-            })  # fmt: skip
-        tables["around"] = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-    stops = int(np.sum(column["channel"] == "stop"))
-    return {"cross_contacts": len(made.flips) - stops, "cross_stops": stops}
+        tables["around"] = [
+            {"step": step, "run": name, "ball": ball, "y": float(run.y[step, ball]),
+             "v": float(run.v[step, ball]), "contact": bool(step and run.contact[step - 1, ball])}
+            for name, run in (("A", made.runs["A"]), ("B", made.runs["B"]))
+            for step in range(max(0, at - _BEFORE), min(made.steps, at + _AFTER) + 1)
+        ]  # fmt: skip
+    stops = sum(flip["channel"] == "stop" for flip in flips)
+    return {"decision": _decision(made), "cross_contacts": len(flips) - stops, "cross_stops": stops}
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
     """The largest Lyapunov exponent of run A beside the growth that was seen, or why there is none."""
     from mdnum.forks.linearized import lyapunov
 
-    def none(name: str, **values: Any) -> dict[str, Any]:
+    def why(name: str, **values: Any) -> dict[str, Any]:
         return {"lyapunov": None, "lyapunov_reason": TEXTS(f"lyapunov_{name}", **values)}
 
     a = made.twin.a.simulation
     if made.dates.seed is None:
-        return none("same")
+        return why("same")
     if not a.pairwise:
-        return none("many_body")
+        return why("many_body")
     steps = min(made.steps, max(_FEWEST, min(_MOST, round(_SHARE * made.steps))))
     try:
         found = lyapunov(a, steps)
     except InputError as error:
-        return none("error", error=error.message)
+        return why("error", error=error.message)
     if not np.isfinite(found.rate):
-        return none("not_finite", steps=steps)
+        return why("not_finite", steps=steps)
     # where A's largest coordinate lies: no smaller displacement of it can be written down
     ulp = float(np.spacing(np.abs(a.positions).max().astype(a.policy.dtype("state"))))
     split = found.steps_to(ulp, made.tolerance)
-    table = {
-        name: getattr(found, name)
-        for name in ("rate", "error", "rate_time", "error_time", "steps", "chaotic")
-    }
-    table |= {"ratio": plain(found.ratio(made.growth["B"])), "ulp": ulp}
-    table["ulp_split"] = None if split is None else round(split)
+    row = {
+        **{name: getattr(found, name) for name in ("rate", "error", "rate_time", "error_time", "steps")},
+        "chaotic": found.chaotic, "ratio": plain(found.ratio(made.growth["B"])), "ulp": ulp,
+        "ulp_split": None if split is None else round(split),
+    }  # fmt: skip
+    if found.chaotic:
+        return {"lyapunov": row, "lyapunov_reason": None}
     # log(end / first) over the steps between them, as Lyapunov.chaotic has it
     linear = float(np.log(steps / found.transient)) / (steps - found.transient)
     slow = found.rate + found.error < 0.5 * linear
-    reason = None if found.chaotic else none("slow" if slow else "unclear", steps=steps, linear=linear)
-    return {"lyapunov": table, "lyapunov_reason": reason and reason["lyapunov_reason"]}
+    return why("slow" if slow else "unclear", steps=steps, linear=linear) | {"lyapunov": row}
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
     """B run again with some decisions overridden with A's; a reason where it cannot be."""
-    from mdnum.forks.replays import check_pins, parse_pin, pinned
+    from mdnum.forks.replays import parse_pin, pinned
 
-    wanted = parse_pin(pin, made.twin.a.size)
     try:
-        check_pins(made)
+        found = pinned(made, **parse_pin(pin, made.twin.a.size))
     except InputError as error:
         return {"pin": pin, "pairs": None, "reason": error.message}
-    if not wanted and made.decision is None:
-        return {"pin": pin, "pairs": None, "reason": "the runs do not fork"}
-    found = pinned(made, **wanted)
     separation["pinned"] = found.separation
     seen = found.separation[np.isfinite(found.separation)]
     row = {name: getattr(found, name) for name in ("pairs", "first", "last", "split", "free")}
     return {"pin": pin, **row, "until": len(seen) - 1, "largest": seen.max(), "reason": None}
 
 
-def _minimal(made: Fork, progress: Progress | None) -> dict[str, Any]:
+def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
     """The fewest decisions that have to be overridden; a reason where none can be."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:
         found = minimal_cause(
-            made,
-            progress=lambda done, most: frame.say(progress, "minimal cause", done, most, unit="runs"),  # type: ignore[arg-type]
+            made, progress=lambda done, most: frame.say(log, "minimal cause", done, most, unit="runs")
         )
     except InputError as error:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
-    pairs = [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs or ()]
-    values = {**vars(found), "n": len(pairs), "decisions": found.horizon + 1}
-    reason = TEXTS(f"minimal_{found.code}", **values)
-    return {
-        **vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "reason": reason,
-        "pairs": pairs or None,
-    }  # fmt: skip
+    pairs = found.pairs and [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs]
+    row = {**vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "pairs": pairs}
+    return row | {"reason": TEXTS(f"minimal_{found.code}", **row, n=len(pairs or ()))}

@@ -43,32 +43,28 @@ def judge(view: View) -> Verdict:
 
 def _headline(view: View) -> tuple[str, dict[str, Any]]:
     """The sentence that answers, by name, and its values."""
-    summary = view.summary
-    failed, word, fork, split = (summary.get(name) for name in ("failed", "effect", "fork", "split"))
-    values = {name: summary.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
+    s = view.summary
+    failed, word, fork, split = (s.get(name) for name in ("failed", "effect", "fork", "split"))
+    values = {name: s.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
     if failed:
-        values |= {"a": failed.get("A"), "b": failed.get("B"), "word": next(iter(failed.values()))}
-        values |= {"run": "A" if "A" in failed else "B", "other": "B" if "A" in failed else "A"}
-        return "ended_both" if len(failed) > 1 else "ended" if summary["decision"] else "ended_fork", values
-    values |= {"until": summary.get("imposed_until"), "subject": subject(summary)}
-    values |= {"compared": _compared(summary), "agreeing": agreeing(summary)}
+        run, ended = next(iter(failed.items()))
+        values |= {"run": run, "word": ended, "other": "B" if run == "A" else "A",
+                   "a": failed.get("A"), "b": failed.get("B")}  # fmt: skip
+        return "ended_both" if len(failed) > 1 else "ended" if s["decision"] else "ended_fork", values
+    imposed = (s.get("splits") or {}).get("B|A")
+    values |= {"imposed": imposed, "until": s.get("imposed_until"), "subject": subject(s)}
+    values["compared"] = TEXTS("compared_not" if imposed is None else "compared", **values)
+    values["agreeing"] = agreeing(s)
     if word == "same":
-        return "same_but_decided" if summary["decision"] else "same", values
+        return "same_but_decided" if s["decision"] else "same", values
     if fork is None:
         return "no_fork" if split is None else "no_fork_split", values
     if word == "bystander" and split < fork:
         return "bystander_before", values
-    if word != "open":
-        return str(word), values
-    by = summary.get("predicted_by")
-    return "open_split" if split is not None else f"open_{by}" if by else "open", values
-
-
-def _compared(summary: Mapping[str, Any]) -> str:
-    """When the runs split, free and under A's decisions."""
-    imposed = (summary.get("splits") or {}).get("B|A")
-    values = {"split": summary.get("split"), "imposed": imposed, "until": summary.get("imposed_until")}
-    return TEXTS("compared_not" if imposed is None else "compared", **values)
+    by = s.get("predicted_by")
+    if word == "open" and (split is not None or by):
+        return "open_split" if split is not None else f"open_{by}", values
+    return str(word), values
 
 
 def agreeing(summary: Mapping[str, Any]) -> str:
@@ -80,8 +76,7 @@ def agreeing(summary: Mapping[str, Any]) -> str:
 def _evidence(view: View) -> Iterator[str]:
     summary, decision = view.summary, view.summary["decision"]
     for reason in summary.get("reasons") or ():
-        text = reason.replace("the first run's", "A’s")
-        yield TEXTS("reason", text=text[:1].upper() + text[1:])
+        yield TEXTS(f"reason_{reason['code']}", **reason, unit=view.units.length)
     if decision is None:
         return
     values = {**decision, "subject": subject(summary), "unit": view.units.length}
@@ -101,38 +96,38 @@ def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _findings(view: View) -> Iterator[Finding]:
-    summary, decision = view.summary, view.summary["decision"]
-    steps, failed = summary["steps"], summary.get("failed") or {}
-    if summary.get("must_hold") and summary.get("first_bit") is not None:
-        yield must_hold(summary)
+    s, decision, unit = view.summary, view.summary["decision"], view.units.length
+    steps, failed, count = s["steps"], s.get("failed") or {}, s.get("count")
+    if s.get("must_hold") and s.get("first_bit") is not None:
+        yield must_hold(s)
     for name, word in failed.items():
-        yield TEXTS.finding("RUN_FAILED", run=name, word=word, steps=steps, asked=summary["steps_asked"])
-    if summary.get("reproduced") is False:
-        stored = summary["stored"]["fork"]
-        yield TEXTS.finding("NOT_REPRODUCED", stored=stored, fork=summary.get("fork"), section=WHAT)
+        yield TEXTS.finding("RUN_FAILED", run=name, word=word, steps=steps, asked=s["steps_asked"])
+    if s.get("reproduced") is False:
+        yield TEXTS.finding("NOT_REPRODUCED", stored=s["stored"]["fork"], fork=s.get("fork"), section=WHAT)
     if decision and decision["ambiguous_in"]:
-        margins = decision["margins"].items()
-        sizes = [TEXTS("of_bound", run=run, margin=abs(x), bound=decision["bounds"][run])
-                 for run, x in margins if run in decision["ambiguous_in"]]  # fmt: skip
-        yield TEXTS.finding("AMBIGUOUS_FORK", section=DECISION, subject=subject(summary), sizes=listed(sizes))
-    values: dict[str, Any] = {"steps": steps, "unit": view.units.length, "split": summary["predicted_split"]}
-    values |= {"separation": summary.get("separation_end"), "tolerance": summary["tolerance"]}
-    if summary["effect"] == "open" and summary["split"] is None and not failed:
-        yield TEXTS.finding("HORIZON_SHORT", *["predicted"] * bool(values["split"]), **values)
-    until = summary.get("imposed_until")
+        sizes = [
+            TEXTS("of_bound", run=run, margin=abs(margin), bound=decision["bounds"][run])
+            for run, margin in decision["margins"].items()
+            if run in decision["ambiguous_in"]
+        ]
+        yield TEXTS.finding("AMBIGUOUS_FORK", section=DECISION, subject=subject(s), sizes=listed(sizes))
+    if s["effect"] == "open" and s["split"] is None and not failed:
+        split = s["predicted_split"]
+        yield TEXTS.finding(
+            "HORIZON_SHORT", *["predicted"] * bool(split), steps=steps, unit=unit, split=split,
+            separation=s.get("separation_end"), tolerance=s["tolerance"],
+        )  # fmt: skip
+    until = s.get("imposed_until")
     if until is not None and until < steps and not failed:
-        word = (summary.get("failed_imposed") or {}).get("B|A")
+        word = (s.get("failed_imposed") or {}).get("B|A")
         yield TEXTS.finding("GUARD", *["failed"] * bool(word), until=until, word=word)
-    count = summary.get("count")
-    if summary["effect"] == "undecided" and count:
+    if s["effect"] == "undecided" and count:
         more = max(REPEATS, 2 * (count["most"] - 1))
         of, need = count["needed"] or (None, None)
         variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
         variants += ["needed"] * (count["needed"] is not None)
-        yield TEXTS.finding(
-            "UNDECIDED", *variants, section=TWO_BY_TWO, agreeing=agreeing(summary), more=more, of=of,
-            need=need,
-        )  # fmt: skip
+        values = {"agreeing": agreeing(s), "more": more, "of": of, "need": need}
+        yield TEXTS.finding("UNDECIDED", *variants, section=TWO_BY_TWO, **values)
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
@@ -144,16 +139,13 @@ def must_hold(row: Mapping[str, Any]) -> Finding:
 def judge_screen(view: View) -> Verdict:
     """The verdict on all choices: which forks first, and whether what must hold did."""
     rows, found = view.summary["ranking"], []
-    for row in rows:
-        if row["must_hold"] and row["first_bit"] is not None:
-            found.append(must_hold(row))
-        if row["failed"]:
-            found.append(TEXTS.finding("CHOICE_FAILED", section=RANKING, **row))
+    broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]
-    broken = [row["choice"] for row in rows if row["must_hold"] and row["first_bit"] is not None]
+    found += [must_hold(row) for row in broken]
+    found += [TEXTS.finding("CHOICE_FAILED", section=RANKING, **row) for row in rows if row["failed"]]
     values = {"choices": len(rows), "forked": len(forked), "steps": view.summary["steps"]}
     if broken:
-        headline = TEXTS("screen_broken", names=", ".join(broken))
+        headline = TEXTS("screen_broken", names=", ".join(row["choice"] for row in broken))
     elif not forked:
         headline = TEXTS("screen_none", **values)
     else:

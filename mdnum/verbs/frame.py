@@ -14,12 +14,13 @@ from __future__ import annotations
 import importlib
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -27,7 +28,8 @@ from mdnum import units
 from mdnum.errors import FolderError, InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, restore
-from mdnum.report.section import Page
+from mdnum.report.section import Key, Page, Section
+from mdnum.report.words import number
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 
@@ -89,6 +91,11 @@ class View:
         """The unit system of all numbers in the folder."""
         return units.get(str(self.summary.get("units") or self.system.get("units") or "lj"))
 
+    @property
+    def took(self) -> tuple[str, str]:
+        """A row on the time that it took."""
+        return "Took", f"{number(self.summary['seconds'], 2)} s"
+
     def table(self, name: str) -> Mapping[str, np.ndarray]:
         """A table of the folder: arrays by column name."""
         if name not in self._tables:
@@ -99,6 +106,11 @@ class View:
         """Findings of summary.json that the verb does not decide again: those whose code it has not."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
+
+    def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
+        """A page of this folder, with its system and provenance; sections without content are left out."""
+        kept = [section for section in sections if section.parts]
+        return Page(title, about, list(keys), kept, self.system_toml, self.folder.provenance)
 
 
 @dataclass(frozen=True)
@@ -169,6 +181,76 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
         yield asked.is_set
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class Keep(TypedDict, total=False):
+    """Keyword arguments of every question that is asked of a system.
+
+    Attributes:
+        out: the new folder; default runs/<verb>-<name>-<n>.
+        overrides: dotted keys of the system file to values, such as {"cutoff.kind": "switched"}.
+        report: write report.html; default True.
+        progress: called now and then with what is done, of how much, and a dictionary that names the phase.
+    """
+
+    out: str | Path | None
+    overrides: Mapping[str, Any] | None
+    report: bool
+    progress: Progress | None
+
+
+@dataclass
+class Answer:
+    """What a question puts into its folder while it is answered.
+
+    Attributes:
+        folder: that is filled.
+        log: passes progress on and writes it to log.txt.
+        summary: of summary.json, anything with plain values.
+        tables: as `store` takes them.
+        result: for who asked from Python.
+        outcome: judged and shown, once it is filled.
+    """
+
+    folder: RunFolder
+    log: Progress
+    summary: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, Any] = field(default_factory=dict)
+    result: Any = None
+    outcome: Outcome = field(init=False)
+
+
+@contextmanager
+def answering(
+    kind: str,
+    name: str,
+    system: Any = None,
+    *,
+    out: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> Iterator[Answer]:
+    """A new folder that is filled, then stored with the seconds that it took, judged and shown.
+
+    Args:
+        kind, name, system: as for `new_folder`.
+        overrides: are in the system already.
+        out, report, progress: see `Keep`; named one by one, so that what is misspelled is refused.
+
+    Raises:
+        InputError: overrides of no system. FolderError: the folder cannot be used.
+    """
+    if overrides and system is None:
+        raise InputError("overrides change a system file, and there is none", remedy="Leave them out")
+    began = perf_counter()
+    with new_folder(kind, name, out, system=system) as folder:
+        answer = Answer(folder, logged(folder, progress, STEPWISE))
+        yield answer
+        store(folder, {"seconds": perf_counter() - began, **answer.summary}, answer.tables)
+        if folder.has_checkpoint():
+            folder.drop_checkpoint()
+    answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
 
 
 @contextmanager
@@ -246,15 +328,19 @@ def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **
         progress(step, steps, {"phase": phase, **counts})
 
 
-def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
+def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Any]) -> None:
     """Ends the filling of a folder: its tables, then its summary.
 
     Args:
         summary: anything with plain values, dataclasses and arrays included.
-        tables: equally long arrays by column name, by table; those of the kind without rows may be left out.
+        tables: by table, equally long arrays by column name, or rows; those of the kind without rows may be
+            left out.
     """
     for name, columns in tables.items():
-        folder.append(name, columns)
+        if not isinstance(columns, Mapping):
+            columns = {key: [row[key] for row in columns] for key in columns[0]} if columns else {}
+        if columns:
+            folder.append(name, columns)
     folder.finalize()
     folder.write_summary(plain(summary))
 

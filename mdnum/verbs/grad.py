@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Unpack, get_args
 
 import numpy as np
 
@@ -17,24 +17,25 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
 from mdnum.store.files import write_bytes
 from mdnum.verbs import frame, grad_page
-from mdnum.verbs.fork_pair import few_steps, is_ball, of_any
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step
+from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, View
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
 if TYPE_CHECKING:
     from mdnum.gradients import Gradient, Method, Problem
     from mdnum.gradients.diagnose import GradientDiagnosis
-    from mdnum.store import RunFolder
+    from mdnum.systems import BallSystem, System
     from mdnum.systems.build import Simulation
-    from mdnum.systems.load import BallSystem, System
 
 ALL = "all"
 #: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
 _QUICK, AFFORDABLE = ("event-aware", "symmetric", "finite-differences"), 6_000_000
 #: Parts of a diagnosis that are always there, and those that are asked for.
 _PARTS, EDGES = ("agreement", "growth", "flips", "trust"), "edges"
-_BRIEF = ("growth", "flips", "spectrum", "scaling", "detective")
 ALSO = ("spectrum", EDGES, "scaling")
+#: Parts that have a table, and its name; parts that the summary has, and what of each it leaves out.
+_TABLES = {"growth": "growth", "flips": "flip_contributions", "trust": "trust", "scaling": "scaling"}
+_BRIEF, _ROWS = ("growth", "flips", "spectrum", "scaling", "detective"), ("table", "turns", "columns")
 #: Entries of a derivative that summary.json has one by one; the file with those that have more.
 _FEW, ARRAYS = 6, "gradients.npz"
 _BALL_UNITS = {
@@ -59,10 +60,7 @@ def grad(
     replicas: int = 0,
     also: str | Sequence[str] = (),
     half_step: bool = True,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
 
@@ -81,10 +79,7 @@ def grad(
         also: further parts of the diagnosis, of `ALSO`, or "all".
         half_step: make the run and its gradient at half the time step too, about as much work again as all
             else; without it nothing is called trusted, and digits are not known. A ball has none of it.
-        out: the new gradient folder; default runs/grad-<name>-<n>.
-        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
-        report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         folder, summary and page; its result is a `GradientDiagnosis`, of a ball `BallGradients`.
@@ -94,39 +89,39 @@ def grad(
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """
+    from mdnum.systems.load import load, world_of
+
     if replicas < 0 or replicas == 1:
         raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
-    began, names, further = time.perf_counter(), words(wrt), words(also)
+    names, further = words(wrt), words(also)
     asked = None if methods is None else words(methods)
     unknown = [word for word in further if word not in (*ALSO, ALL)]
     if unknown:
         raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(ALSO)}")
     further = ALSO if ALL in further else further
-    if is_ball(system):
-        frame.refuse(
-            {"--also": bool(further)}, "of molecular dynamics: this system is a ball", "Leave it out"
-        )
+    if world_of(system) == "ball":
+        whose = "of molecular dynamics: this system is a ball"
+        frame.refuse({"--also": bool(further)}, whose, "Leave it out")
         remedy = "Use --methods randomized, an average over noise with its standard error"
-        frame.refuse({"--replicas": bool(replicas)}, "of molecular dynamics: this system is a ball", remedy)
-        ball = _ball_system(system, of, names, steps, overrides)
+        frame.refuse({"--replicas": bool(replicas)}, whose, remedy)
+        ball = _ball_system(system, of, names, steps, keep.get("overrides"))
         chosen = _ball_methods(asked)
-        with frame.new_folder("grad", f"grad-{ball.name}", out, system=ball) as folder:
-            result, summary = _differentiated(ball, chosen, frame.logged(folder, progress, frame.STEPWISE))
-            frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, {})
-        return frame.finish(folder, report=report, result=result, progress=progress)
+        with frame.answering("grad", f"grad-{ball.name}", ball, **keep) as answer:
+            _differentiated(ball, chosen, answer)
+        return answer.outcome
 
-    md: Any = of_any(system, overrides)
+    md = load(system, keep.get("overrides"), world="md")
     problem, names = _problem(md, of, names, steps)
     chosen, left = plan(problem, names, asked, replicas)
-    with frame.new_folder("grad", f"grad-{md.name}", out, system=md) as folder:
-        log = frame.logged(folder, progress, frame.STEPWISE)
-        result = _diagnosed(problem, names, chosen, left, further, replicas, half_step, log)
-        summary = _summary(problem, names, result)
-        summary["left_out"] = [*_not_run(md, steps, problem, result, replicas, further, half_step), *left]
-        _keep_arrays(folder, result)
-        tables = {name: part.table for name, part in _tables(result).items() if len(part.table)}
-        frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, tables)
-    return frame.finish(folder, report=report, result=result, progress=progress)
+    with frame.answering("grad", f"grad-{md.name}", md, **keep) as answer:
+        found = _diagnosed(problem, names, chosen, left, further, replicas, half_step, answer.log)
+        answer.result, answer.summary = found, _summary(problem, names, found)
+        skipped = _not_run(md, steps, problem, found, replicas, further, half_step)
+        answer.summary["left_out"] = [*skipped, *left]
+        tables = {name: getattr(found, part).table for part, name in _TABLES.items() if getattr(found, part)}
+        answer.tables = {name: table for name, table in tables.items() if len(next(iter(table.values())))}
+        _keep_arrays(answer)
+    return answer.outcome
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
@@ -149,7 +144,7 @@ def _problem(
     if of is None:
         remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
         raise InputError("no loss to differentiate", where=system.name, remedy=remedy)
-    last, simulation = few_steps(system, steps), build(system)
+    last, simulation = last_step(system, steps, FEW_STEPS), build(system)
     loss = parse(of, simulation, last)
     if not names:
         remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"
@@ -201,18 +196,15 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
     return f"about {runs} more runs of {problem.steps:,} steps"
 
 
-def _over(method: Method, replicas: int, horizons: bool = True) -> Method:
+def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
     """A method that averages over starts, over this many of them; other methods as they are.
 
     Args:
         horizons: whether it follows shorter runs too.
     """
-    from dataclasses import replace
-
     if not replicas or not hasattr(method, "replicas"):
         return method
-    changed: Any = method
-    changed = replace(changed, replicas=replace(changed.replicas, count=replicas))
+    changed = replace(method, replicas=replace(method.replicas, count=replicas))
     return replace(changed, halvings=0) if hasattr(changed, "halvings") and not horizons else changed
 
 
@@ -227,7 +219,6 @@ def _diagnosed(
     if not chosen:
         reasons = "; ".join(f"{one['what']}: {one['why']}" for one in left)
         raise InputError(f"no method applies: {reasons}", where=where, remedy="Ask for one with --methods")
-    parts = (*_PARTS, *(word for word in further if word != EDGES))
     scalars = [name for name in names if not np.ndim(parameters.value(problem.simulation, name))]
 
     def tell(done: int, steps: int, phase: str) -> None:
@@ -240,38 +231,20 @@ def _diagnosed(
             half_step=half_step, progress=tell,
         )  # fmt: skip
 
+    parts = (*_PARTS, *(word for word in further if word != EDGES))
     found = look(parts, scalars if EDGES in further else ())
     if found.agreement is None:
         raise InputError(found.failed["agreement"], where=where)
     reference = found.agreement.gradient(found.agreement.reference)
     assert reference is not None
     if found.growth is not None and not all(np.isfinite(one).all() for one in reference.gradient.values()):
-        from dataclasses import replace
-
         return replace(found, detective=look(("detective",)).detective)
     return found
 
 
-def _tables(found: GradientDiagnosis) -> dict[str, Any]:
-    """The parts of a diagnosis that have a table, by its name."""
-    parts = {
-        "growth": found.growth, "flip_contributions": found.flips, "trust": found.trust,
-        "scaling": found.scaling,
-    }  # fmt: skip
-    return {
-        name: part
-        for name, part in parts.items()
-        if part is not None and len(next(iter(part.table.values())))
-    }
-
-
 def _brief(part: Any) -> Any:
-    """A part of a diagnosis without the rows of its table, and without pairs that did not nearly flip."""
-    if part is None:
-        return None
-    return plain(
-        {name: value for name, value in vars(part).items() if name not in ("table", "turns", "columns")}
-    )
+    """A part of a diagnosis without its rows, and without pairs that did not nearly flip."""
+    return part and plain({name: value for name, value in vars(part).items() if name not in _ROWS})
 
 
 def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -> dict[str, Any]:
@@ -279,7 +252,7 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
 
     agreement, simulation, loss = found.agreement, problem.simulation, problem.loss
     assert agreement is not None
-    units, (energy, force) = simulation.units, simulation.jumps()
+    energy, force = simulation.jumps()
     trust = _brief(found.trust)
     if found.trust is not None:
         half, turns = found.trust.half, found.trust.turns
@@ -288,16 +261,11 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
             "turns": len(turns), "within": int(turns.within.sum()),
             "heaviest": turns.heaviest(found.trust.columns),
         }  # fmt: skip
-    made = [one for one in agreement.opinions if one.found is not None]
-    return {
+    return basics(simulation.system, problem.steps) | {
         "world": "grad",
-        "system": simulation.system.name,
-        "about": simulation.system.spec.about,
-        "atoms": simulation.atoms,
-        "steps": problem.steps,
-        "timestep": float(simulation.system.spec.dynamics.timestep),
-        "units": units.name,
-        "loss": {"word": loss.name, "about": loss.label, "unit": loss.unit.format_map(vars(units))},
+        "loss": {
+            "word": loss.name, "about": loss.label, "unit": loss.unit.format_map(vars(simulation.units)),
+        },
         "value": found.value,
         "parameters": [
             {
@@ -306,43 +274,33 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
             }
             for name in names
         ],
-        "energy_jump": float(np.max(np.abs(energy))),
-        "force_jump": float(np.max(np.abs(force))),
+        "energy_jump": np.max(np.abs(energy)), "force_jump": np.max(np.abs(force)),
         "reference": agreement.reference,
-        "methods": [_method(one.found) | {"seconds": one.seconds} for one in made if one.found],
+        "methods": [_method(one.found) | {"seconds": one.seconds} for one in agreement.opinions if one.found],
         "comparisons": plain(agreement.comparisons),
         **{name: _brief(getattr(found, name)) for name in _BRIEF},
-        "trust": trust,
-        "edges": plain(found.edges),
-        "failed": dict(found.failed),
+        "trust": trust, "edges": plain(found.edges), "failed": dict(found.failed),
         "refused": [{"method": one.method, "why": one.missing} for one in agreement.opinions if one.missing],
-        "status": "complete",
     }  # fmt: skip
 
 
 def _not_run(
     system: System, asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
-) -> Iterator[dict[str, str]]:  # fmt: skip
+) -> list[dict[str, str]]:  # fmt: skip
     """What was left out: what, why, and how to have it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
-    own = system.spec.dynamics.steps
+    own, rows = system.spec.dynamics.steps, []
     if asked is None and problem.steps < own:
-        yield {
-            "what": f"{own - problem.steps:,} steps",
-            "why": f"the system has {own:,}",
-            "how": f"--steps {own}",
-        }
+        rows += [(f"{own - problem.steps:,} steps", f"the system has {own:,}", f"--steps {own}")]
     if found.trust is not None and not replicas:
-        yield {"what": "standard error", "why": TEXTS("left_starts"), "how": "--replicas 8"}
+        rows += [("standard error", TEXTS("left_starts"), "--replicas 8")]
     if found.trust is not None and not half_step and not no_half_step(problem.simulation):
-        yield {"what": "half the time step", "why": TEXTS("left_half"), "how": "leave out --no-half-step"}
-    for part in ALSO:
-        if part not in further:
-            yield {"what": part, "why": TEXTS(f"left_{part}"), "how": f"--also {part}"}
-    for part, why in found.failed.items():
-        yield {"what": part, "why": why, "how": ""}
+        rows += [("half the time step", TEXTS("left_half"), "leave out --no-half-step")]
+    rows += [(part, TEXTS(f"left_{part}"), f"--also {part}") for part in ALSO if part not in further]
+    rows += [(part, why, "") for part, why in found.failed.items()]
+    return [dict(zip(("what", "why", "how"), row, strict=True)) for row in rows]
 
 
 def _entries(simulation: Simulation, name: str) -> list[str] | None:
@@ -361,20 +319,18 @@ def _entries(simulation: Simulation, name: str) -> list[str] | None:
     return found
 
 
-def _keep_arrays(folder: RunFolder, found: GradientDiagnosis) -> None:
+def _keep_arrays(answer: Answer) -> None:
     """Puts large derivatives into a folder."""
-    opinions = () if found.agreement is None else found.agreement.opinions
-    large = {
+    agreement = answer.result.agreement
+    large: dict[str, Any] = {
         f"{one.method}/{name}": np.asarray(value)
-        for one in opinions
-        if one.found is not None
-        for name, value in one.found.gradient.items()
-        if np.ndim(value) > 1 or np.size(value) > _FEW
-    }
+        for one in (agreement.opinions if agreement else ()) if one.found is not None
+        for name, value in one.found.gradient.items() if np.ndim(value) > 1 or np.size(value) > _FEW
+    }  # fmt: skip
     if large:
         sink = io.BytesIO()
         np.savez_compressed(sink, **large)  # type: ignore[arg-type]
-        write_bytes(folder.path / ARRAYS, sink.getbuffer())
+        write_bytes(answer.folder.path / ARRAYS, sink.getbuffer())
 
 
 # -- of either world ---------------------------------------------------------------------------------
@@ -384,15 +340,16 @@ def _method(found: Gradient) -> dict[str, Any]:
     """What one method found, in plain values."""
     details = plain(found.details)
     error = details.pop("error", details.get("standard_error", {}))
+    # by what is used, zero is a number like any other
     notes = {
         name: note
         for name, note in found.notes.items()
-        if not found.depends.get(name, not found.depends) or not np.any(found.gradient.get(name, 0))
-    } if found.depends else dict(found.notes)  # fmt: skip
-    gradient = {name: brief(value) for name, value in found.gradient.items()}
+        if not found.depends.get(name, False) or not np.any(found.gradient.get(name, 0))
+    }
     return {
         "method": found.method, "description": found.description, "kind": found.kind, "value": found.value,
-        "gradient": gradient, "error": error, "notes": notes, "details": details,
+        "gradient": {name: brief(value) for name, value in found.gradient.items()}, "error": error,
+        "notes": notes, "details": details,
     }  # fmt: skip
 
 
@@ -426,8 +383,6 @@ def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
     """The ball with the loss and the parameters that were asked for in its own tables."""
-    from dataclasses import replace
-
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
@@ -435,7 +390,7 @@ def _ball_system(
         raise InputError(f"no loss {of!r} of a ball", remedy=f"There are {', '.join(kinds)}")
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
-    made = system if isinstance(system, BallSystem) else load(system, overrides, world="ball")
+    made = load(system, overrides, world="ball")
     known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):
@@ -443,24 +398,21 @@ def _ball_system(
         raise InputError(seen, where=made.name, remedy=f"Add --wrt NAME,NAME. There are {', '.join(known)}")
     if not isinstance(system, BallSystem):
         made = load(system, {**(overrides or {}), **changes}, world="ball")
-    elif overrides:
-        remedy = "Load it with the overrides, or give its name"
-        raise InputError("overrides change a system while it is loaded", remedy=remedy, where=system.name)
     elif changes:
         made = replace(system, spec=system.against(changes, "asked").variants["asked"])
     return made if steps is None else made.for_steps(steps)
 
 
-def _differentiated(system: BallSystem, methods: list[str], log: Progress) -> tuple[Any, dict[str, Any]]:
+def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> None:
     from mdnum.gradients.ball import compare
     from mdnum.systems.build_ball import build_ball
     from mdnum.verbs.ball_record import exact
 
     spec, problem = system.spec, build_ball(system).problem
-    log(0, 0, {"phase": "run"})
+    frame.say(answer.log, "run")
     run = problem.run()
-    log(0, 0, {"phase": "gradient"})
-    found = compare(problem, spec.gradient.of, methods)
+    frame.say(answer.log, "gradient")
+    answer.result = found = compare(problem, spec.gradient.of, methods)
     rows = [_method(one) for one in found]
     if not rows:
         reasons = "; ".join(f"{name}: {why}" for name, why in found.refused.items())
@@ -470,39 +422,26 @@ def _differentiated(system: BallSystem, methods: list[str], log: Progress) -> tu
     reference = "closed form" if right else "event-aware" if "event-aware" in made else rows[0]["method"]
     base = right or made[reference]
     power = "²" if spec.loss.kind == "residual-penetration" or spec.loss.target is not None else ""
-    summary = {
+    answer.summary = basics(system, None) | {
         "world": "grad",
-        "system": system.name,
-        "about": spec.about,
-        "balls": system.balls,
-        "contact_kind": spec.contact.kind,
-        "integrator": spec.integrator.kind,
-        "steps": spec.integrator.steps,
-        "timestep": spec.integrator.timestep,
-        "units": "ball",
         "loss": {"word": spec.loss.kind, "about": spec.loss.kind.replace("-", " "), "unit": f"m{power}"},
         "value": rows[0]["value"],
         "parameters": [
             {"name": name, "unit": _BALL_UNITS.get(name, ""), "value": None} for name in spec.gradient.of
         ],
-        "reference": reference,
-        "exact": dict(right),
-        "methods": rows,
+        "reference": reference, "exact": dict(right), "methods": rows,
         "comparisons": [
             {
                 "name": name, "method": method, "reference": reference, "size": abs(base[name]),
                 "difference": value - base[name], "relative": relative(value, base[name]), "meaning": "",
             }
-            for method, gradient in made.items()
-            for name, value in gradient.items()
-            if name in base and method != reference
+            for method, gradient in made.items() if method != reference
+            for name, value in gradient.items() if name in base
         ],
         "contacts": int(run.contacts.step.size),
         "refused": [{"method": name, "why": why} for name, why in found.refused.items()],
         "left_out": [],
-        "status": "complete",
     }  # fmt: skip
-    return found, summary
 
 
 def relative(value: float, right: float) -> float:
@@ -518,11 +457,7 @@ def relative(value: float, right: float) -> float:
 def judge(view: View) -> Verdict:
     """Findings, evidence and headline of a gradient."""
     trust = view.summary.get("trust") or {}
-    found = [
-        *_not_finite(view), *_no_dependence(view), *_unexplained(view), *_plain_at_a_jump(view),
-        *_loss_jumps(view), *_short(view), *_few_flips(view), *_departs(view), *_grazing(view),
-        *_off_the_motion(view), *_refused(view),
-    ]  # fmt: skip
+    found = [*_of_methods(view), *_of_trust(view), *_of_flips(view), *_of_the_motion(view)]
     known = view.summary.get("exact") or trust.get("verdict") == "trusted"
     # the headline has the verdict on trust already
     worst = [one for one in found if one.severity == "error" or one.code not in ("BEYOND_TRUST", "UNDECIDED")]
@@ -546,7 +481,7 @@ def _headline(view: View) -> str:
         name = "limited_anywhere"
     starts = TEXTS("starts_unknown") if "other starts" in trust.get("unknown", ()) else ""
     return TEXTS(
-        f"headline_{name}", steps=view.summary["steps"], slopes=listed(parts), horizon=trust.get("horizon"),
+        f"headline_{name}", steps=summary["steps"], slopes=listed(parts), horizon=trust.get("horizon"),
         limit=trust.get("limited_by"), starts=starts,
     )  # fmt: skip
 
@@ -563,38 +498,57 @@ def _evidence(view: View) -> Iterator[str]:
             yield TEXTS("flips_share", share=share, name=name)
 
 
-def _unexplained(view: View) -> Iterator[Finding]:
-    """Methods that should agree and do not."""
-    for row in view.summary["comparisons"]:
+def _of_methods(view: View) -> Iterator[Finding]:
+    """What the methods gave, did not give, or should not be taken for."""
+    summary, methods, section = view.summary, view.summary["methods"], "By method"
+    where = summary.get("detective") or {}
+    variants = []
+    if where.get("found"):
+        variants = ["found" if where["forward"] else "forward", *["pair"] * (where["j"] >= 0)]
+    inputs = ", ".join(f"{value:.4g}" for value in where.get("inputs") or ())
+    for one in methods:
+        sizes = {name: magnitude(value, math.nan) for name, value in one["gradient"].items()}
+        broken = [name for name, size in sizes.items() if not math.isfinite(size)]
+        if broken:
+            values: dict[str, Any] = {**where, "inputs": inputs, "names": listed(broken)}
+            yield TEXTS.finding("NOT_FINITE", *variants, method=one["method"], **values)
+    # what the reference has first: it leaves nothing out
+    ranked = sorted(methods, key=lambda one: one["method"] != summary["reference"])
+    for name in (one["name"] for one in summary["parameters"]):
+        if not any(magnitude(one["gradient"].get(name), math.nan) for one in methods):
+            notes = filter(None, (one["notes"].get(name) for one in ranked))
+            yield TEXTS.finding("NO_DEPENDENCE", name=name, note=next(notes, TEXTS("no_note")))
+    for row in summary["comparisons"]:
         if row["meaning"] == "unexplained":
             yield TEXTS.finding(
-                "UNEXPLAINED", section="By method", method=row["method"], reference=row["reference"],
+                "UNEXPLAINED", section=section, method=row["method"], reference=row["reference"],
                 name=row["name"], closeness=closeness(row), explained=row["values"].get("explained"),
             )  # fmt: skip
+    # only methods that hold decisions fixed, where flips count
+    held = [one["method"] for one in methods if one["kind"] == "steps"]
+    aware = any(
+        one["kind"] == "flow" or one["method"] in ("event-aware", "smoothed-differences", "ensemble")
+        for one in methods
+    )
+    if summary.get("force_jump") and held and not aware:
+        unit = f"{view.units.energy}/{view.units.length}"
+        yield TEXTS.finding("MISSING_SALTATION", section=section, jump=summary["force_jump"],
+                            methods=listed(held), unit=unit, held=len(held))  # fmt: skip
+    if any(one["details"].get("loss jumps") for one in methods):
+        yield TEXTS.finding("LOSS_JUMPS", loss=summary["loss"]["word"])
+    for one in methods:
+        primal = one["details"].get("primal") or {}
+        state, decision = primal.get("first state"), primal.get("first decision")
+        if state is not None:
+            decided = ["decided"] * (decision is not None)
+            yield TEXTS.finding("ANOTHER_PRIMAL", *decided, method=one["method"], state=state,
+                                decision=decision)  # fmt: skip
+    if refused := summary["refused"]:
+        each = " ".join(f"{one['method']}: {one['why'].rstrip('.')}." for one in refused)
+        yield TEXTS.finding("DOES_NOT_APPLY", methods=len(refused), each=each)
 
 
-def _plain_at_a_jump(view: View) -> Iterator[Finding]:
-    """Only methods that hold decisions fixed, where flips count."""
-    summary = view.summary
-    kinds = {one["kind"] for one in summary["methods"]}
-    held = [one["method"] for one in summary["methods"] if one["kind"] == "steps"]
-    aware = {"event-aware", "smoothed-differences", "ensemble"} & {
-        one["method"] for one in summary["methods"]
-    }
-    if summary.get("force_jump") and held and not aware and "flow" not in kinds:
-        yield TEXTS.finding(
-            "MISSING_SALTATION", section="By method", jump=summary["force_jump"], methods=listed(held),
-            unit=f"{view.units.energy}/{view.units.length}", held=len(held),
-        )  # fmt: skip
-
-
-def _loss_jumps(view: View) -> Iterator[Finding]:
-    """A loss that itself jumps at a flip, in frames that no average is over."""
-    if any(one["details"].get("loss jumps") for one in view.summary["methods"]):
-        yield TEXTS.finding("LOSS_JUMPS", loss=view.summary["loss"]["word"])
-
-
-def _short(view: View) -> Iterator[Finding]:
+def _of_trust(view: View) -> Iterator[Finding]:
     """A gradient that is not trusted as far as it was asked for."""
     trust, section = view.summary.get("trust") or {}, "How far it is trusted"
     if trust.get("verdict") == "limited":
@@ -613,122 +567,65 @@ def _short(view: View) -> Iterator[Finding]:
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
     """What to do about each thing that was not examined, as variants of the finding."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
-    averaged = any(name.startswith("error.") for name in view.table("trust"))
+    aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
         yield "half"
     elif "time step" in unseen:
         yield "noise"
     elif "near miss" in unseen:
-        yield "near" if by(view.summary, "event-aware") is not None else "aware"
-    if "time step" in unseen and "near miss" in unseen and by(view.summary, "event-aware") is None:
+        yield "near" if aware else "aware"
+    if {"time step", "near miss"} <= unseen and not aware:
         yield "aware"
-    if "other starts" in trust["unknown"] and not averaged:
+    if "other starts" in trust["unknown"] and not _averaged(view):
         yield "starts"
     if "parameters of many entries" in trust["unknown"]:
         yield "entries"
 
 
-def _few_flips(view: View) -> Iterator[Finding]:
-    """Derivatives that hang on a flip or two."""
-    totals = (view.summary.get("flips") or {}).get("total") or {}
+def _averaged(view: View) -> bool:
+    """Whether the gradient was averaged over starts."""
+    return any(name.startswith("error.") for name in view.table("trust"))
+
+
+def _of_flips(view: View) -> Iterator[Finding]:
+    """Derivatives that hang on a flip or two, and flips that the guard left out."""
+    section, totals = "Flips on the way", (view.summary.get("flips") or {}).get("total") or {}
     table = view.table("flip_contributions") if totals else {}
     for name, total in totals.items():
-        added = table.get(f"contribution.{name}")
-        if added is None or not len(added) or not total:
-            continue
+        added = table.get(f"contribution.{name}", np.zeros(0))
         heavy = np.argsort(-np.abs(added))[:_SINGLE]
         heavy = heavy[np.abs(added[heavy]) > _HEAVY * abs(total)]
-        if not len(heavy):
-            continue
-        k = heavy[0]
-        none = ["none"] * (digits_of(view.summary, name.partition("[")[0]) == 0)
-        averaged = any(one.startswith("error.") for one in view.table("trust"))
-        yield TEXTS.finding(
-            "FEW_FLIPS", *none, *["averaged"] * averaged, section="Flips on the way", name=name,
-            count=len(heavy), heavy=_HEAVY, i=int(table["i"][k]), j=int(table["j"][k]),
-            step=int(table["step"][k]), speed=abs(float(table["radial_speed"][k])),
-            share=abs(float(added[k]) / total),
-        )  # fmt: skip
-
-
-def _departs(view: View) -> Iterator[Finding]:
-    """Methods that differentiate a forward pass of their own, and where it leaves the run."""
-    for one in view.summary["methods"]:
-        primal = one["details"].get("primal") or {}
-        if primal.get("first state") is not None:
-            decided = primal.get("first decision")
+        if total and len(heavy):
+            k = heavy[0]
+            none = ["none"] * (digits_of(view.summary, name.partition("[")[0]) == 0)
             yield TEXTS.finding(
-                "ANOTHER_PRIMAL", *["decided"] * (decided is not None), method=one["method"],
-                state=primal["first state"], decision=decided,
+                "FEW_FLIPS", *none, *["averaged"] * _averaged(view), section=section, name=name,
+                count=len(heavy), heavy=_HEAVY, i=int(table["i"][k]), j=int(table["j"][k]),
+                step=int(table["step"][k]), speed=abs(float(table["radial_speed"][k])),
+                share=abs(float(added[k]) / total),
             )  # fmt: skip
-
-
-def _grazing(view: View) -> Iterator[Finding]:
-    """What the guard left out."""
     details = (by(view.summary, "event-aware") or {"details": {}})["details"]
     left, applied = details.get("weight left out"), details.get("weight applied")
     if left and applied is not None and left > _LEFT_OUT * (left + applied):
-        yield TEXTS.finding(
-            "GRAZING", section="Flips on the way", grazing=details["grazing"], share=left / (left + applied),
-            guard=details["guard"],
-        )  # fmt: skip
+        yield TEXTS.finding("GRAZING", section=section, grazing=details["grazing"],
+                            share=left / (left + applied), guard=details["guard"])  # fmt: skip
 
 
-def _not_finite(view: View) -> Iterator[Finding]:
-    where = view.summary.get("detective") or {}
-    variants = []
-    if where.get("found"):
-        variants = ["found" if where["forward"] else "forward", *["pair"] * (where["j"] >= 0)]
-    inputs = ", ".join(f"{value:.4g}" for value in where.get("inputs") or ())
-    for one in view.summary["methods"]:
-        sizes = {name: magnitude(value, math.nan) for name, value in one["gradient"].items()}
-        broken = [name for name, size in sizes.items() if not math.isfinite(size)]
-        if broken:
-            values: dict[str, Any] = {**where, "inputs": inputs, "names": listed(broken)}
-            yield TEXTS.finding("NOT_FINITE", *variants, method=one["method"], **values)
-
-
-def _no_dependence(view: View) -> Iterator[Finding]:
-    """Parameters by which no method finds anything."""
-    for one in view.summary["parameters"]:
-        name = one["name"]
-        sizes = [magnitude(method["gradient"].get(name), math.nan) for method in view.summary["methods"]]
-        if any(sizes):
-            continue
-        # what the reference has first: it leaves nothing out
-        reference = view.summary["reference"]
-        ranked = sorted(view.summary["methods"], key=lambda one: one["method"] != reference)
-        notes = [method["notes"].get(name) for method in ranked]
-        note = next(filter(None, notes), TEXTS("no_note"))
-        yield TEXTS.finding("NO_DEPENDENCE", name=name, note=note)
-
-
-def _off_the_motion(view: View) -> Iterator[Finding]:
+def _of_the_motion(view: View) -> Iterator[Finding]:
     """Methods that do not give the derivative of the exact motion, where that is known."""
-    if not view.summary.get("exact"):
-        return
-    rows = view.summary["comparisons"]
+    rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
-    if not off:
-        return
-    methods = list(dict.fromkeys(row["method"] for row in off))
-    each = []
-    for method in methods:
-        named = [f"{row['name']} {closeness(row)}" for row in off if row["method"] == method]
-        each.append(f"{method} ({', '.join(named)})")
-    aware = ["aware"] * ("event-aware" in methods)
-    impact = view.summary["contact_kind"] == "impact" and view.summary["integrator"] != "event-located"
-    yield TEXTS.finding(
-        "NOT_THE_MOTION", *["impact"] * (impact and bool(aware)), *aware, section="By method",
-        methods=len(methods), close=_CLOSE, each=listed(each),
-    )  # fmt: skip
-
-
-def _refused(view: View) -> Iterator[Finding]:
-    refused = view.summary["refused"]
-    if refused:
-        each = " ".join(f"{one['method']}: {one['why'].rstrip('.')}." for one in refused)
-        yield TEXTS.finding("DOES_NOT_APPLY", methods=len(refused), each=each)
+    methods: dict[str, list[str]] = {}
+    for row in off:
+        methods.setdefault(row["method"], []).append(f"{row['name']} {closeness(row)}")
+    if methods:
+        aware = "event-aware" in methods
+        impact = view.summary["contact_kind"] == "impact" and view.summary["integrator"] != "event-located"
+        each = listed([f"{method} ({', '.join(named)})" for method, named in methods.items()])
+        yield TEXTS.finding(
+            "NOT_THE_MOTION", *["impact"] * (impact and aware), *["aware"] * aware, section="By method",
+            methods=len(methods), close=_CLOSE, each=each,
+        )  # fmt: skip
 
 
 VERBS = {"grad": Verb(judge, grad_page.page)}

@@ -11,20 +11,21 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import Code, Key, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.section import ROLES, Code, Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import MINUS, count, heading, many, number, percent, power
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("grad.py"))
-#: Colors of parameters, in order.
-ROLES: tuple[Role, ...] = ("first", "second", "third", "ink", "muted", "bad")
 #: Digits that are shown where nobody knows how many hold.
 _UNKNOWN = 2
 #: Rows of the table of flips that the page carries, and parameters that have a column there.
 TABLE_ROWS, _SHOWN = 2_000, 3
 
+
+#: Sentences about growth by its word; of other words by whether there is a rate.
+_GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "unbounded"}
 
 # -- derivatives as text -----------------------------------------------------------------------------
 
@@ -130,16 +131,10 @@ def trust_sentences(summary: Mapping[str, Any]) -> list[str]:
     trust = summary.get("trust")
     if not trust:
         return []
-    verdict, limits = trust["verdict"], trust["limits"]
+    limits = trust["limits"]
     free = [one["what"] for one in limits if one["horizon"] is not None and not one["reached"]]
-    examined = ", ".join(free) or "nothing"
-    values = {
-        "steps": summary["steps"],
-        "horizon": trust["horizon"],
-        "limit": trust["limited_by"],
-        "free": examined,
-    }
-    found = [TEXTS(f"trust_{verdict}", **values)]
+    values = {"steps": summary["steps"], "horizon": trust["horizon"], "limit": trust["limited_by"]}
+    found = [TEXTS(f"trust_{trust['verdict']}", free=", ".join(free) or "nothing", **values)]
     found += [limit_sentence(summary, one) for one in limits if one["reached"]]
     if trust["unknown"]:
         found.append(TEXTS("not_known", unknown=", ".join(trust["unknown"])))
@@ -151,18 +146,10 @@ def growth_sentences(view: View) -> list[str]:
     growth = view.summary.get("growth")
     if not growth:
         return []
+    name = _GROWN.get(growth["word"], "steady" if growth["rate"] is not None else "short")
     if not np.any(view.table("growth")["size"] > 0):
-        return [TEXTS("growth_nothing")]
-    grows = growth["word"] == "forward bounded, gradient not"
-    name = "growing" if grows else "unbounded" if "not bounded" in growth["word"] else "steady"
-    if name == "steady" and growth["rate"] is None:
-        name = "short"
-    return [
-        TEXTS(
-            f"growth_{name}", steps=view.summary["steps"], gain=growth["gain"], rate=growth["rate"],
-            error=growth["error"], time=growth["time"], unit=view.units.time,
-        )
-    ]  # fmt: skip
+        name = "nothing"
+    return [TEXTS(f"growth_{name}", steps=view.summary["steps"], unit=view.units.time, **growth)]
 
 
 # -- the page ----------------------------------------------------------------------------------------
@@ -170,13 +157,13 @@ def growth_sentences(view: View) -> list[str]:
 
 def page(view: View, verdict: Verdict) -> Page:
     """Everything that is known about a gradient."""
-    summary = view.summary
+    summary, loss = view.summary, view.summary["loss"]
     size = many(summary["atoms"], "atom") if "atoms" in summary else many(summary["balls"], "ball")
     about = TEXTS(
-        "about", loss=heading(summary["loss"]["about"]), size=size, steps=summary["steps"],
+        "about", loss=heading(loss["about"]), size=size, steps=summary["steps"],
         timestep=summary["timestep"], unit=view.units.time,
     )  # fmt: skip
-    sections = [
+    return view.page(f"{view.name}: gradient of {loss['word']}", about, _keys(view), [
         Section("By method", list(_methods(view)), terminal=True),
         Section("Against the horizon", list(_horizons(view)), terminal=True),
         Section("How far it is trusted", list(_trust(view)), terminal=True),
@@ -186,11 +173,7 @@ def page(view: View, verdict: Verdict) -> Page:
         Section("In a narrow format", list(_scaling(view))),
         Section("Left out", list(_left_out(view)), terminal=True),
         Section("What was differentiated", list(_what(view))),
-    ]
-    return Page(
-        f"{view.name}: gradient of {summary['loss']['word']}", about, list(_keys(view)),
-        [one for one in sections if one.parts], view.system_toml, view.folder.provenance,
-    )  # fmt: skip
+    ])  # fmt: skip
 
 
 def _keys(view: View) -> Iterator[Key]:
@@ -209,43 +192,36 @@ def _keys(view: View) -> Iterator[Key]:
 def _methods(view: View) -> Iterator[Any]:
     """Derivatives by method, the reference first, each with how far it is from the reference."""
     summary, reference = view.summary, view.summary["reference"]
-    heads = []
-    for one in summary["parameters"]:
-        unit, entries = slope_unit(summary, one), one.get("entries")
-        heads.append(
-            f"by {one['name']}"
-            + (f" ({unit})" if unit else "")
-            + (f": {', '.join(entries)}" if entries else "")
-        )
     rows = sorted(summary["methods"], key=lambda one: one["method"] != reference)
     exact = by(summary, reference)
     if summary.get("exact") and exact is not None:
         rows = [{**exact, "method": "closed form"}, *rows]
     half = (summary.get("trust") or {}).get("half")
+    if half:
+        shorter = {"method": "at half the time step", "gradient": half, "error": {}}
+        rows = [part for one in rows for part in ([one, shorter] if one["method"] == reference else [one])]
     differences = {(row["method"], row["name"]): row for row in summary["comparisons"]}
-    names = [one["name"] for one in summary["parameters"]]
-    cells: list[list[Any]] = []
-    for one in rows:
-        line: list[Any] = [one["method"]]
-        for name in names:
-            row = differences.get((one["method"], name))
-            note = digits_note(summary, name) if one["method"] == reference else ""
-            means = f", {row['meaning']}" if row and row["meaning"] else ""
-            line += [slope(summary, one, name), note if row is None else f"{closeness(row)}{means}"]
-        cells.append(line)
-        if half and one["method"] == reference:
-            shorter = {"gradient": half, "error": {}}
-            cells.append(
-                ["at half the time step", *(part for n in names for part in (slope(summary, shorter, n), ""))]
-            )
-    columns = [part for head in heads for part in (head, f"from {reference}")]
-    yield Table(("method", *columns), cells, shown=100)
+
+    def difference(one: Mapping[str, Any], name: str) -> str:
+        row = differences.get((one["method"], name))
+        if row is None:
+            return digits_note(summary, name) if one["method"] == reference else ""
+        return ", ".join(filter(None, (closeness(row), row["meaning"])))
+
+    heads, cells = ["method"], [[one["method"]] for one in rows]
+    for parameter in summary["parameters"]:
+        name, unit = parameter["name"], slope_unit(summary, parameter)
+        entries = ", ".join(parameter.get("entries") or ())
+        head = f"by {name}" + (f" ({unit})" if unit else "") + (f": {entries}" if entries else "")
+        heads += [head, f"from {reference}"]
+        for one, line in zip(rows, cells, strict=True):
+            line += [slope(summary, one, name), difference(one, name)]
+    yield Table(tuple(heads), cells, shown=100)
     for one in rows:
         for name, note in one.get("notes", {}).items():
             yield f"{one['method']} by {name}: {note}."
-    yield Table(
-        ("method", "derivative"), [[one["method"], one["description"]] for one in rows], "What each gives"
-    )
+    described = [one for one in rows if "description" in one]
+    yield table_of(described, {"method": "method", "derivative": "description"}, "What each gives")
     meanings = dict.fromkeys(row["meaning"] for row in summary["comparisons"] if row["meaning"])
     if meanings:
         rows = [[word, TEXTS(f"means_{word}".replace(" ", "_"))] for word in meanings]
@@ -253,45 +229,39 @@ def _methods(view: View) -> Iterator[Any]:
 
 
 def _horizons(view: View) -> Iterator[Any]:
-    summary = view.summary
-    if not summary.get("growth"):
+    summary, growth = view.summary, view.summary.get("growth")
+    if not growth:
         return
     yield from growth_sentences(view)
     table, unit = view.table("growth"), summary["loss"]["unit"]
-    verticals = tuple(_limits(view))
-    series = []
-    for role, one in zip(ROLES, summary["parameters"], strict=False):
-        name = one["name"]
-        parts = [
-            values
-            for key, values in table.items()
-            if key == f"gradient.{name}" or key.startswith(f"gradient.{name}.")
-        ]
-        values = np.sqrt(np.sum(np.square(parts), axis=0)) if parts else np.zeros(1)
-        if values.any() and one["value"] is not None:
-            # of no steps at all there is no derivative
-            shown = values[1:] * abs(magnitude(one["value"]))
-            series.append(Series(name, table["horizon"][1:], shown, role=role))
+    verticals, horizon, size = tuple(_limits(view)), table["horizon"], table["size"]
+    lines = {}
+    for one in summary["parameters"]:
+        head = f"gradient.{one['name']}"
+        parts = [values for key, values in table.items() if key == head or key.startswith(f"{head}.")]
+        if parts and one["value"] is not None:
+            lines[one["name"]] = np.sqrt(np.sum(np.square(parts), axis=0)) * abs(magnitude(one["value"]))
+    # of no steps at all there is no derivative
+    series = curves(horizon[1:], {name: values[1:] for name, values in lines.items()})
     if series:
         label = f"|parameter × derivative| ({unit})" if unit else "|parameter × derivative|"
         yield Plot(
             "growth", f"The gradient of {summary['loss']['word']} against the horizon", "horizon (steps)",
-            label, tuple(series), y_scale="log", caption=TEXTS("caption_growth"), verticals=verticals,
+            label, series, y_scale="log", caption=TEXTS("caption_growth"), verticals=verticals,
         )  # fmt: skip
-    size, horizon, rate = table["size"], table["horizon"], summary["growth"]["rate"]
     if np.any(size > 0):
-        lines = [Series("by all positions and velocities", horizon, size)]
-        if rate and summary["growth"]["word"] == "forward bounded, gradient not":
+        series = [Series("by all positions and velocities", horizon, size)]
+        rate = growth["rate"]
+        if rate and _GROWN.get(growth["word"]) == "growing":
             half = len(horizon) // 2
             fitted = np.exp(np.mean(np.log(size[half:])) + rate * (horizon - np.mean(horizon[half:])))
             shown = np.where(fitted >= size[size > 0].min(), fitted, np.nan)
-            lines.append(
-                Series(f"a factor e in {number(1 / rate)} steps", horizon, shown, role="bad", dashed=True)
-            )
-        per = f"{unit or '1'}/{view.units.length}"
+            text = f"a factor e in {number(1 / rate)} steps"
+            series.append(Series(text, horizon, shown, role="bad", dashed=True))
         yield Plot(
-            "state", "The gradient by the state against the horizon", "horizon (steps)", f"norm ({per})",
-            tuple(lines), y_scale="log", caption=TEXTS("caption_state"), verticals=verticals,
+            "state", "The gradient by the state against the horizon", "horizon (steps)",
+            f"norm ({unit or '1'}/{view.units.length})", tuple(series), y_scale="log",
+            caption=TEXTS("caption_state"), verticals=verticals,
         )  # fmt: skip
 
 
@@ -307,29 +277,21 @@ def _trust(view: View) -> Iterator[Any]:
     if not trust:
         return
     yield trust_sentences(view.summary)[0]
-    rows = []
-    for one in trust["limits"]:
-        until = (
-            "not examined" if one["horizon"] is None else "up to step" if one["reached"] else "not by step"
-        )
-        rows.append([one["what"], until, one["horizon"], limit_sentence(view.summary, one)])
-    yield Table(("limit", "", "step", "what was seen"), rows)
-    near = (trust.get("near") or {}).get("heaviest")
+
+    def until(one: Mapping[str, Any]) -> str:
+        return "not examined" if one["horizon"] is None else "up to step" if one["reached"] else "not by step"
+
+    yield table_of(trust["limits"], {
+        "limit": "what", "": until, "step": "horizon",
+        "what was seen": lambda one: limit_sentence(view.summary, one),
+    })  # fmt: skip
+    near, unit = (trust.get("near") or {}).get("heaviest"), view.units.length
     if near:
         yield TEXTS("near_table")
-        unit = view.units.length
-        columns = (
-            "pair",
-            "before step",
-            f"gap ({unit})",
-            f"reach ({unit})",
-            *(f"by {name}" for name in near[0]["term"]),
-        )
-        rows = [
-            [f"{one['i']}–{one['j']}", one["step"], one["gap"], one["reach"], *one["term"].values()]
-            for one in near
-        ]
-        yield Table(columns, rows, "Pairs that nearly flipped, or nearly did not")
+        yield table_of([one | {f"by {name}": term for name, term in one["term"].items()} for one in near], {
+            "pair": lambda one: f"{one['i']}–{one['j']}", "before step": "step", f"gap ({unit})": "gap",
+            f"reach ({unit})": "reach", **{f"by {name}": f"by {name}" for name in near[0]["term"]},
+        }, "Pairs that nearly flipped, or nearly did not")  # fmt: skip
     table = view.table("trust")
     words = (("relative", "other rounding"), ("step", "half the step"), ("error", "standard error / mean"))
     series = tuple(
@@ -350,60 +312,41 @@ def _trust(view: View) -> Iterator[Any]:
 
 
 def _flips(view: View) -> Iterator[Any]:
-    found = view.summary.get("flips")
+    summary, found = view.summary, view.summary.get("flips")
     if not found:
         return
-    yield (
-        TEXTS("flips_none")
-        if not found["flips"]
-        else TEXTS("flips_all", flips=found["flips"], grazing=found["grazing"])
-    )
+    yield TEXTS("flips_all" if found["flips"] else "flips_none", **found)
     if not found["flips"]:
         return
+    units = {one["name"]: slope_unit(summary, one) for one in summary["parameters"]}
     rows = []
     for name, parts in found["share"].items():
         parameter = name.partition("[")[0]
-        unit = next(
-            (slope_unit(view.summary, one) for one in view.summary["parameters"] if one["name"] == parameter),
-            "",
-        )
         # of a derivative without a digit a share is none
-        none = digits_of(view.summary, parameter) == 0
-        shares = [
-            None if none or part is None else f"{number(100 * part, 3, signed=True)} %"
-            for part in parts.values()
-        ]
-        total = f"{resolved(view.summary, parameter, found['total'][name], 4)} {unit}".rstrip()
+        none = digits_of(summary, parameter) == 0
+        shares = [None if none or part is None else f"{number(100 * part, 3, signed=True)} %"
+                  for part in parts.values()]  # fmt: skip
+        total = f"{resolved(summary, parameter, found['total'][name], 4)} {units.get(parameter, '')}".rstrip()
         rows.append([name, *shares, total, found["half"][name]])
-    columns = (
-        "share of the derivative by",
-        "between the flips",
-        "pairs that enter",
-        "pairs that leave",
-        "in all",
-    )
-    yield Table((*columns, "flips with half the weight"), rows)
+    columns = ("share of the derivative by", "between the flips", "pairs that enter", "pairs that leave",
+               "in all", "flips with half the weight")  # fmt: skip
+    yield Table(columns, rows)
     table = view.table("flip_contributions")
-    added = {name: table[f"contribution.{name}"] for name, total in found["total"].items() if total}
-    added = {name: values / abs(found["total"][name]) for name, values in added.items() if np.any(values)}
-    order = np.argsort(table["step"], kind="stable")
-    running = [
-        Series(name, table["step"][order], np.cumsum(values[order]), role=role)
-        for role, (name, values) in zip(ROLES, added.items(), strict=False)
-    ]
-    ranked = [
-        Series(name, np.arange(1, len(values) + 1), np.sort(np.abs(values))[::-1], role=role)
-        for role, (name, values) in zip(ROLES, added.items(), strict=False)
-    ]
-    if running:
+    added = {name: table[f"contribution.{name}"] / abs(total) for name, total in found["total"].items()
+             if total and np.any(table[f"contribution.{name}"])}  # fmt: skip
+    if added:
+        order = np.argsort(table["step"], kind="stable")
+        running = {name: np.cumsum(values[order]) for name, values in added.items()}
         yield Plot(
             "running", "What the flips up to a step add", "step", "sum of contributions / |derivative|",
-            tuple(running), caption=TEXTS("caption_running"), horizontals=((0.0, ""),),
+            curves(table["step"][order], running, log=False), caption=TEXTS("caption_running"),
+            horizontals=((0.0, ""),),
         )  # fmt: skip
+        ranked = {name: np.sort(np.abs(values))[::-1] for name, values in added.items()}
         yield Plot(
             "ranked", "Contributions of single flips, the largest first", "rank",
-            "|contribution| / |derivative|", tuple(ranked), x_scale="log", y_scale="log",
-            caption=TEXTS("caption_ranked"),
+            "|contribution| / |derivative|", curves(np.arange(1, len(order) + 1), ranked), x_scale="log",
+            y_scale="log", caption=TEXTS("caption_ranked"),
         )  # fmt: skip
     yield TEXTS("by_weight", shown=min(found["flips"], TABLE_ROWS), flips=found["flips"])
     yield _browse({name: values[:TABLE_ROWS] for name, values in table.items()})
@@ -437,55 +380,33 @@ def _spectrum(view: View) -> Iterator[Any]:
         return
     unit, largest = view.units.time, found["log_singular"][0]
     factor = f"{math.exp(largest):.3g}" if largest < 600 else f"10^{largest / math.log(10):.4g}"
-    yield TEXTS(
-        "spectrum",
-        factor=factor,
-        steps=found["steps"],
-        exponent=found["exponents_time"][0],
-        unit=unit,
-        word=found["word"],
-    )
+    yield TEXTS("spectrum", factor=factor, exponent=found["exponents_time"][0], unit=unit, **found)
     curve = np.array(found["curve"], float)
-    series = tuple(
-        Series(f"{k + 1}", np.array(found["horizon"]), curve[:, k], role=role)
-        for k, role in zip(range(curve.shape[1]), ROLES, strict=False)
-    )
+    lines = {f"direction {k + 1}": curve[:, k] for k in range(curve.shape[1])}
     yield Plot(
         "spectrum", "How far the directions that stretch most have stretched", "step",
-        "logarithm of the stretch", series, caption=TEXTS("caption_spectrum"),
+        "logarithm of the stretch", curves(np.array(found["horizon"]), lines, log=False),
+        caption=TEXTS("caption_spectrum"),
     )  # fmt: skip
     rows = zip(found["log_singular"], found["exponents_time"], found["residual"], strict=True)
     columns = ("", "logarithm of the singular value", f"exponent per {unit}", "residual")
-    yield Table(columns, [[k + 1, *row] for k, row in enumerate(rows)])
+    yield Table(columns, [[k, *row] for k, row in enumerate(rows, 1)])
 
 
 def _edges(view: View) -> Iterator[Any]:
-    rows = []
+    rows: list[list[Any]] = []
     for one in (view.summary.get("edges") or {}).values():
         for side in (one["below"], one["above"]):
-            if not side["found"]:
-                rows.append([one["name"], side["side"], "none within reach", *[None] * 4])
-                continue
-            slopes = [
-                resolved(view.summary, one["name"], side[where].get("event-aware"), 6)
-                for where in ("gradient_inside", "gradient_beyond")
-            ]
-            decision = f"pair {side['i']}–{side['j']} at step {count(side['step'])}"
-            rows.append(
-                [one["name"], side["side"], repr(side["inside"]), repr(side["beyond"]), decision, *slopes]
-            )
+            rows.append([one["name"], side["side"], "none within reach", *[None] * 4])
+            if side["found"]:
+                decision = f"pair {side['i']}–{side['j']} at step {count(side['step'])}"
+                slopes = [resolved(view.summary, one["name"], side[f"gradient_{where}"].get("event-aware"), 6)
+                          for where in ("inside", "beyond")]  # fmt: skip
+                rows[-1][2:] = [repr(side["inside"]), repr(side["beyond"]), decision, *slopes]
     if rows:
         yield TEXTS("edges")
-        columns = (
-            "parameter",
-            "side",
-            "as here up to",
-            "otherwise from",
-            "first decision",
-            "gradient",
-            "beyond",
-        )
-        yield Table(columns, rows)
+        yield Table(("parameter", "side", "as here up to", "otherwise from", "first decision", "gradient",
+                     "beyond"), rows)  # fmt: skip
 
 
 def _scaling(view: View) -> Iterator[Any]:
@@ -494,48 +415,38 @@ def _scaling(view: View) -> Iterator[Any]:
         return
     table = view.table("scaling")
     word = "fits" if found["fits"] else "spans" if found["usable"] else "nothing"
-    yield TEXTS(
-        f"scaling_{word}", format=found["format"], overflow=int(np.count_nonzero(table["overflow"])),
-        underflow=int(np.count_nonzero(table["underflow"])), power=found["power"], worst=found["worst"],
-    )  # fmt: skip
-    series = [
-        Series(name, table["horizon"], np.where(np.isfinite(table[name]), table[name], np.nan), role=role)
-        for name, role in zip(("largest", "smallest"), ROLES, strict=False)
-    ]
-    lost = table["overflow"] + table["underflow"]
-    if lost.any():
-        series.append(Series(f"lost in {found['format']}", table["horizon"], lost.astype(float), role="bad"))
+    lost = {name: int(np.count_nonzero(table[name])) for name in ("overflow", "underflow")}
+    yield TEXTS(f"scaling_{word}", **{**found, **lost})
+    sizes = {name: table[name] for name in ("largest", "smallest")}
+    series = curves(table["horizon"], sizes)
+    if any(lost.values()):
+        values = (table["overflow"] + table["underflow"]).astype(float)
+        series += (Series(f"lost in {found['format']}", table["horizon"], values, role="bad"),)
     yield Plot(
         "scaling", f"Numbers of the reverse pass, compared with {found['format']}", "horizon (steps)",
-        "magnitude; count", tuple(series), y_scale="log", caption=TEXTS("caption_scaling"),
+        "magnitude; count", series, y_scale="log", caption=TEXTS("caption_scaling"),
     )  # fmt: skip
 
 
 def _left_out(view: View) -> Iterator[Any]:
-    left = view.summary["left_out"]
-    rows = [[one["what"], one["why"], one["how"]] for one in left if one["how"]]
-    if rows:
-        yield Table(("what", "it is", "to have it"), rows)
-    never = [one for one in left if not one["how"]]
+    left = [one for one in view.summary["left_out"] if one["how"]]
+    never = [one for one in view.summary["left_out"] if not one["how"]]
+    if left:
+        yield table_of(left, {"what": "what", "it is": "why", "to have it": "how"})
     if never:
         yield Code("What does not apply", "\n".join(f"{one['what']}: {one['why']}" for one in never))
 
 
 def _what(view: View) -> Iterator[Any]:
     summary, loss = view.summary, view.summary["loss"]
-    rows = [
-        ("System", summary["about"]),
-        ("Loss", f"{loss['about']} ({loss['unit']})" if loss["unit"] else loss["about"]),
-    ]
+    unit = f" ({loss['unit']})" if loss["unit"] else ""
+    rows = [("System", summary["about"]), ("Loss", f"{loss['about']}{unit}")]
     for one in summary["parameters"]:
         value = one["value"]
-        if value is None:
-            continue
         if isinstance(value, Mapping):
-            text = " × ".join(f"{side:,}" for side in value["shape"]) + " numbers"
-        else:
+            rows.append((heading(one["name"]), " × ".join(f"{n:,}" for n in value["shape"]) + " numbers"))
+        elif value is not None:
             text = ", ".join(map(repr, value)) if isinstance(value, list) else repr(value)
-            text = text if one["unit"].startswith("[") else f"{text} {one['unit']}".rstrip()
-        rows.append((heading(one["name"]), text))
-    rows.append(("Time it took", f"{number(summary['seconds'])} s"))
-    yield pairs(rows)
+            unit = "" if one["unit"].startswith("[") else one["unit"]
+            rows.append((heading(one["name"]), f"{text} {unit}".rstrip()))
+    yield pairs([*rows, view.took])

@@ -67,15 +67,10 @@ def run(
     if isinstance(system, BallSystem):
         raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
     if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).world != "md":
-        ball = folder.world == "ball"
-        what = (
-            "is a run of the ball, which takes seconds and leaves nothing to resume"
-            if ball
-            else f"is the folder of `mdnum {folder.verb}`, and no run"
+        remedy = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
+        raise InputError(
+            f"is the folder of `mdnum {folder.verb}`, and no run", where=str(resume), remedy=remedy
         )
-        again = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
-        remedy = f"Run it again with `mdnum ball {resume}`" if ball else again
-        raise InputError(what, where=str(resume), remedy=remedy)
     try:
         result = roll_out(
             system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
@@ -194,7 +189,7 @@ def _ledger(run: RunView) -> Iterator[Finding]:
         yield TEXTS.finding("EVENT_ALGEBRA", *lost, step=run.step(wrong[0]), steps=len(wrong))
     counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
     wrong = np.flatnonzero(~run.flips.matches(run.series))
-    values = {"counted": counted, "listed": run.flips.total}
+    values: dict[str, Any] = {"counted": counted, "listed": run.flips.total}
     if counted != run.flips.total:
         yield TEXTS.finding("LEDGER_INCOMPLETE", **values)
     elif len(wrong):

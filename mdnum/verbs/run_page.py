@@ -16,7 +16,7 @@ from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, few_ticks, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
-from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.section import Figure, Key, Page, Plot, Section, Table, curves, pairs
 from mdnum.report.words import count, many, number, percent, plain
 from mdnum.store.tables import as_numpy
 from mdnum.verbs.frame import View
@@ -323,18 +323,16 @@ def _chatter(run: RunView) -> Iterator[Any]:
         return
     if stays.total > 1:
         steps = np.arange(len(stays.inside))
-        sides = (("inside", stays.inside, "first"), ("outside", stays.outside, "second"))
-        longest = max(10, *(np.flatnonzero(lengths).max(initial=0) for _, lengths, _ in sides))
+        longest = max(10, *(np.flatnonzero(one).max(initial=0) for one in (stays.inside, stays.outside)))
         edges = np.unique(np.round(np.geomspace(1, longest + 1, 36)))
-        series = []
-        for name, lengths, role in sides:
+        lines = {}
+        for name, lengths in (("inside", stays.inside), ("outside", stays.outside)):
             # per step of width: bins of a few steps would otherwise look fuller than they are
             values = np.histogram(steps, edges, weights=lengths)[0] / np.diff(edges)
-            values = np.where(values > 0, values, np.nan)
-            series.append(Series(f"stays {name}", edges, np.append(values, values[-1]), "steps", role))  # type: ignore[arg-type]
+            lines[f"stays {name}"] = np.append(values, values[-1])
         yield Plot(
             "residence", "Steps between two flips of a pair", "steps between two flips of a pair",
-            "stays per step of length", tuple(series), x_scale="log", y_scale="log",
+            "stays per step of length", curves(edges, lines, "steps"), x_scale="log", y_scale="log",
             caption=TEXTS("residence_caption"),
         )  # fmt: skip
     undone = stays.undone_within(CHATTER_STEPS)

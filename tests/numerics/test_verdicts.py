@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.numerics.verdicts import Dates, Delay, expected, growth, judge, split_of
+from mdnum.numerics import verdicts
+from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, expected, growth, split_of
+from mdnum.verbs.fork_verdict import TEXTS
+
+
+def judge(*given, **options) -> ForkVerdict:
+    """The verdict, each of whose reasons has a sentence for its values."""
+    verdict = verdicts.judge(*given, **options)
+    for code, values in verdict.reasons:
+        assert TEXTS(f"reason_{code}", **values, unit="σ").endswith(".")
+    return verdict
 
 
 def grown(rate: float, steps: int, start: float = 1e-15, top: float = 3.0) -> np.ndarray:
@@ -47,9 +57,7 @@ def test_a_horizon_too_short_says_how_long_it_would_take(free):
     verdict = judge(Dates(0, 400, None), free[:900], None, 0.1)
     assert verdict.word == "open"
     left = split_of(free, 0.1) - 899
-    assert any(
-        f"about {left} steps" in reason or f"about {left - 1} steps" in reason for reason in verdict.reasons
-    )
+    assert dict(verdict.reasons)["growing"]["steps"] in (left - 1, left)
 
 
 def test_a_cause_is_a_split_that_does_not_come(free):
@@ -121,13 +129,13 @@ def test_what_was_not_seen_counts_for_neither(free):
 def test_close_to_the_tolerance_is_no_cause(free):
     verdict = judge(dates(free), free, np.full(3000, 0.05), 0.1)
     assert verdict.word == "open"
-    assert any("within one e-folding" in reason for reason in verdict.reasons)
+    assert [code for code, _ in verdict.reasons] == ["kept", "within"]
 
 
 def test_a_split_before_the_fork_is_no_flips_doing(free):
     verdict = judge(dates(free, fork=2500), free, free, 0.1)
     assert verdict.word == "bystander"
-    assert "before any decision differed" in verdict.reasons[0]
+    assert verdict.reasons[0][0] == "had_split"
 
 
 def test_first_steps_predict_nothing():
@@ -135,15 +143,16 @@ def test_first_steps_predict_nothing():
     assert expected(1e-9 * step**2, 0.1) is None
     assert expected(1e-9 * step**2, 0.1, exponent=0.0036) == pytest.approx(np.log(0.1 / 3.6e-6) / 0.0036)
     verdict = judge(Dates(0, 5, None), 1e-9 * step**2, None, 0.1)
-    assert any("so few steps" in reason for reason in verdict.reasons)
+    assert "no_growth" in dict(verdict.reasons)
 
 
 def test_an_end_of_one_run_is_a_fork_by_itself():
-    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended="run B ended in a runaway at step 0")
-    assert verdict.word == "open" and "that is the fork" in verdict.reasons[0]
+    ended = {"run": "B", "word": "runaway", "step": 0, "other": "A"}
+    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended=ended)
+    assert verdict.word == "open" and verdict.reasons == (("ended", {**ended, "steps": 0}),)
 
 
 def test_a_split_under_the_others_decisions_alone_is_told(free):
     verdict = judge(Dates(0, 400, None), free[:900], free[-900:], 0.1)
     assert verdict.word == "open" and verdict.handed == 0
-    assert any("keep them together" in reason for reason in verdict.reasons)
+    assert dict(verdict.reasons)["together"] == {"step": 0}

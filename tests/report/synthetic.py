@@ -11,45 +11,15 @@ from mdnum.store import RunFolder
 
 TOML = """about = "Liquid argon (Rahman 1964), 864 atoms at 94.4 K, hard cutoff."
 units = "metal"
-
-[structure]
-file = "liquid-864.extxyz"
-
-[potential]
-kind = "lennard-jones"
-sigma = 3.405
-epsilon = 0.0103235
-
-[cutoff]
-kind = "hard"
-radius = 8.5125
-compare = "r2 <"
-
-[neighbors]
-skin = 1.0
-builder = "auto"
-
-[neighbors.rebuild]
-every = 1
-delay = 0
-check = true
-
-[dynamics]
-kind = "nve"
-timestep = 0.002
-temperature = 94.4
-steps = 2000
-seed = 7
-
-[precision]
-state = "float64"
-force = "float64"
-decision = "float64"
-accumulate = "float64"
-reduction = "sequential"
+potential = {kind = "lennard-jones", sigma = 3.405, epsilon = 0.0103235}
+cutoff = {kind = "hard", radius = 8.5125, compare = "r2 <"}
+neighbors = {skin = 1.0, builder = "auto", rebuild = {every = 1, delay = 0, check = true}}
+dynamics = {kind = "nve", timestep = 0.002, temperature = 94.4, steps = 2000, seed = 7}
+precision = {state = "float64", force = "float64", decision = "float64", accumulate = "float64"}
 """
 
-RADIUS, SKIN, DT = 8.5125, 1.0, 0.002
+#: Cutoff, skin, time step, and the energy of a pair at the cutoff.
+RADIUS, SKIN, DT, JUMP = 8.5125, 1.0, 0.002, -1.681e-4
 
 
 def make_run(
@@ -58,8 +28,6 @@ def make_run(
     steps: int = 400,
     atoms: int = 864,
     candidates: int = 4000,
-    seed: int = 1,
-    jump: float = -1.681e-4,
     drop_flip: bool = False,
     finish: bool = True,
     summary: dict[str, Any] | None = None,
@@ -70,12 +38,11 @@ def make_run(
     Args:
         steps, atoms: size of the run.
         candidates: pairs whose distance oscillates about the cutoff (about 0.045 flips each and step).
-        jump: energy of a pair at the cutoff; 0 for a cutoff that ends at zero.
         drop_flip: leave one flip out of the ledger, as a faulty recorder would.
         finish: end as a complete run; else leave it as a killed one.
         summary: entries that replace the honest ones.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     pairs = _distinct_pairs(rng, atoms, candidates)
     count = len(pairs)
     frequency = rng.gamma(3.0, 0.018, count)
@@ -86,170 +53,88 @@ def make_run(
     folder = RunFolder.create(path)
     folder.write_system(toml)
     base = int(27.3 * atoms) - count // 2
-    before = None
-    energy = potential = 0.0
-    start, moved, first_list = 0, 0.0, 0
-    totals = {"entered": 0, "left": 0, "ambiguous": 0, "pairs_first": 0, "pairs_last": 0}
-    columns: dict[str, list[Any]] = {}
+    before, energy, start, moved, first_list = None, 0.0, 0, 0.0, 0
+    rows: list[dict[str, Any]] = []
     epochs: list[dict[str, Any]] = []
-    conserved = []
+    written = 0
     integrator = np.cumsum(rng.normal(0, 2e-7, steps + 1)) + 2e-5 * np.sin(np.arange(steps + 1) * 0.05)
     for step in range(steps + 1):
-        distance = center + amplitude * np.sin(frequency * step + phase)
-        squared = distance**2
-        margin = RADIUS**2 - squared
+        angle = frequency * step + phase
+        distance = center + amplitude * np.sin(angle)
+        margin = RADIUS**2 - distance**2
         inside = margin > 0
         flipped = np.flatnonzero(inside != before) if before is not None else np.zeros(0, int)
         before = inside
         if drop_flip and step == steps // 2 and len(flipped):
-            energy += jump * (1 if inside[flipped[0]] else -1)
+            energy += JUMP * (1 if inside[flipped[0]] else -1)
             flipped = flipped[1:]
         entered = inside[flipped]
-        jumps = np.where(entered, jump, -jump)
+        jumps = np.where(entered, JUMP, -JUMP)
         energy += jumps.sum()
+        bound = 4.5 * np.finfo(float).eps * distance[flipped] ** 2
+        folder.append("flips", {
+            "step": np.full(len(flipped), step), "i": pairs[flipped, 0], "j": pairs[flipped, 1],
+            "entered": entered, "distance": distance[flipped], "margin": margin[flipped],
+            "radial_speed": (amplitude * frequency * np.cos(angle))[flipped] / DT, "energy_jump": jumps,
+            "force_jump": np.where(entered, 1.18e-4, -1.18e-4), "bound": bound,
+            "ambiguous": np.abs(margin[flipped]) <= bound,
+        })  # fmt: skip
         potential = -62.1 + energy + 0.9 * np.sin(step * 0.031) + 0.4 * np.sin(step * 0.173)
         total = -51.5312 + energy + integrator[step]
-        bound = 4.5 * np.finfo(float).eps * squared[flipped]
-        speed = (
-            amplitude[flipped] * frequency[flipped] * np.cos(frequency[flipped] * step + phase[flipped]) / DT
-        )
         moved += rng.gamma(40.0, 0.0011)
-        folder.append(
-            "flips",
-            {
-                "step": np.full(len(flipped), step),
-                "i": pairs[flipped, 0],
-                "j": pairs[flipped, 1],
-                "entered": entered,
-                "distance": distance[flipped],
-                "margin": margin[flipped],
-                "radial_speed": speed,
-                "energy_jump": jumps,
-                "force_jump": np.where(entered, 1.18e-4, -1.18e-4),
-                "bound": bound,
-                "ambiguous": np.abs(margin[flipped]) <= bound,
-            },
-        )
-        row = {
-            "step": step,
-            "time": step * DT,
-            "potential": potential,
-            "kinetic": total - potential,
-            "total": total,
-            "temperature": (total - potential) / (1.5 * atoms * 8.617e-5),
-            "pressure": 0.012 + 0.01 * rng.normal(),
-            "pairs": base + int(inside.sum()),
-            "entered": int(entered.sum()),
-            "left": int((~entered).sum()),
-            "displacement": moved,
-            "energy_jump": jumps.sum(),
-            "ambiguous": 0,
+        rows.append({
+            "step": step, "time": step * DT, "potential": potential, "kinetic": total - potential,
+            "total": total, "temperature": (total - potential) / (1.5 * atoms * 8.617e-5),
+            "pressure": 0.012 + 0.01 * rng.normal(), "pairs": base + int(inside.sum()),
+            "entered": int(entered.sum()), "left": int((~entered).sum()), "displacement": moved,
+            "energy_jump": jumps.sum(), "ambiguous": 0, "conserved": total,
             "min_margin": float(np.min(np.abs(margin), initial=RADIUS**2)),
-            "conserved": total,
-        }
-        conserved.append(total)
-        for key, value in row.items():
-            columns.setdefault(key, []).append(value)
-        totals["entered"] += row["entered"]
-        totals["left"] += row["left"]
-        totals["pairs_first"] = totals["pairs_first"] or row["pairs"]
-        totals["pairs_last"] = row["pairs"]
+        })  # fmt: skip
         if 2 * moved > SKIN * 0.96 or step == steps:
-            epochs.append(
-                {
-                    "epoch": len(epochs),
-                    "start": start,
-                    "length": step - start,
-                    "displacement": moved,
-                    "skin_consumed": 2 * moved / SKIN,
-                    "pairs_listed": int(2 * base * 1.39) + int(rng.integers(400)),
-                    "capacity": 112,
-                    "occupancy": int(rng.integers(88, 104)),
-                    "reason": "end" if step == steps else "displacement",
-                    "dangerous": False,
-                    "lost_pairs": 0,
-                    "lost_pair_steps": 0,
-                    "first_lost_step": -1,
-                    "build_ms": float(rng.gamma(30.0, 0.2)),
-                    "margin": -float(rng.exponential(0.01)),
-                }
-            )
+            epochs.append({
+                "epoch": len(epochs), "start": start, "length": step - start, "displacement": moved,
+                "skin_consumed": 2 * moved / SKIN, "capacity": 112, "occupancy": int(rng.integers(88, 104)),
+                "pairs_listed": int(2 * base * 1.39) + int(rng.integers(400)),
+                "reason": "end" if step == steps else "displacement", "dangerous": False, "lost_pairs": 0,
+                "lost_pair_steps": 0, "first_lost_step": -1, "build_ms": float(rng.gamma(30.0, 0.2)),
+                "margin": -float(rng.exponential(0.01)),
+            })  # fmt: skip
             start, moved = step, 0.0
-        if step == steps // 2:
-            _flush(folder, columns, epochs[first_list:])
-            first_list = len(epochs)
+        if step in (steps // 2, steps) and (finish or step < steps):
+            _flush(folder, rows[written:], epochs[first_list:])
+            written, first_list = len(rows), len(epochs)
             folder.checkpoint({"step": step}, force=True)
     if not finish:
         folder.close()
         return RunFolder.open(path)
-    _flush(folder, columns, epochs[first_list:])
-    folder.checkpoint({"step": steps}, force=True)
     folder.finalize()
-    folder.write_summary(
-        {
-            "system": "argon/liquid-864",
-            "units": "metal",
-            "atoms": atoms,
-            "steps": steps,
-            "time": steps * DT,
-            "flips_entered": totals["entered"],
-            "flips_left": totals["left"],
-            "rebuilds": len(epochs) - 1,
-            "dangerous_builds": 0,
-            "lost_pairs": 0,
-            "lost_pair_steps": 0,
-            "first_lost_step": -1,
-            "ambiguous": 0,
-            "energy_drift": (conserved[-1] - conserved[0]) / (atoms * steps * DT),
-            "energy_budget_residual": 2.6e-14 + (abs(jump) if drop_flip else 0),
-            "energy_budget_tolerance": abs(jump) / 10,
-            "energy_budget_checks": 21,
-            "energy_budget_closes": not drop_flip,
-            "pairs_first": totals["pairs_first"],
-            "pairs_last": totals["pairs_last"],
-            "steps_per_second": 412.7,
-            "start_up_seconds": 8.31,
-            "wall_seconds": 13.2,
-            "cutoff": {
-                "kind": "hard",
-                "radius": RADIUS,
-                "compare": "r2 <",
-                "energy_jump": jump,
-                "force_jump": 1.18e-4,
-                "smoothness": -1,
-            },
-            "ase": {
-                "energy_rel": 3.4e-15,
-                "force_max": 2.2e-16,
-                "stress_max": 1.1e-17,
-                "force_scale": 0.0281,
-                "ok": True,
-            },
-            "status": "complete",
-        }
-        | (summary or {})
-    )
-    folder.write_provenance(
-        {
-            "command": "mdnum run argon/liquid-864",
-            "mdnum": "0.1.0",
-            "python": "3.11.9",
-            "packages": {"jax": "0.10.1", "jax-md": "0.2.29", "ase": "3.29.0", "numpy": "2.3.1"},
-            "platform": "Linux x86_64, 2 cores",
-            "device": "cpu",
-            "started": "2026-11-20T09:42:11Z",
-            "xla_flags": "",
-            "fingerprint": "9f1c52d0a7b3e4c8",
-        }
-    )
+    drift = (rows[-1]["total"] - rows[0]["total"]) / (atoms * steps * DT)
+    folder.write_summary({
+        "system": "argon/liquid-864", "units": "metal", "atoms": atoms, "steps": steps, "time": steps * DT,
+        "flips_entered": sum(row["entered"] for row in rows), "flips_left": sum(row["left"] for row in rows),
+        "rebuilds": len(epochs) - 1, "dangerous_builds": 0, "lost_pairs": 0, "lost_pair_steps": 0,
+        "first_lost_step": -1, "ambiguous": 0, "energy_drift": drift, "energy_budget_checks": 21,
+        "energy_budget_residual": 2.6e-14 + (abs(JUMP) if drop_flip else 0),
+        "energy_budget_tolerance": abs(JUMP) / 10, "energy_budget_closes": not drop_flip,
+        "pairs_first": rows[0]["pairs"], "pairs_last": rows[-1]["pairs"], "steps_per_second": 412.7,
+        "cutoff": {"kind": "hard", "radius": RADIUS, "compare": "r2 <", "energy_jump": JUMP,
+                   "force_jump": 1.18e-4, "smoothness": -1},
+        "ase": {"energy_rel": 3.4e-15, "force_max": 2.2e-16, "stress_max": 1.1e-17, "force_scale": 0.0281,
+                "ok": True},
+        "status": "complete",
+        **(summary or {}),
+    })  # fmt: skip
+    folder.write_provenance({
+        "command": "mdnum run argon/liquid-864", "mdnum": "0.1.0",
+        "packages": {"jax": "0.10.1", "jax-md": "0.2.29"}, "fingerprint": "9f1c52d0a7b3e4c8",
+    })  # fmt: skip
     return folder
 
 
-def _flush(folder: RunFolder, columns: dict[str, list[Any]], epochs: list[dict[str, Any]]) -> None:
-    folder.append("series", {key: np.array(values) for key, values in columns.items()})
-    columns.clear()
-    if epochs:
-        folder.append("epochs", {key: [epoch[key] for epoch in epochs] for key in epochs[0]})
+def _flush(folder: RunFolder, rows: list[dict[str, Any]], epochs: list[dict[str, Any]]) -> None:
+    for name, part in (("series", rows), ("epochs", epochs)):
+        if part:
+            folder.append(name, {key: np.array([row[key] for row in part]) for key in part[0]})
 
 
 def _distinct_pairs(rng: np.random.Generator, atoms: int, count: int) -> np.ndarray:

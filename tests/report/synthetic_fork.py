@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.store import RunFolder
+from mdnum.store.files import write_text
 
 TOML = """name = "argon/synthetic"
 units = "lj"
@@ -33,7 +34,7 @@ MINIMAL = {
         {"i": 3, "j": 9, "differs": [[410, None]]},
     ],
     "proven": True, "fork_alone": False, "candidates": 77, "tests": 23, "horizon": 1652,
-    "reason": "2 pairs are enough, and none of them can be left out",
+    "code": "proven", "reason": "2 pairs are enough.",
 }  # fmt: skip
 PINNED = {
     "pin": "fork", "pairs": [[3, 4]], "first": FORK, "last": FORK + 6, "split": None, "free": 1321,
@@ -73,7 +74,7 @@ def make_fork(
     nothing = np.full(len(step), np.nan)
     after = forks & (step >= FORK)
     folder = RunFolder.create(path, world="fork")
-    folder.write_system(toml)
+    write_text(folder.path / "system.toml", toml)
     folder.append(
         "separation",
         {
@@ -129,7 +130,7 @@ def make_fork(
             "fork_time": 4.0 if forks else None,
             "split": split, "split_time": None if split is None else 0.01 * split, "tolerance": TOLERANCE,
             "decision": DECISION if forks else None, "effect": "cause" if forks else "no fork",
-            "reasons": ["free, split at step 1321; under the first run's decisions not", "and so on"],
+            "reasons": [{"code": "not_run", "split": 1321}, {"code": "within"}],
             "growth_rate": RATE if forks else None, "growth_rate_time": RATE / 0.01 if forks else None,
             "r_squared": 0.99 if forks else None, "growth": {"B": fit if forks else dict.fromkeys(fit)},
             "predicted_split": None, "predicted_by": None,
@@ -169,7 +170,7 @@ DECISION: dict[str, Any] = {
 def make_screen(path: Path, summary: dict[str, Any] | None = None) -> RunFolder:
     """Writes the folder of a screening."""
     folder = RunFolder.create(path, world="screen")
-    folder.write_system(TOML)
+    write_text(folder.path / "system.toml", TOML)
     folder.finalize()
     folder.write_summary(
         {

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import re
 import warnings
+from typing import Any, get_args
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from mdnum.report import drawing
-from mdnum.report.section import Figure, Plot, Region, Series
+from mdnum.report.section import Figure, Plot, Region, Role, Series
+
+
+def plot(*series: Series, x: str = "k", y: str = "loss", **options: Any) -> Plot:
+    return Plot("plot", "Awkward", x, y, series, **options)
 
 
 def awkward() -> dict[str, Plot]:
@@ -27,148 +32,66 @@ def awkward() -> dict[str, Plot]:
     spike = np.sin(40 * long)
     spike[54_321] = 7.0
     k = 0.5035674359581247 + np.arange(-40, 41) * 2.0**-53
-    grid = np.geomspace(0.01, 4, 60)
+    grid, decades = np.geomspace(0.01, 4, 60), np.geomspace(1e-8, 1, 50)
     region = (np.add.outer(np.log10(grid), 1.5 * np.log10(grid)) > -0.8).astype(int)
     region += (np.add.outer(grid, grid) > 3.2).astype(int)
+    words = ("forward and gradient bounded", "forward bounded, gradient overflows", "neither bounded")
+    beyond = np.where(x > 8, np.inf, 10 ** (38 * np.minimum(x, 8)))
     return {
-        "gaps": Plot("plot", "Gaps", "time (s)", "height (m)", (Series("height", x, gaps),)),
-        "zeros on a log axis": Plot(
-            "plot",
-            "Zeros",
-            "iteration",
-            "residual",
+        "gaps": plot(Series("height", x, gaps)),
+        "zeros on a log axis": plot(
+            Series("residual", x, decay, "line+points"), Series("other", x, -decay - 1, "points", "second"),
             y_scale="log",
-            series=(
-                Series("residual", x, decay, mark="line+points"),
-                Series("all negative", x, -decay - 1, role="second", mark="points"),
-            ),
         ),
-        "nothing positive": Plot("plot", "None", "k", "gradient", (Series("", x, 0 * x),), y_scale="log"),
-        "empty": Plot(
-            "plot", "Empty", "k", "loss", (Series("none", np.zeros(0), np.zeros(0)),), x_scale="log"
+        "nothing positive": plot(Series("", x, 0 * x), y_scale="log"),
+        "empty": plot(Series("none", np.zeros(0), np.zeros(0)), x_scale="log"),
+        "no series": plot(),
+        "all NaN": plot(Series("none", x, x * np.nan), y_scale="symlog"),
+        "one point": plot(Series("one", np.array([3.0]), np.array([1e-30])), y_scale="log"),
+        "one point alone": plot(Series("one", np.array([3.0]), np.array([2.0]))),
+        "many points": plot(
+            Series("line", long, spike), Series("cloud", long, rng.normal(size=100_000), "points", "second"),
+            Series("steps", long, np.floor(5 * long), "steps", "third", dashed=True),
         ),
-        "no series": Plot("plot", "Nothing", "k", "loss"),
-        "all NaN": Plot("plot", "NaN", "k", "loss", (Series("none", x, x * np.nan),), y_scale="symlog"),
-        "one point": Plot(
-            "plot", "One", "k", "loss", (Series("one", np.array([3.0]), np.array([1e-30])),), y_scale="log"
+        "infinite": plot(Series("unrolled", x, beyond, "line+points"), y_scale="log"),
+        "last digits": plot(
+            Series("iterations", k, np.where(k < k[40], 30, 29), "steps"),
+            verticals=((float(k[40]), "last with 30 iterations"), (float(k[41]), "first float with 29")),
         ),
-        "one point alone": Plot(
-            "plot", "One", "k", "loss", (Series("one", np.array([3.0]), np.array([2.0])),)
+        "symlog": plot(
+            Series("gradient", decades, np.linspace(-1, 1, 50) ** 9, "line+points"),
+            Series("exact", decades, np.full(50, 0.3), role="muted", dashed=True),
+            x_scale="log", y_scale="symlog", horizontals=((0.3, "closed form"), (-1e-3, "noise floor")),
         ),
-        "many points": Plot(
-            "plot",
-            "Many",
-            "k",
-            "loss",
-            series=(
-                Series("line", long, spike),
-                Series("cloud", long, rng.normal(size=100_000), mark="points", role="second"),
-                Series("steps", long, np.floor(5 * long), mark="steps", role="third", dashed=True),
-            ),
+        "hidden": plot(
+            Series("float32, unsafe sum", np.arange(5), np.array([1, 0, 0, 0, 2]), "line+points"),
+            Series("bfloat16, safe sum", np.arange(5), np.array([1, 0, 0, 0, 2]), role="second"),
+            Series("bfloat16, unsafe sum", np.arange(5), np.zeros(5), "line+points", "bad"),
         ),
-        "infinite": Plot(
-            "plot",
-            "Infinite",
-            "step",
-            "gradient",
-            y_scale="log",
-            series=(
-                Series(
-                    "unrolled", x, np.where(x > 8, np.inf, 10 ** (38 * np.minimum(x, 8))), mark="line+points"
-                ),
-            ),
+        "map": plot(
+            x="h √k", y="damping h", x_scale="log", y_scale="log", region=Region(grid, grid, region, words),
+            verticals=((2.0, "h √k = 2"),), horizontals=((0.1, "usual damping"),),
         ),
-        "last digits": Plot(
-            "plot",
-            "Last digits",
-            "k",
-            "iterations",
-            series=(Series("iterations", k, np.where(k < k[40], 30, 29), mark="steps"),),
-            verticals=(
-                (float(k[40]), "last float with 30 iterations"),
-                (float(k[41]), "first float with 29"),
-            ),
+        "map of one cell": plot(
+            region=Region(np.array([0.0]), np.array([1.0]), np.array([[1]]), ("never", "always"))
         ),
-        "symlog": Plot(
-            "plot",
-            "Symmetric",
-            "eps",
-            "dloss/dk",
-            x_scale="log",
-            y_scale="symlog",
-            series=(
-                Series(
-                    "gradient", np.geomspace(1e-8, 1, 50), np.linspace(-1, 1, 50) ** 9, mark="line+points"
-                ),
-                Series("exact", np.geomspace(1e-8, 1, 50), np.full(50, 0.3), role="muted", dashed=True),
-            ),
-            horizontals=((0.3, "closed form"), (-1e-3, "noise floor of the estimate")),
-        ),
-        "hidden": Plot(
-            "plot",
-            "One upon the other",
-            "step",
-            "iterations",
-            series=(
-                Series("float32, unsafe sum", np.arange(5), np.array([1, 0, 0, 0, 2]), mark="line+points"),
-                Series("bfloat16, safe sum", np.arange(5), np.array([1, 0, 0, 0, 2]), role="second"),
-                Series("bfloat16, unsafe sum", np.arange(5), np.zeros(5), role="bad", mark="line+points"),
-            ),
-        ),
-        "map": Plot(
-            "plot",
-            "Stability",
-            "h √k",
-            "damping h",
-            x_scale="log",
-            y_scale="log",
-            region=Region(
-                grid,
-                grid,
-                region,
-                ("forward and gradient bounded", "forward bounded, gradient overflows", "neither bounded"),
-            ),
-            verticals=((2.0, "h √k = 2"),),
-            horizontals=((0.1, "usual damping"),),
-        ),
-        "map of one cell": Plot(
-            "plot",
-            "Cell",
-            "x",
-            "y",
-            region=Region(np.array([0.0]), np.array([1.0]), np.array([[1]]), ("never", "always")),
-        ),
-        "crowded marks": Plot(
-            "plot",
-            "Bounces",
-            "time (s)",
-            "height (m)",
-            series=(Series("height", x, np.abs(np.cos(x)) * np.exp(-x / 5)),),
+        "crowded marks": plot(
+            Series("height", x, np.abs(np.cos(x)) * np.exp(-x / 5)),
             verticals=tuple((10 - 8 * 0.6**n, f"bounce {n + 1}") for n in range(9)),
         ),
-        "long words": Plot(
-            "plot",
-            "Long",
-            "the logarithm of the ratio of the learned stiffness to the one that was asked for (1/s²)",
-            "derivative of the loss with respect to stiffness (m s²)",
-            series=tuple(
-                Series(
-                    f"a series whose description is number {n} of several rather long ones",
-                    x,
-                    x + n,
-                    role=role,
-                )
-                for n, role in enumerate(("first", "second", "third", "bad", "muted", "ink"))
+        "long words": plot(
+            *(
+                Series(f"a series whose description is number {n} of several rather long ones", x, x + n,
+                       role=role)
+                for n, role in enumerate(get_args(Role))
             ),
+            x="the logarithm of the ratio of the learned stiffness to the one that was asked for (1/s²)",
+            y="derivative of the loss with respect to stiffness (m s²)",
         ),
-        "small numbers": Plot(
-            "plot",
-            "Small",
-            "k",
-            "loss",
-            (Series("loss", x * 1e-9, x * 1e-12 - 4e-12), Series("other", x * 1e-9, x * 0)),
+        "small numbers": plot(
+            Series("loss", x * 1e-9, x * 1e-12 - 4e-12), Series("other", x * 1e-9, x * 0)
         ),
-    }
+    }  # fmt: skip
 
 
 PLOTS = awkward()
@@ -187,7 +110,7 @@ def test_awkward_plots_are_drawn_without_a_warning(name):
 
 
 def lines(*series, **options):
-    (axes,) = drawing.draw(Plot("p", "t", "x", "y", series, **options)).axes
+    (axes,) = drawing.draw(plot(*series, **options)).axes
     return axes
 
 
@@ -200,10 +123,10 @@ def test_a_gap_stays_a_gap_and_a_lone_value_is_seen():
 
 def test_what_a_logarithmic_axis_cannot_show_is_told():
     values = np.array([1.0, 0.0, 1e-3, -1e-3, 1e-6])
-    plot = Plot("p", "t", "step", "loss", (Series("loss", np.arange(5), values),), y_scale="log")
-    assert drawing.notes(plot) == ["Not shown: 2 values of loss at or below zero."]
-    assert drawing.draw(plot).axes[0].get_yscale() == "log"
-    zero = Plot("p", "t", "step", "loss", (Series("loss", np.arange(5), 0 * values),), y_scale="log")
+    some = plot(Series("loss", np.arange(5), values), y_scale="log")
+    assert drawing.notes(some) == ["Not shown: 2 values of loss at or below zero."]
+    assert drawing.draw(some).axes[0].get_yscale() == "log"
+    zero = plot(Series("loss", np.arange(5), 0 * values), y_scale="log")
     assert drawing.draw(zero).axes[0].get_yscale() == "linear"
     assert drawing.notes(zero) == ["No value of loss is positive, so its axis is linear."]
     assert drawing.notes(PLOTS["infinite"]) == ["Infinite and left out: 40 values."]

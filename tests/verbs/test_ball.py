@@ -53,15 +53,10 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def three(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     said: list[str] = []
-    made = bounce(
-        file,
-        out=tmp_path_factory.mktemp("runs") / "three",
-        against=["stop.rule=per-instance"],
-        report=False,
-        progress=lambda step, steps, info: said.append(info["phase"]),
-    )
-    assert said[0] == "compile"
-    assert "run" in said
+    note = lambda step, steps, info: said.append(info["phase"])  # noqa: E731
+    out = tmp_path_factory.mktemp("runs") / "three"
+    made = bounce(file, out=out, against=["stop.rule=per-instance"], report=False, progress=note)
+    assert said[0] == "compile" and "run" in said
     return made
 
 
@@ -179,16 +174,13 @@ def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     assert list(again.variants) == ["stop.rule=per-instance"]
     with pytest.raises(FolderError, match="already holds a run"):
         bounce("ball/drop", out=three.folder)
-    with pytest.raises(InputError, match=r"run of the ball.*Run it again with `mdnum ball"):
+    with pytest.raises(InputError, match="is the folder of `mdnum ball`"):
         run(None, resume=three.folder)
 
 
 def test_a_rule_per_ball_records_each_ball(file: Path, tmp_path: Path):
     made = bounce(
-        file,
-        out=tmp_path / "own",
-        overrides={"stop.rule": "per-instance", "gradient.of": []},
-        report=False,
+        file, out=tmp_path / "own", overrides={"stop.rule": "per-instance", "gradient.of": []}, report=False
     )
     solver = RunFolder.open(made.folder).read("solver")
     counts = made.result.iterations
@@ -346,7 +338,7 @@ def test_every_planted_defect_is_found_and_nothing_else(good: BallView):
     own, exact = good.summary["gradient"][0], {"height_error": 1e-9, "height_error_largest": 1e-9}
     contacts, series = good.table("contacts"), {k: v.copy() for k, v in good.table("steps").items()}
     short = {name: values[1:] for name, values in contacts.items()}
-    planted: dict[str, View] = {
+    planted: dict[str, BallView] = {
         "NOT_FINITE": altered(good, not_finite=17, status="failed"),
         "LEDGER_INCOMPLETE": altered(good, {"contacts": short, "steps": series}),
         "GRADIENT_NOT_FINITE": altered(good, gradient=[made("unrolled", {"k": None})]),
@@ -410,13 +402,7 @@ def test_variants_of_a_finding(good: BallView):
 
 
 def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: BallView):
-    remark = {
-        "code": "STIFF",
-        "severity": "warning",
-        "title": "h √k is 1.95",
-        "text": "Near 2.",
-        "remedy": "",
-    }
+    remark = {"code": "STIFF", "severity": "warning", "title": "h √k is 1.95", "text": "Near 2."}
     stale = {**remark, "code": "SOLVER_CAP"}
     assert set(codes(altered(good, findings=[remark, stale]))) == {"STIFF"}
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from report.synthetic import TOML, make_run
 
+import mdnum
 from mdnum.errors import FolderError
 from mdnum.report import analysis, drawing
 from mdnum.rollout.summary import LineFit
@@ -294,3 +295,20 @@ def test_a_time_that_has_no_slope(step):
     line = LineFit()
     line.add(step * np.arange(5), np.arange(5.0))
     assert line.slope is None
+
+
+@pytest.mark.slow
+def test_energy_is_set_beside_that_of_float64(tmp_path):
+    smooth = {"cutoff.kind": "quintic"}
+    whole, floats = (
+        mdnum.run("argon/crystal-108", out=tmp_path / state, steps=60, check=state == "lattice", report=False,
+                  overrides={**smooth, "precision.state": state})
+        for state in ("lattice", "float64")
+    )  # fmt: skip
+    told = whole.summary["lattice"]
+    assert told["energy_steps"] == 60
+    for key, run in (("energy_std", whole), ("energy_std_float64", floats)):
+        energy = np.asarray(RunFolder.open(run.folder).read("series")["total"])
+        assert len(energy) == 61
+        # the starts differ by the changed edges of the box
+        assert told[key] == pytest.approx(np.std(energy) / 108, rel=1e-4)

@@ -14,6 +14,7 @@ from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry, nearest
 from mdnum.systems import BallSystem, System
+from mdnum.systems.load import world_of
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
@@ -116,11 +117,6 @@ def choice(family: str | None):
     return add
 
 
-def world_of(system: Any) -> str:
-    """ "md" or "ball"."""
-    return "ball" if isinstance(system, BallSystem) else "md"
-
-
 def shipped(world: str) -> dict[str, Choice]:
     """The choices of a world that are screened when all are asked for, by name."""
 
@@ -165,7 +161,7 @@ def twin_of(choice: Choice, system: System | BallSystem) -> Twin:
     return made
 
 
-def parse(text: str) -> Choice:
+def parse(text: str, world: str | None = None) -> Choice:
     """A choice from a word.
 
     Args:
@@ -176,6 +172,7 @@ def parse(text: str) -> Choice:
             "iterations=+1:57:3" (more, step, ball), "contact=later:2" (of the second contact),
             "contact=57:0" (inverted at a step, for a ball). A last "@exact" gives both runs that reduction,
             where an order is what is chosen; "@alone" stops each ball by itself.
+        world: whose choices an error lists, "md" or "ball"; default those of both.
 
     Raises:
         InputError: no such choice, or an argument that it cannot have.
@@ -194,10 +191,12 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    close = nearest(text, [*CHOICES, *shipped("md"), *shipped("ball")])
-    hint = f"Did you mean {close}? " if close else ""
+    worlds = _WORLDS if world is None else (world,)
+    families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
+    close = nearest(text, [*families, *(name for one in worlds for name in shipped(one))])
+    near = f"Did you mean {close}? " if close else ""
     raise InputError(
-        f"no choice {text!r}", remedy=f"{hint}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
+        f"no choice {text!r}", remedy=f"{near}There are {', '.join(families)}; `mdnum fork` lists all"
     )
 
 
