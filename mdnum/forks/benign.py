@@ -363,16 +363,15 @@ class Benign:
     Attributes:
         passed: whether they do.
         window: step of the comparison.
-        components: how many principal components were compared.
-        limit: standard deviations beyond which one stands out.
+        components, limit: principal components that were compared, and standard deviations beyond which one
+            stands out.
         scores: components of B's runs, in standard deviations of A's ensemble, shape (runs, components);
             not a number for a run that blew up.
         failing: features that give B away, by name, with the median over B's runs of their distance from A's
             mean, in standard deviations of A's ensemble; the ones that matter most come first.
         calibration: what the rule said of each planted change.
-        false_positive_rate: verdicts "fail" on A itself, expected from runs that were held out; not a number
-            where none were. Its exact 95 % interval is in `false_positive_bounds`.
-        false_positive_bounds: see there.
+        false_positive_rate, false_positive_bounds: verdicts "fail" on A itself, expected from runs that were
+            held out, and the exact 95 % interval; not a number where none were.
         false_positives: verdicts "fail" that were counted, and of how many.
     """
 

@@ -46,8 +46,7 @@ class StoredFlip:
     """A stored flip that one of two runs has and the other has not.
 
     Attributes:
-        run: "A" or "B": which run has it.
-        step: of it.
+        run, step: which run has it, "A" or "B", and when.
         subject: labels of the atoms of a pair, or of the ball.
         entered: whether the pair enters its cutoff, or the contact begins.
         margin, bound: as stored: of the decision, and on its rounding error.
@@ -70,14 +69,12 @@ class FolderFork:
     """What two run folders hold about where their runs diverge.
 
     Attributes:
-        world: "md" or "ball".
-        a, b: the folders.
+        world, a, b: "md" or "ball", and the folders.
         differences: what was different about the runs, as (key, in A, in B): system first, then the starts,
             then what bits depend on.
         causes: what a fork may be put down to: keys of the system file, "start", "arithmetic".
-        steps: steps that both have.
-        first_bit: first step at which a stored number differs; None where none does.
-        fork: first step at which a stored decision differs; None where none does.
+        steps: that both have.
+        first_bit, fork: first steps at which a stored number and decision differ; None where none does.
         channel: of the decision at the fork; "" without one.
         iterations: of both solvers of a ball at the fork, where they differ.
         decisions: the flips that differ at the fork, the nearest to its threshold first.

@@ -339,9 +339,8 @@ class PredictedFlip:
 
     Attributes:
         step, i, j: of the decision, i < j.
-        amplitude: at which it flips, with its sign.
+        amplitude, ulps: at which it flips, with its sign, and in ulps of the largest start coordinate.
         margin: of the unperturbed run, in the quantity's space.
-        ulps: that amplitude, in ulps of the largest start coordinate.
     """
 
     step: int

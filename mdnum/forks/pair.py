@@ -53,24 +53,20 @@ class Fork:
 
     Attributes:
         twin: the pair.
-        steps: steps that were followed.
-        asked: steps that were asked for.
+        steps, asked: that were followed, and that were asked for.
         tolerance: of the split, length.
-        dates: first differing bit, fork and split.
-        decision: at the fork; None without one.
+        dates: first differing bit, fork and split. decision: at the fork; None without one.
         series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
             (repeats, NaN once all have split), from B "A|B" and "B|A from B"; "cross"; "overridden" and
             "furthest" of B|A; "energy A", ...; of molecular dynamics "nearest A", "bound A", "ambiguous A"
             and the same of B.
-        flips: cross-run flips, the first `FLIPS_KEPT`.
-        flips_total: of all.
+        flips, flips_total: cross-run flips, the first `FLIPS_KEPT`, and how many there are of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
         growth: of the separations "B" and "B|A".
         splits: first step beyond the tolerance by separation; None where there is none.
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
-        verdict: on the flips.
-        repeats: when each repeat splits, free and under A's decisions.
+        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions.
         failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
             where only one of them does, that is the fork at the latest.
         runs: A, B and the counterfactuals by name, of a world that keeps them whole.

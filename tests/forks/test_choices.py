@@ -67,7 +67,7 @@ def test_arguments_are_read_and_written_alike(word: str):
     ("word", "message"),
     [
         ("reductoin", "Did you mean"),
-        ("nonsense", "Known are precision, reduction"),
+        ("nonsense", "lists all"),
         ("vmap", "fork processes"),
         ("precision.mass", "no role 'mass'; there are state, force, decision, accumulate"),
         ("precision=half", "known are float64, float32, float16, bfloat16"),

@@ -151,7 +151,7 @@ class _ExactBall:
         self.half = HALF * self.h
         self.y = [Dyadic.of(c) for c in np.asarray(start.y)]
         self.v = [Dyadic.of(c) for c in np.asarray(start.v)]
-        self.each = isinstance(contact, Projection) and isinstance(_ExactStopping(world).rule, PerInstance)
+        self.each = isinstance(contact, Projection) and isinstance(_ExactRule(world).rule, PerInstance)
         self.touching = self._judge(self.y, [False] * len(self.y))
         self.carried = self._pull(self.y, self.v, self._free(0), self.touching)
 
@@ -229,7 +229,7 @@ class _ExactBall:
         def depths() -> Balls:
             return [-y if t and y.negative else ZERO for y, t in zip(ys, touching, strict=True)]
 
-        rule = _ExactStopping(self.world)
+        rule = _ExactRule(self.world)
         residual = first = rule.measure(depths())
         counts = [0] * len(residual)
         while True:
@@ -252,7 +252,7 @@ class _ExactBall:
         return ys, vs, counts if len(counts) == len(ys) else counts * len(ys)
 
 
-class _ExactStopping:
+class _ExactRule:
     """A stopping rule in exact numbers: residuals and thresholds, one for the batch or one for each ball."""
 
     def __init__(self, world: World):

@@ -47,12 +47,10 @@ class PolicyHorizon:
     """How long a run in one precision keeps to the exact history.
 
     Attributes:
-        name: of the precision.
-        roles: dtype by role.
+        name, roles: of the precision, and its dtype by role.
         decision: the first that is not the exact one, exact (A) and the run's (B), with the exact margin in
             the quantity's space; None where there is none.
-        separation: largest distance from the exact places at each step, length.
-        growth: of that separation.
+        separation, growth: largest distance from the exact places at each step, length, and its growth.
         failed: how the run ended, where badly.
         gain: share of the steps that double precision gains over single which this policy gains; an upper
             bound where double precision never left; NaN where unknown.
