@@ -158,13 +158,13 @@ class PairRows:
     energy: dict[str, Float[np.ndarray, "rows"]]
     cross: Int[np.ndarray, "rows"]
     flips: Sequence[Any]
-    overridden: dict[str, Real[np.ndarray, "rows"]]
-    furthest: dict[str, Float[np.ndarray, "rows"]]
-    nearest: dict[str, Float[np.ndarray, "rows"]]
-    bound: dict[str, Float[np.ndarray, "rows"]]
-    ambiguous: dict[str, Float[np.ndarray, "rows"]]
-    doubts: dict[str, Any]
-    failed: dict[str, str]
+    overridden: dict[str, Real[np.ndarray, "rows"]] = field(default_factory=dict)
+    furthest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    nearest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    bound: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    ambiguous: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    doubts: dict[str, Any] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Any] = field(default_factory=dict)
 
     @property

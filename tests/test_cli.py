@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import subprocess
 import sys
 import time
@@ -485,3 +486,22 @@ def test_what_is_good_to_know_leaves_the_exit_code_alone():
     found = [restore({"severity": severity}) for severity in ("info", "warning", "error")]
     assert [output.exit_code(found[:n]) for n in range(4)] == [0, 0, 1, 1]
     assert output.exit_code(found[:1], ok=False) == 1
+
+
+def test_programs_are_kept_beside_other_caches_and_nobody_elses_are_touched(tmp_path, monkeypatch, capsys):
+    name = "JAX_COMPILATION_CACHE_DIR"
+    # set here, so that all three are put back
+    for each in (name, "JAX_COMPILATION_CACHE_MAX_SIZE", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+        monkeypatch.setenv(each, "0")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert call("systems", "list") == 0 and not any(tmp_path.iterdir())
+    monkeypatch.delenv(name)
+    assert call("systems", "list") == 0
+    (folder,) = (tmp_path / "mdnum").iterdir()
+    assert os.environ[name] == str(folder) and int(os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"]) > 0
+    # where nothing can be kept, nothing is said of it
+    monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    (tmp_path / "file").touch()
+    assert call("systems", "list") == 0 and name not in os.environ
+    assert not capsys.readouterr().err

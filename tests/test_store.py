@@ -420,3 +420,20 @@ def test_trajectory_shorter_than_its_checkpoint_is_refused(tmp_path):
 def test_store_does_not_import_jax():
     code = "import sys, mdnum.store; assert not {'jax', 'jax_md'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_checkpoint_that_takes_long_comes_seldom(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("mdnum.store.folder.time.monotonic", lambda: clock[0])
+    folder = RunFolder.create(tmp_path / "run")
+    folder.checkpoint({"step": np.zeros(1)}, force=True)
+    clock[0] = 2.5
+    assert folder.checkpoint_due()
+    # making the state counts too
+    clock[0] = 3.5
+    folder.checkpoint({"step": np.ones(1)}, force=True)
+    clock[0] = 43.0
+    assert not folder.checkpoint_due()
+    clock[0] = 60.0
+    assert folder.checkpoint_due()
+    folder.close()

@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 from ase import Atoms
+from ase.neighborlist import neighbor_list
 from jaxtyping import Float
 
 from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
-from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import SpeciesCutoffs
-from mdnum.trajectories.tracker import Tracker
 
 #: Å before and after a crossing at which the energy is asked for.
 _BESIDE = 1e-7
@@ -41,6 +38,8 @@ _MOST_STEPS, _CALLS = 40, 800
 #: Of kT: what a step leaves unexplained below this is not searched.
 _SMALL = 1e-6
 _BLOCKS = 8
+#: Å by which a list of pairs reaches further than the threshold, so that it lasts for some steps.
+_SKIN = 1.0
 
 Steps = Float[np.ndarray, "steps"]
 
@@ -84,7 +83,7 @@ class RunCrossing:
     """A pair that crossed a threshold between two steps.
 
     Attributes:
-        i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
+        i, j, rank: the pair, and how many of its images inside are nearer.
     """
 
     step: int  # after it; the step before is one less
@@ -106,68 +105,35 @@ class RunCrossing:
 
 def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
     """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
-    like = run.start
-    box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
-    species = like.get_chemical_symbols()
-    found = []
-    for level in _levels(thresholds, set(species)):
-        radii = {one.species: one.radius for one in level.values()}
-        tracker = Tracker(SpeciesCutoffs(radii), species=species)
-        for step, positions in enumerate(run.positions):
-            flips = tracker.step(Frame(step, float(step), positions, box))
-            # the flips of one pair one way, by place on the way: which image a rank means does not matter
-            taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
-            for row in range(len(flips)):
-                i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
-                pair = i, j, entered
-                threshold = level[frozenset((species[i], species[j]))]
-                if pair not in taken:
-                    before, after = (run.positions[n][j] - run.positions[n][i] for n in (step - 1, step))
-                    taken[pair] = _ways(before, after, entered, threshold, box)
-                share, slack = taken[pair].pop(0) if taken[pair] else (0.5, 1e-3)
+    species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
+    for threshold in (one for one in thresholds if set(one.species) <= species):
+        radius, skin, reference = threshold.radius, 0.0, run.positions[0]
+        for step in range(1, len(run.positions)):
+            before, after = run.positions[step - 1 : step + 1]
+            if step == 1 or 2 * _furthest(after - reference) > skin:
+                skin, reference = max(_SKIN, 3 * _furthest(after - before)), before
+                i, j, image = neighbor_list("ijS", run.at(before), {threshold.species: radius + skin})
+                once = (i < j) | ((i == j) & (image @ [1_000_000, 1000, 1] > 0))
+                i, j, shift = i[once], j[once], image[once] @ cell
+            start, end = (positions[j] - positions[i] + shift for positions in (before, after))
+            was, now = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
+            for k in np.flatnonzero((was < radius) != (now < radius)):
+                entered, way = bool(now[k] < radius), end[k] - start[k]
+                distances = now if entered else was
+                nearer = (i == i[k]) & (j == j[k]) & (distances < distances[k])
+                clear = max(_BESIDE, 3 * threshold.located) / max(float(np.linalg.norm(way)), 1e-300)
                 found.append(
                     RunCrossing(
-                        step, i, j, int(flips.rank[row]), entered, threshold,
-                        float(flips.distance[row]), float(flips.margin[row]), share, slack,
+                        step, int(i[k]), int(j[k]), int(nearer.sum()), entered, threshold, float(now[k]),
+                        radius - float(now[k]), _root(start[k], way, radius**2),
+                        float(np.clip(clear, 1e-9, 1e-3)),
                     )
                 )  # fmt: skip
     return sorted(found, key=lambda one: (one.step, one.share))
 
 
-def _levels(
-    thresholds: Sequence[PairThreshold], species: set[str]
-) -> list[dict[frozenset[str], PairThreshold]]:
-    """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
-    levels: list[dict[frozenset[str], PairThreshold]] = []
-    for one in thresholds:
-        key = frozenset(one.species)
-        if key <= species:
-            level = next((level for level in levels if key not in level), None)
-            if level is None:
-                levels.append(level := {})
-            level[key] = one
-    return levels
-
-
-def _ways(
-    before: Float[np.ndarray, "3"],
-    after: Float[np.ndarray, "3"],
-    entered: bool,
-    threshold: PairThreshold,
-    box: Box,
-) -> list[tuple[float, float]]:
-    """Where on the way of a step images of a pair cross a threshold one way, and what to stay clear of there.
-
-    Ranks name images by their distance: which image a flip belongs to is not known, those that cross are.
-    """
-    end, way = _images(after, threshold.radius, box), after - before
-    start = end - way
-    square = threshold.radius**2
-    was, is_now = np.sum(start**2, axis=1) < square, np.sum(end**2, axis=1) < square
-    crossing = (is_now & ~was) if entered else (was & ~is_now)
-    length = float(np.linalg.norm(way))
-    slack = float(np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3))
-    return sorted((_root(one, way, square), slack) for one in start[crossing])
+def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
+    return float(np.linalg.norm(moved, axis=1).max())
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
@@ -180,19 +146,6 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
     q = -0.5 * (b + np.copysign(np.sqrt(inside), b))
     roots = [q / a, c / q if q else 0.0]
     return float(np.clip(min(roots, key=lambda one: abs(one - 0.5)), 0.0, 1.0))
-
-
-def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np.ndarray, "images 3"]:
-    """The periodic images of a vector that may be as long as a radius, and some more."""
-    if not box.periodic:
-        return vector[None]
-    rows = box.matrix[box.pbc]
-    shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
-    base = vector - shares @ rows
-    # distance between the planes of the cell: one over the length of a reciprocal vector
-    widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
-    reach = [range(-int(radius / width) - 2, int(radius / width) + 3) for width in widths]
-    return base + np.array(list(product(*reach)), np.float64) @ rows
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:

@@ -20,6 +20,8 @@ _SPACING = 1e-5
 _POINTS = 9
 #: Å by which atoms are moved from where they were given, so that no distance sits on a threshold by design.
 RATTLE = 0.03
+#: Structures of which the quietest is taken, and random moves of the size of rounding.
+_TRIES, _DRAWS = 5, 4
 #: Atoms below which symmetry may hide the noise.
 FEW = 8
 #: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
@@ -80,7 +82,7 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     energy = float(_scatter(energies[:, None])[0])
     scatters = _scatter(columns)
     force = float(np.max(scatters))
-    if no_rounding(energy, energies[0], force, columns, subject.kT):
+    if no_rounding(energy, force, (energies[0], columns), subject.kT):
         # by chance, or by a threshold: the point that sticks out is asked again
         for at in {_odd_one(energies), _odd_one(columns[:, np.argmax(scatters)])}:
             subject.again(places[at], *answers[at])
@@ -160,7 +162,7 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 
 
 def under_jitter(
-    subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator, draws: int = 4
+    subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
     """The largest change of energy and of a force component when all atoms are moved at random.
 
@@ -168,22 +170,21 @@ def under_jitter(
 
     Args:
         size: of the moves, Å: of the order of an ulp of the largest coordinate.
-        draws: how many are tried.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
-    for _ in range(draws):
+    for _ in range(_DRAWS):
         there = displaced(atoms, size * rng.uniform(-1, 1, (len(atoms), 3)))
         moved = subject.both(there)
         change, force = differences(base, moved)
         # either answer may be the one that sticks out
-        if no_rounding(change, base[0], force, base[1], subject.kT) and not subject.again(there, *moved):
+        if no_rounding(change, force, base, subject.kT) and not subject.again(there, *moved):
             subject.again(atoms, *base)
         worst = worst.louder(NoiseFloor(change, force))
     return worst
 
 
 def settled(
-    subject: CalculatorSubject, rng: np.random.Generator, tries: int = 5, at_least: int = 1
+    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = 1
 ) -> tuple[Atoms, NoiseFloor]:
     """The structure with its atoms moved a little, away from any threshold, and the noise there.
 
@@ -192,17 +193,16 @@ def settled(
     of a few draws is taken.
 
     Args:
-        tries: how many structures are tried.
         at_least: atoms; a smaller cell is repeated, where it repeats.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
-    key = ("settled", tries, len(given), str(rng.bit_generator.state))
+    key = ("settled", len(given), str(rng.bit_generator.state))
     if key in subject.known:
         there, noise, rng.bit_generator.state = subject.known[key]
         return there.copy(), noise
     tried: list[tuple[Atoms, NoiseFloor]] = []
-    for _ in range(tries):
+    for _ in range(_TRIES):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
         noise = along_a_line(subject, there, rng)
         if not tried or noise.energy < _QUIETER * tried[-1][1].energy:

@@ -24,6 +24,8 @@ from mdnum.references.load import described
 _FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
 _LAST_ELEMENT = 95
 _MOST_ATOMS, _FEWEST_ATOMS = 500, 32
+#: Å between molecules of water, as in the liquid.
+_SPACING = 3.1
 #: Molecules along an edge: some calculators want a box of two cutoffs.
 _WATER_EDGES = (4, 5, 6, 8)
 #: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
@@ -151,13 +153,8 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
     return copy
 
 
-def water(edge: int = 4, spacing: float = 3.1) -> Atoms:
-    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H.
-
-    Args:
-        edge: molecules along an edge.
-        spacing: between them, Å; 3.1 is the density of the liquid.
-    """
+def water(edge: int = 4) -> Atoms:
+    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H."""
     from ase.calculators.tip3p import angleHOH, rOH
     from scipy.spatial.transform import Rotation
 
@@ -166,8 +163,8 @@ def water(edge: int = 4, spacing: float = 3.1) -> Atoms:
     turns = Rotation.random(edge**3, rng=np.random.default_rng(0)).as_matrix()
     corners = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     positions = np.concatenate([flat @ turn.T for turn in turns])
-    positions += np.repeat((corners + 0.5) * spacing, 3, axis=0)
-    return Atoms("OH2" * edge**3, positions, cell=[edge * spacing] * 3, pbc=True)
+    positions += np.repeat((corners + 0.5) * _SPACING, 3, axis=0)
+    return Atoms("OH2" * edge**3, positions, cell=[edge * _SPACING] * 3, pbc=True)
 
 
 def _symbols(calculator: object) -> tuple[list[str], list[str]]:
@@ -188,18 +185,18 @@ def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atom
     """The element's crystal, None where the calculator answers for it at no density."""
     cutoff, least = (None, None) if pair is None else _felt(subject, pair)
     cell, lattice = _unit_cell(symbol)
-    start = next((scale for scale in _DENSITIES if _answers(subject, _small(cell, scale))), None)
+    start = next((scale for scale in _DENSITIES if subject.answers(_small(cell, scale))), None)
     if start is None:
         return None
     scale, relaxed = _least_energy(subject, cell, least, start)
     for how in ((scale, relaxed, cutoff), (start, False, cutoff)):
         made = _filled(cell, f"{symbol}, {lattice}", *how)
-        if not _answers(subject, made):
+        if not subject.answers(made):
             continue
         took = _processor_time(subject, made)
         small = _filled(cell, f"{symbol}, {lattice}", *how, few=True)
         # it is asked hundreds of times; narrower than two cutoffs, which not every calculator takes
-        if took <= _SLOW or len(small) >= len(made) or not _answers(subject, small):
+        if took <= _SLOW or len(small) >= len(made) or not subject.answers(small):
             return made
         why = f"; of {len(made)} atoms, for two cutoffs, one calculation takes {took:.2g} s of a processor"
         return _labeled(small, small.info["origin"] + why)
@@ -239,10 +236,6 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
             except CalculatorError:
                 return float(distance), None
         return None, None
-
-
-def _answers(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    return not isinstance(subject.try_both(atoms), CalculatorError)
 
 
 def _filled(

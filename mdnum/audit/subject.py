@@ -116,14 +116,14 @@ class Repeats:
         return []
 
 
-def no_rounding(change: float, energy: float, force: float, forces: np.ndarray | None, kT: float) -> bool:
-    """Whether answers that ought to be one differ by more than any rounding.
+def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
+    """Whether an answer that ought to be another one differs from it by more than any rounding.
 
     Args:
         change: of the energy, eV.
         force: change of a force component, eV/Å.
-        forces: eV/Å; None where forces are not compared.
     """
+    energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
     )
@@ -305,6 +305,10 @@ class CalculatorSubject:
         except CalculatorError as error:
             return error
 
+    def answers(self, atoms: Atoms) -> bool:
+        """Whether it has energy and forces for a structure."""
+        return not isinstance(self.try_both(atoms), CalculatorError)
+
     @contextmanager
     def trying(self) -> Iterator[None]:
         """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
@@ -338,10 +342,11 @@ class CalculatorSubject:
         now = self.energy(atoms), None if forces is None else self.forces(atoms)
         before = now[0] if energy is None else energy, forces
         chance.times += 1
-        if not self._differ(before, now):
+        if not no_rounding(*differences(before, now), before, self.kT):
             return False
-        new = self.fresh()
-        if self._differ(now, (new.energy(atoms), None if forces is None else new.forces(atoms))):
+        fresh = self.fresh()
+        new = fresh.energy(atoms), None if forces is None else fresh.forces(atoms)
+        if no_rounding(*differences(now, new), now, self.kT):
             return False
         change, force = differences(before, now)
         chance.differ += 1
@@ -349,10 +354,6 @@ class CalculatorSubject:
         if now[1] is not None:
             chance.typical = rms(now[1])
         return True
-
-    def _differ(self, before: EnergyForces, now: EnergyForces) -> bool:
-        change, force = differences(before, now)
-        return no_rounding(change, before[0], force, before[1], self.kT)
 
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.

@@ -187,11 +187,10 @@ def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWal
     return subject.known["walks"]
 
 
-def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
+def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
     """Walk one pair.
 
     Args:
-        step: of the scan.
         calls: after so many, only the place that stands out most of the scan is zoomed into.
 
     Raises:
@@ -219,13 +218,13 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         end = edge[1] if edge else min(far, 15.0)
     thresholds: list[PairThreshold] = []
     left_out, smallest = 0, None
-    margin = 8 * step
+    margin = 8 * STEP
     distance = np.append(coarse[coarse >= near][:12], near + margin)
-    if end > near + 12 * step:
-        jumps, left_out = find_jumps(curve, near + margin, end + margin, step, calls=calls)
+    if end > near + 12 * STEP:
+        jumps, left_out = find_jumps(curve, near + margin, end + margin, STEP, calls=calls)
         thresholds = [_at_jump(pair, jump) for jump in jumps]
-        smallest = smallest_steps(curve, near + margin, end + margin, step)
-        scanned = grid(near + margin, end + margin, step)
+        smallest = smallest_steps(curve, near + margin, end + margin, STEP)
+        scanned = grid(near + margin, end + margin, STEP)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
     knots = sum(one.order == SMOOTH for one in thresholds)
     knots = knots if knots > _KNOTS else 0
@@ -235,7 +234,7 @@ def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: floa
         thresholds = _with_end(pair, curve, edge, thresholds, near)
     further = None
     if edge is None and alive(far):
-        further = _beyond(subject, pair, end + margin, noise, step, calls)
+        further = _beyond(subject, pair, end + margin, noise, calls)
     if further:
         thresholds += further.thresholds
     if pair.moves == "atom":
@@ -387,12 +386,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 
 
 def _beyond(
-    subject: CalculatorSubject,
-    pair: Pair,
-    start: float,
-    noise: Float[np.ndarray, "2"],
-    step: float,
-    calls: float,
+    subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
     """Look outward from a distance, as far as something is left that could be lost at a cutoff.
 
@@ -422,7 +416,7 @@ def _beyond(
                 if ended and alive(float(nodes[0])):
                     edge = _end_of(nodes, alive)
                 for one, other in _rough(curve, low, (edge[0] if edge else low) if ended else high, noise):
-                    jumps, _ = find_jumps(curve, one - 4 * step, other + 4 * step, step, calls=calls)
+                    jumps, _ = find_jumps(curve, one - 4 * STEP, other + 4 * STEP, STEP, calls=calls)
                     found += [_at_jump(pair, jump) for jump in jumps]
                 if ended:
                     break

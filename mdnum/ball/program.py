@@ -147,12 +147,9 @@ class BallProgram:
         for pin in self.pins:
             if pin.step > steps:
                 continue
-            if pin.channel == "contact":
-                contact[pin.step - 1, pin.ball] = pin.value
-            elif iterations.ndim == 1:
-                iterations[pin.step - 1] = pin.value
-            else:
-                iterations[pin.step - 1, pin.ball] = pin.value
+            decided = contact if pin.channel == "contact" else iterations
+            # the last of one column is all that there is: a count that all balls share is that of ball -1
+            decided.reshape(steps, -1)[pin.step - 1, pin.ball] = pin.value
         return BallDecisions(contact, iterations)  # type: ignore[arg-type]
 
     def lockstep(
@@ -188,10 +185,6 @@ class BallProgram:
             flips=flips,
             overridden=overridden_count,
             furthest=furthest,
-            nearest={},
-            bound={},
-            ambiguous={},
-            doubts={},
             failed=failed,
             runs=runs,
         )

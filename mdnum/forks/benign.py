@@ -3,7 +3,7 @@
 B is compared with an ensemble of A, at a step that a calibration chooses. Too early, the ensemble differs by
 less than rounding may; too late, every run has forgotten its start and a changed program gives the same
 scatter. Between the two lies a window, and it belongs to the system: so planted changes are run, and the step
-is taken at which all of them are told apart.
+is taken at which all of them are distinguished from rounding.
 
 The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018):
 features are standardized by the ensemble and projected on its principal components; a run stands out when two
@@ -213,7 +213,7 @@ class Window:
 
     @property
     def ok(self) -> bool:
-        """Whether every planted change was told apart."""
+        """Whether every planted change was distinguished."""
         return all(one.ok for one in self.table)
 
 
@@ -258,7 +258,7 @@ def calibrate(
     changes: Sequence[Change] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Run an ensemble, and choose the step at which planted changes are told from rounding.
+    """Run an ensemble, and choose the step at which planted changes are distinguished from rounding.
 
     Args:
         simulation: the program.
@@ -271,8 +271,8 @@ def calibrate(
         progress: called with runs done, runs in all, and figures.
 
     Raises:
-        InputError: too few runs, a program that blows up, or no step at which planted changes are told
-            apart.
+        InputError: too few runs, a program that blows up, or no step at which planted changes can be
+            distinguished from rounding.
 
     Error: statistical. The limit is a quantile over the members, see `Calibration.rate_bounds`.
     """
@@ -323,7 +323,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """The latest window in which every planted change is clearly told apart, else the one that does it best.
+    """The latest window in which every planted change is clear, else the one that does it best.
 
     Raises:
         InputError: there is none.
@@ -407,7 +407,7 @@ def benign(
         progress: called with runs done, runs in all, and figures.
 
     Raises:
-        InputError: programs that cannot be compared, or no step at which planted changes are told apart.
+        InputError: programs that cannot be compared, or no step at which planted changes are clear.
     """
     _check(twin)
     found = calibration or calibrate(twin.a.simulation, start=twin.a.begin, steps=steps, progress=progress)

@@ -145,6 +145,10 @@ def tangents(
         shift += float(np.log(now))
 
 
+def _joined(parts: list[StepTangents], name: str, axis: int = 0) -> np.ndarray:
+    return np.concatenate([getattr(part, name) for part in parts], axis)
+
+
 def _length(tangent, clock: float) -> float:
     x, v = tangent
     return float(np.sqrt(np.sum(x * x) + clock * clock * np.sum(v * v)))
@@ -260,7 +264,7 @@ class Lyapunov:
     def ratio(self, seen: Growth) -> float:
         """Growth rate of two runs over the exponent; NaN where they were not seen to grow.
 
-        Near 1 the runs parted as the motion parts them. Well above it, their flips did it.
+        Near 1 the runs diverged as the motion makes them. Well above it, their flips did it.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
@@ -306,8 +310,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
     dx -= dx.mean(axis=0)
     step = float(simulation.integrator.timestep)
     parts = list(tangents(simulation, last, dx, np.zeros_like(dx), reach=False))
-    size = np.concatenate([part.size for part in parts])
-    furthest = np.concatenate([part.furthest for part in parts])
+    size, furthest = _joined(parts, "size"), _joined(parts, "furthest")
     first = int(_TRANSIENT * last)
     edges = np.linspace(first, len(size) - 1, _BLOCKS + 1).astype(int)
     slopes = np.diff(size[edges]) / np.diff(edges)
@@ -511,24 +514,21 @@ def forecast(
         raise InputError(f"a direction has the shape of the start, {shape}")
     dx, dv = change
     parts = list(tangents(simulation, last, dx, dv))
-    skin = simulation.rule.skin
-    listed = [
-        np.full(len(part.size), np.sum(part.segment.table.index < simulation.atoms) // 2) for part in parts
-    ]
+    tables = [part.segment.table for part in parts]
+    listed = [np.full(len(part.size), table.pairs) for part, table in zip(parts, tables, strict=True)]
     largest = np.abs(np.asarray(simulation.positions)).max()
-    dtype = simulation.policy.dtype("state")
     return Forecast(
         simulation,
         last,
         dx,
         dv,
-        np.concatenate([part.reach for part in parts], axis=1),
-        np.concatenate([part.pairs for part in parts], axis=1),
-        np.concatenate([part.margins for part in parts], axis=1),
-        np.exp(np.concatenate([part.furthest for part in parts])),
-        float(np.spacing(np.asarray(largest, dtype))),
+        _joined(parts, "reach", 1),
+        _joined(parts, "pairs", 1),
+        _joined(parts, "margins", 1),
+        np.exp(_joined(parts, "furthest")),
+        float(np.spacing(np.asarray(largest, simulation.policy.dtype("state")))),
         np.concatenate(listed),
-        np.concatenate([skin - 2 * part.moved for part in parts]),
+        simulation.rule.skin - 2 * _joined(parts, "moved"),
     )
 
 

@@ -250,13 +250,13 @@ def density(
     flat = (4 * found[1:] - found[:-1]) / 3
     flat = (16 * flat[1:] - flat[:-1]) / 15
     by_frame = flat.sum(axis=2)
-    best = len(flat) - 1
-    for k in range(best):
+
+    def alike(k: int) -> bool:
         # the noise that frames share does not tell one width from another
         differences = by_frame[k + 1 :] - by_frame[k]
-        if all(abs(one.sum()) <= 2 * rows * standard_error(one) for one in differences):
-            best = k
-            break
+        return all(abs(one.sum()) <= 2 * rows * standard_error(one) for one in differences)
+
+    best = next(k for k in range(len(flat)) if alike(k))
     bias = np.abs((flat[min(best + 1, len(flat) - 1)] - flat[best]).sum(axis=0))
     noise = np.array([rows * standard_error(column) for column in flat[best].T])
     return Density(flat[best], float(widths[best]), np.hypot(noise, bias), table)

@@ -131,8 +131,8 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Whether a scalar loss depends on its parameters, in the branches and iterations that ran.
 
-    A tangent that is no number stays none through everything that carries a derivative, whatever it is
-    multiplied by, and goes nowhere else.
+    A tangent that is NaN stays NaN through everything that carries a derivative, whatever it is multiplied
+    by, and goes nowhere else.
 
     Args:
         function: from a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as

@@ -101,6 +101,8 @@ def neighbor_vectors(
 # jax-md keeps the box of a list in float32, so its cells can come out 6e-8 too small and lose pairs that
 # span one; searching a little further and filtering in float64 makes the result exact
 _SEARCH_MARGIN = 1e-6
+# room left in each row, as a factor
+_ROOM = 1.25
 
 
 def standard_promotion() -> AbstractContextManager[None]:
@@ -199,7 +201,6 @@ class PairSearch:
         cell: lattice vectors as rows, length.
         pbc: which axes are periodic.
         r_list: search radius, length (cutoff plus skin).
-        capacity_multiplier: room left in each row, as a factor.
 
     Raises:
         InputError: r_list is over half the smallest perpendicular width, where one image is not enough.
@@ -210,7 +211,6 @@ class PairSearch:
         cell: Float[np.ndarray, "3 3"],
         pbc: tuple[bool, bool, bool],
         r_list: float,
-        capacity_multiplier: float = 1.25,
     ):
         narrowest = float(np.min(Cell.create(cell, pbc).widths))
         # a hair beyond half the width is the room that callers add for rounding, not another image
@@ -223,7 +223,6 @@ class PairSearch:
         self.cell = complete(cell, np.asarray(pbc))
         self.pbc = np.asarray(pbc, bool)
         self.r_list = float(r_list)
-        self.capacity_multiplier = capacity_multiplier
         self._list: NeighborList | None = None
         self._low = np.zeros(3)
         self._span = np.ones(3)
@@ -259,7 +258,7 @@ class PairSearch:
             jnp.asarray(boxes),
             scalar(self.r_list * (1 + _SEARCH_MARGIN)),  # type: ignore[arg-type]
             dr_threshold=0.0,
-            capacity_multiplier=self.capacity_multiplier,
+            capacity_multiplier=_ROOM,
             fractional_coordinates=True,
             format=partition.Dense,
         )

@@ -36,7 +36,7 @@ from mdnum.md.decide import (
     halves_of,
     packed,
     unpacked,
-)  # fmt: skip
+)
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, other_than, symmetric
 from mdnum.md.potentials import CutPotential, of_type

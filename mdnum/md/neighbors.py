@@ -420,9 +420,11 @@ class VerletList:
             if most <= self.slots and first:
                 # every size of table is compiled for: settle on one with room before the first use
                 first, wanted = False, self._rounded(most * self.slack)
-                if wanted != self.slots:
-                    self.slots = wanted
-                    continue
+                if wanted < self.slots:
+                    index = index[:wanted]
+                elif wanted > self.slots:
+                    index = np.concatenate([index, np.full((wanted - self.slots, atoms), atoms, np.int32)])
+                self.slots = wanted
             if most <= self.slots:
                 return PairTable(index, order, r_list, most, time.perf_counter() - begin)
             if most >= atoms and atoms > 1:
@@ -433,9 +435,9 @@ class VerletList:
         volume = cell.volume
         if not np.isfinite(volume):
             return SLOTS
-        # a guess that is too small costs one more search, one that is too large costs every step
+        # one that is too small costs another search; what is too much is cut off
         mean = atoms / volume * 4.0 / 3.0 * np.pi * r_list**3
-        return self._rounded(min(mean, atoms))
+        return self._rounded(min(1.25 * mean + 8, atoms))
 
     @staticmethod
     def _rounded(slots: float) -> int:

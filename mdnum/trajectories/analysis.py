@@ -21,7 +21,7 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import FrameError, UnreadableFrame, check_frame
+from mdnum.trajectories.frame import FrameCheck, FrameError, UnreadableFrame
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.resolution import Resolution, infer
@@ -78,8 +78,9 @@ class _ProcessPart:
     rows: list[tuple[int, int, float]] = field(
         default_factory=list
     )  # (pairs, near, smallest margin) of its own
-    before: Members | None = None  # the pairs inside at the frame before its first; None for the first part
-    initial: Members | None = None  # the pairs inside at its first frame, kept by the first part alone
+    first: Members | None = (
+        None  # the pairs inside at the first of them: of later parts, the one before theirs
+    )
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
 
@@ -163,14 +164,14 @@ class NeighborFlips(AnalysisBase):
                 )
             self._second = np.unique(np.asarray(second.indices, np.int64))
         self.rules = _rules_of(r_cut, rule)
-        self._radius = smallest_radius(self.rules)
         self._species = None
         if any(one.needs_species for one in self.rules):
             self._species = [str(one) for one in AtomTable.of(group.universe.atoms).species]
             for one in self.rules:
                 # refuses a species that no atom has
                 one.table(self._species)
-        self._seen = atoms_of((self._first, self._second))
+        seen = atoms_of((self._first, self._second))
+        self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             raise InputError(
                 f"bound = {bound!r}; expected a length of 0 or more, Å",
@@ -178,11 +179,9 @@ class NeighborFlips(AnalysisBase):
             )
         self._bound = bound
         self._resolution: Resolution | None = None
-        self._pbc: np.ndarray | None = None
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
-        self._names: np.ndarray | None = None
         self._library: LibraryFrames | None = None
         self._done, self._reading = 0, True
         self._to_the_end = False
@@ -246,7 +245,7 @@ class NeighborFlips(AnalysisBase):
                 break
         if sample:
             self._resolution = infer(sample, 32, formats_of(self._trajectory)[0])
-            self._pbc = sample[0].box.pbc
+            self._check.pbc = sample[0].box.pbc
         self._library = None
         return groups
 
@@ -260,23 +259,26 @@ class NeighborFlips(AnalysisBase):
         """The frames as the library reads them, opened when they are asked for in this process."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
-            self._names = self._library.labels(0)
+            self._check.labels = self._library.labels(0)
         return self._library
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
         self._done, self._reading = 0, True
-        self.results = Results(failures=[None])
+        self.results, failure = Results(failures=[None]), None
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            self._stopped(_Failure(error.frame, error.message, False))
+            failure = _Failure(error.frame, error.message, False)
         except READING_FAILS as error:
             if not self._reading:
                 raise
             # reading the frame before the first of this part has failed where done is -1
             number = int(self._numbers[self._at + self._done])
-            self._stopped(_Failure(number, f"frame {number} cannot be read ({first_line(error)})", True))
+            failure = _Failure(number, f"frame {number} cannot be read ({first_line(error)})", True)
+        if failure is not None:
+            self.results.failures, done = [failure], max(self._done, 0)
+            self.frames, self.times = self.frames[:done], self.times[:done]
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.last = tracker.members() if part.rows else None
         # what a process sends back is what it found, not what it needed for that; an open file cannot be sent
@@ -284,11 +286,6 @@ class NeighborFlips(AnalysisBase):
         self._library = None
         # where one process computes several parts, each has to be an object of its own
         return copy(self)
-
-    def _stopped(self, failure: _Failure) -> None:
-        self.results.failures = [failure]
-        done = max(self._done, 0)
-        self.frames, self.times = self.frames[:done], self.times[:done]
 
     def _prepare(self) -> None:
         self._trackers = [
@@ -303,7 +300,7 @@ class NeighborFlips(AnalysisBase):
             self._reading = False
             self._examined(ts)
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
-                part.before = tracker.members()
+                part.first = tracker.members()
             self._done, self._reading = 0, True
 
     def _single_frame(self) -> None:
@@ -312,8 +309,7 @@ class NeighborFlips(AnalysisBase):
         for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
             if len(flips):
                 part.flips.append(flips)
-            if self._at == 0 and self._done == 0:
-                part.initial = tracker.members()
+            part.first = tracker.members() if part.first is None else part.first
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
         self._done += 1
@@ -321,11 +317,10 @@ class NeighborFlips(AnalysisBase):
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
-        frame = self.library.frame(ts, int(ts.frame))
-        check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
+        frame = self._check(self.library.frame(ts, int(ts.frame)))
         bound = self._bound or 0.0
         if self._bound is None and self._resolution is not None:
-            bound = self._resolution.bound(frame, self._seen)
+            bound = self._resolution.bound(frame, self._check.atoms)
         try:
             # a margin among the nearest is the difference of two distances
             return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
@@ -374,24 +369,21 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     flips: list[FlipTable] = []
     done, last = 0, None
     for part in parts:
-        if last is not None and part.before is not None:
-            both = zip(vars(last).values(), vars(part.before).values(), strict=True)
-            if not all(np.array_equal(one, other) for one, other in both):
-                raise InputError(
-                    f"two processes found other pairs at the frame between them (number {done - 1} of those "
-                    "examined)",
-                    remedy="The file was changed while it was read; run again",
-                )
-        # a part that examined the frame before its first has counted that one too
-        shift = done - (part.before is not None)
+        if last is not None and part.first is not None and not last.equals(part.first):
+            raise InputError(
+                f"two processes found other pairs at the frame between them (number {done - 1} of all)",
+                remedy="The file was changed while it was read; run again",
+            )
+        # a part after the first has counted the frame before its own too
+        shift = done - (done > 0)
         flips += [replace(rows, frame=rows.frame + shift) for rows in part.flips]
         done += len(part.rows)
         last = last if part.last is None else part.last
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
     table = FlipTable.concatenate(flips) if flips else FlipTable.none()
-    initial = (parts[0].initial if parts else None) or Members.none()
+    initial, none = parts[0].first if parts else None, Members.none()
     pairs, near = rows[:, :2].T.astype(np.int64)
-    return RuleResult(rule, table, pairs, near, rows[:, 2], initial, last or Members.none())
+    return RuleResult(rule, table, pairs, near, rows[:, 2], initial or none, last or none)
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:

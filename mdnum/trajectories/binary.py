@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -220,29 +221,20 @@ class XtcTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        file = XtcFile(path)
-        try:
-            atoms = file.atoms
-        except ValueError as error:
-            raise self._refused(f"it is no xtc file, or a damaged one ({error})") from None
-        whole = file.whole_frames()
-        # a frame that is cut is one to read
-        self._count = whole + (not file.ends_at(whole))
-        file.close()
+        with closing(XtcFile(path)) as file:
+            try:
+                atoms = file.atoms
+            except ValueError as error:
+                raise self._refused(f"it is no xtc file, or a damaged one ({error})") from None
+            whole = file.whole_frames()
+            # a frame that is cut is one to read
+            self._count = whole + (not file.ends_at(whole))
         self._has(atoms)
         self.notes = (NARROWED, *self.table.notes)
 
     def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        file = XtcFile(self.path)
-        try:
-            for number in numbers:
-                try:
-                    found = file.read(number)
-                except self._fails as error:
-                    raise self._unreadable(number, error) from error
-                yield number, found
-        finally:
-            file.close()
+        with closing(XtcFile(self.path)) as file:
+            yield from self._guarded(numbers, file.read)
 
     def _frame(self, number: int, raw: Any) -> Frame:
         # in Å by the operations that MDAnalysis makes, so that both see the same numbers
@@ -375,11 +367,11 @@ class NetcdfTrajectory(Trajectory):
 
     def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         names = {"coordinates", "velocities", "time", "cell_lengths", "cell_angles"}
+        variables = self._head.variables
         with self.path.open("rb") as file:
             for number in numbers:
                 if number >= self._head.whole:
                     raise self._ends(number)
-                variables = self._head.variables
                 yield (
                     number,
                     {name: self._value(file, variables[name], number) for name in names & set(variables)},

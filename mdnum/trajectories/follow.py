@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame, checked, leap
+from mdnum.trajectories.frame import Box, Chosen, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
@@ -41,7 +41,7 @@ _SAME_TIME = 1e-6
 
 def _usable(
     files: Sequence[Trajectory],
-    atoms: Int[np.ndarray, "atoms"] | None,
+    atoms: Chosen,
     rules: Sequence[Rule],
     step: Callable[..., Any],
     found: Pass | Compared,
@@ -55,7 +55,7 @@ def _usable(
         InputError: the first frame cannot be read or used: there is nothing to keep.
     """
     radius = smallest_radius(rules)
-    streams = [checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits) for one in files]
+    streams = [map(FrameCheck(atoms, str(one.path), radius, one.bits), one.frames()) for one in files]
     while True:
         try:
             frames = [frame for one in streams if (frame := next(one, None)) is not None]
@@ -81,16 +81,13 @@ def _usable(
 
 
 class NeighborCounts:
-    """How many neighbors each atom of the first group has, kept up to date by the flips.
-
-    Attributes:
-        seen: by number of neighbors, atoms and frames at which an atom had as many.
-    """
+    """How many neighbors each atom of the first group has, kept up to date by the flips."""
 
     def __init__(self, members: Members, atoms: int, groups: Groups, directed: bool):
         self._sides = [None if one is None else np.isin(np.arange(atoms), one) for one in groups]
         self._atoms = np.arange(atoms) if groups[0] is None else np.asarray(groups[0])
         self._directed, self._now = directed, np.zeros(atoms, np.int64)
+        # by number of neighbors, atoms and frames at which an atom had as many
         self.seen = np.zeros(1, np.int64)
         self._add(members.i, members.j, np.ones(len(members)))
 
@@ -116,57 +113,45 @@ class NeighborCounts:
 
 @dataclass
 class Followed:
-    """One rule on its way through the frames.
-
-    Attributes:
-        flux: (flips, moment) at frames whose velocities were used.
-        reach: the usual distance of a pair at the threshold, length; nan where there was none.
-    """
+    """One rule on its way through the frames."""
 
     rule: Rule
     tracker: Tracker  # of it
     neighbors: NeighborCounts | None = None  # known from the first frame on
-    flux: list[tuple[int, float]] = field(default_factory=list)
-    reach: float = float("nan")
+    flux: list[tuple[int, float]] = field(default_factory=list)  # (flips, moment) where velocities were used
+    reach: float = float("nan")  # the usual distance of a pair at the threshold, length; nan without one
     ranked: bool = False  # whether it is mostly the order of distances that decides there, and no radius
 
 
 @dataclass
 class Pass:
-    """What came of reading a trajectory.
-
-    Attributes:
-        stopped: what was wrong with the frame after the last one, if the file did not come to its end.
-        moved: root mean square displacement between frames over what the velocities say; nan without.
-        leaps: (number of the frame, atom, how far) of what no atom does between two frames.
-    """
+    """What came of reading a trajectory."""
 
     rules: list[Followed]
     frames: int = 0  # examined
-    stopped: InputError | None = None
-    moved: float = float("nan")
+    stopped: InputError | None = None  # what was wrong with the frame after the last one
+    moved: float = float(
+        "nan"
+    )  # root mean square displacement of a frame over what velocities say; nan without
+    # (number of the frame, atom, how far) of what no atom does between two frames
     leaps: list[tuple[int, int, float]] = field(default_factory=list)
 
 
 def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink
 ) -> Iterator[Pass]:
-    """Reads the frames once, handing flips, frames and the first members on as they come.
+    """Reads the frames once, handing rows of "members", "flips" and "frames" to the sink as they come.
 
     Yields the same `Pass` after each frame, and can be left then. Memory is that of one frame and the
     trackers', however many frames there are. A frame that cannot be read or used ends it; what came before
     stays.
-
-    Args:
-        resolution: of the file.
-        sink: takes rows of "members", "flips" and "frames".
 
     Raises:
         InputError: the first frame cannot be read or used: there is nothing to keep.
     """
     species = [str(one) for one in trajectory.species]
     found = Pass([Followed(rule, Tracker(rule, *groups, species)) for rule in rules])
-    atoms, start, last = atoms_of(groups), None, None
+    atoms, last = atoms_of(groups), None
     # frames whose velocities are used: spread over the file, or ever fewer if its end is not known
     count, measured = trajectory.count, {0, *(2**n for n in range(_FLUX_FRAMES - 1))}
     if count is not None:
@@ -178,13 +163,10 @@ def follow(
         return [one.tracker.step(frame, bound * (1 + one.rule.directed)) for one in found.rules]
 
     for (frame,), stepped in _usable([trajectory], atoms, rules, step, found):
-        if found.frames == 0:
-            start = frame
-        elif found.frames == 1:
-            assert start is not None
-            found.moved = _moved(start, frame)
-        if last is not None and (far := leap(last, frame, atoms)) is not None:
-            found.leaps.append((frame.index, *far))
+        if last is not None:
+            found.moved = _moved(last, frame) if found.frames == 1 else found.moved
+            if (far := leap(last, frame, atoms)) is not None:
+                found.leaps.append((frame.index, *far))
         last = frame
         for number, (one, new) in enumerate(zip(found.rules, stepped, strict=True)):
             _hand_on(sink, number, one, new, frame, found.frames, (trajectory.atoms, groups))
@@ -310,7 +292,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
-def separation(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Separation:
+def separation(one: Frame, other: Frame, atoms: Chosen = None) -> Separation:
     """The separation of two frames; only of these atoms, where they are given."""
     moved, whole = _displaced(one, other)
     if atoms is not None:
@@ -471,29 +453,21 @@ class NeighborSets:
 
 @dataclass
 class Compared:
-    """What the frames showed.
-
-    Attributes:
-        beyond: first frame at which an atom is further apart than the resolution of the two files explains.
-        last: the separation at the last frame.
-    """
+    """What the frames showed."""
 
     frames: int = 0
     seed: int | None = None  # first frame whose positions differ at all
-    beyond: int | None = None
+    beyond: int | None = None  # first frame with an atom further apart than the resolution of both explains
     other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
     times_differ: int = 0
-    last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))
+    last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))  # at the last frame
     stopped: InputError | None = None
 
 
-def follow_both(sets: list[NeighborSets], atoms: np.ndarray | None, sink: Sink) -> Iterator[Compared]:
-    """Reads both once, in step, yielding the same `Compared` after each frame.
+def follow_both(sets: list[NeighborSets], atoms: Chosen, sink: Sink) -> Iterator[Compared]:
+    """Reads both once, in step, yielding the same `Compared` after each frame; only these atoms matter.
 
-    Args:
-        sets: of every rule.
-        atoms: those that matter; None for all.
-        sink: takes rows of "apart" and "differing": name of the table, and columns.
+    The sink takes rows of "apart" and "differing".
     """
     found, sides = Compared(), sets[0].sides
 

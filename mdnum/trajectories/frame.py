@@ -7,7 +7,6 @@ every other pair of that frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,16 +22,15 @@ _FAR_BOXES, _FAR_SIZES = 1e5, 1e6
 _LEAP_BOXES, _LEAP_SIZES = 100.0, 1e4
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 
+#: Indices of some atoms of a file; None for all.
+Chosen = Int[np.ndarray, "chosen"] | None
+
 
 @dataclass(frozen=True)
 class Box:
-    """Lattice vectors, and the directions in which they repeat.
+    """Lattice vectors, and the directions in which they repeat."""
 
-    Attributes:
-        matrix: lattice vectors as rows, length; rows of directions that do not repeat do not matter.
-        pbc: which of them repeat.
-    """
-
+    # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     pbc: Bool[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, bool))
 
@@ -48,23 +46,14 @@ class Box:
 
 @dataclass(frozen=True)
 class Frame:
-    """Positions at one moment.
+    """Positions at one moment."""
 
-    Attributes:
-        index: number of the frame in its file, from 0.
-        time: in the file's unit; the index where the file has no times.
-        positions: length; those of all atoms of the file.
-        box: the box of this frame.
-        velocities: length per time, where the file has them.
-        labels: names, elements or types of the atoms, where the file has them in every frame.
-    """
-
-    index: int
-    time: float
-    positions: Float[np.ndarray, "atoms 3"]
+    index: int  # number of the frame in its file, from 0
+    time: float  # in the file's unit; the index where the file has no times
+    positions: Float[np.ndarray, "atoms 3"]  # of all atoms of the file, length
     box: Box
-    velocities: Float[np.ndarray, "atoms 3"] | None = None
-    labels: np.ndarray | None = None
+    velocities: Float[np.ndarray, "atoms 3"] | None = None  # length per time, where the file has them
+    labels: np.ndarray | None = None  # names, elements or types, where the file has them in every frame
 
 
 class FrameError(InputError):
@@ -84,41 +73,9 @@ class UnreadableFrame(FrameError):
         super().__init__(message, frame=frame, remedy=remedy, where=where)
 
 
-def checked(
-    frames: Iterable[Frame],
-    atoms: Int[np.ndarray, "chosen"] | None = None,
-    where: str | None = None,
-    *,
-    radius: float = np.inf,
-    bits: int = 64,
-) -> Iterator[Frame]:
-    """The frames, each checked before it is given on; arguments and errors as of `check_frame`."""
-    pbc = labels = None
-    for frame in frames:
-        pbc = frame.box.pbc if pbc is None else pbc
-        labels = frame.labels if labels is None else labels
-        check_frame(frame, atoms, pbc, where, labels, radius=radius, bits=bits)
-        yield frame
-
-
-def check_frame(
-    frame: Frame,
-    atoms: Int[np.ndarray, "chosen"] | None = None,
-    pbc: Bool[np.ndarray, "3"] | None = None,
-    where: str | None = None,
-    labels: np.ndarray | None = None,
-    *,
-    radius: float = np.inf,
-    bits: int = 64,
-) -> None:
-    """Refuses a frame that no simulation writes.
-
-    Args:
-        atoms: those that matter, ascending; None for all.
-        pbc, labels: of the first frame; None for any.
-        where: the file, for messages.
-        radius: the shortest length that distances are compared with.
-        bits: width of a coordinate as it was read.
+@dataclass
+class FrameCheck:
+    """Refuses frames that no simulation writes, or that do not compare with the first; gives on the others.
 
     Raises:
         FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
@@ -127,60 +84,75 @@ def check_frame(
             atom is labeled as another one than in the first frame.
     """
 
-    def refused(message: str, remedy: str) -> FrameError:
-        return FrameError(f"frame {frame.index}{message}", frame=frame.index, remedy=remedy, where=where)
+    atoms: Chosen = None  # those that matter, ascending; None for all
+    where: str | None = None  # the file, for messages
+    radius: float = np.inf  # the shortest length that distances are compared with
+    bits: int = 64  # width of a coordinate as it was read
+    pbc: Bool[np.ndarray, "3"] | None = None  # of the first frame, once there was one
+    labels: np.ndarray | None = None
 
-    def place(atom: int) -> str:
-        return f"atom {atom} is at ({', '.join(f'{value:g}' for value in frame.positions[atom])})"
+    def __call__(self, frame: Frame) -> Frame:
+        atoms = self.atoms
+        self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
+        self.labels = labels = frame.labels if self.labels is None else self.labels
 
-    failed = (
-        f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
-        if frame.index
-        else "The simulation or the writing of it failed from the first frame on"
-    )
-    if labels is not None and frame.labels is not None:
-        others = np.flatnonzero(labels != frame.labels)
-        others = others if atoms is None else np.intersect1d(others, atoms)
-        if others.size:
-            atom = int(others[0])
-            raise refused(
-                f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one looked at"
-                f"{_and_others(others.size)}",
-                "Write all frames in one order of atoms, or leave out those that differ with @START:STOP: "
-                "pairs are followed by the place of their atoms in the file",
+        def refused(message: str, remedy: str) -> FrameError:
+            return FrameError(
+                f"frame {frame.index}{message}", frame=frame.index, remedy=remedy, where=self.where
             )
-    if pbc is not None and (frame.box.pbc != pbc).any():
-        raise refused(
-            f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
-            "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
+
+        def place(atom: int) -> str:
+            return f"atom {atom} is at ({', '.join(f'{value:g}' for value in frame.positions[atom])})"
+
+        failed = (
+            f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
+            if frame.index
+            else "The simulation or the writing of it failed from the first frame on"
         )
-    x = frame.positions if atoms is None else frame.positions[atoms]
-    for axis in np.flatnonzero(frame.box.pbc):
-        if not (vector := frame.box.matrix[axis]).any() or not np.isfinite(vector).all():
+        if labels is not None and frame.labels is not None:
+            others = np.flatnonzero(labels != frame.labels)
+            others = others if atoms is None else np.intersect1d(others, atoms)
+            if others.size:
+                atom = int(others[0])
+                raise refused(
+                    f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one looked at"
+                    f"{_and_others(others.size)}",
+                    "Write all frames in one order of atoms, or leave out those that differ with @START:STOP:"
+                    " pairs are followed by the place of their atoms in the file",
+                )
+        if (frame.box.pbc != pbc).any():
             raise refused(
-                f": the box repeats along {'abc'[axis]}, but its vector there is {vector.tolist()}",
-                "Give the frames a box, or say that this direction does not repeat",
+                f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
+                "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
             )
-    # a sum is finite unless a term is not, or the terms are of no use anyway
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = x.sum()
-    if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
-        raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
-    if (found := far_out(frame, atoms, radius, bits)) is not None:
-        atom, many, why = found
-        raise refused(
-            f": {place(atom)}, {why}{_and_others(many)}",
-            f"{failed}; an atom that did fly off is left out with --between",
-        )
-    # one atom may well be at the origin; two cannot be at one place
-    zero = np.flatnonzero(~x.any(axis=1))
-    if zero.size > 1:
-        some = f"atom {_named(zero[0], atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
-        some = "all coordinates are 0" if zero.size == len(x) else some
-        raise refused(
-            f": {some}, as where coordinates were never written",
-            "Leave the frame out with @START:STOP, or the atoms with --between",
-        )
+        x = frame.positions if atoms is None else frame.positions[atoms]
+        for axis in np.flatnonzero(frame.box.pbc):
+            if not (vector := frame.box.matrix[axis]).any() or not np.isfinite(vector).all():
+                raise refused(
+                    f": the box repeats along {'abc'[axis]}, but its vector there is {vector.tolist()}",
+                    "Give the frames a box, or say that this direction does not repeat",
+                )
+        # a sum is finite unless a term is not, or the terms are of no use anyway
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = x.sum()
+        if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
+            raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
+        if (found := far_out(frame, atoms, self.radius, self.bits)) is not None:
+            atom, many, why = found
+            raise refused(
+                f": {place(atom)}, {why}{_and_others(many)}",
+                f"{failed}; an atom that did fly off is left out with --between",
+            )
+        # one atom may well be at the origin; two cannot be at one place
+        zero = np.flatnonzero(~x.any(axis=1))
+        if zero.size > 1:
+            some = f"atom {_named(zero[0], atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
+            some = "all coordinates are 0" if zero.size == len(x) else some
+            raise refused(
+                f": {some}, as where coordinates were never written",
+                "Leave the frame out with @START:STOP, or the atoms with --between",
+            )
+        return frame
 
 
 def _repeats(pbc: np.ndarray) -> str:
@@ -198,9 +170,9 @@ def _and_others(count: int) -> str:
 
 
 def far_out(
-    frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, radius: float = np.inf, bits: int = 64
+    frame: Frame, atoms: Chosen = None, radius: float = np.inf, bits: int = 64
 ) -> tuple[int, int, str] | None:
-    """The atom that is furthest out, where that is further than can be; arguments as of `check_frame`.
+    """The atom that is furthest out, where that is further than can be; arguments as of `FrameCheck`.
 
     Returns:
         (the atom, how many are too far out, why in words); None where none is.
@@ -227,9 +199,7 @@ def far_out(
     return None
 
 
-def leap(
-    before: Frame, now: Frame, atoms: Int[np.ndarray, "chosen"] | None = None
-) -> tuple[int, float] | None:
+def leap(before: Frame, now: Frame, atoms: Chosen = None) -> tuple[int, float] | None:
     """The atom that is furthest from where it was a frame before, where that is further than can be.
 
     Wrapping an atom, or all of them at once after a long time, is none.
@@ -258,6 +228,6 @@ def _box(frame: Frame) -> float:
     return float(np.linalg.norm(frame.box.matrix, axis=1).max())
 
 
-def _named(at: Any, atoms: Int[np.ndarray, "chosen"] | None) -> int:
+def _named(at: Any, atoms: Chosen) -> int:
     """Number in the file of the atom at this place among those that matter."""
     return int(at if atoms is None else atoms[at])

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.trajectories.ledger import Columns, FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is ten times as fast
 _ROOM = 2**62
@@ -46,27 +46,17 @@ class Sums:
 
 @dataclass(frozen=True)
 class History:
-    """Pairs that were ever inside or flipped, each with its flips in the order of frames.
+    """Pairs that were ever inside or flipped, each with its flips in the order of frames."""
 
-    Attributes:
-        i, j, rank: the pairs, sorted, each once; see `ledger.Members`.
-        inside: whether each was inside at the first frame.
-        rows: flips of pair p are rows `rows[p]` to `rows[p + 1]` of what follows.
-        frame: position among the frames examined, from 1.
-        entered: whether the pair is inside at that frame.
-        ambiguous: whether the file's resolution may have made each flip.
-        frames: frames examined.
-    """
-
-    i: Int[np.ndarray, "pairs"]
+    i: Int[np.ndarray, "pairs"]  # the pairs, sorted, each once; see `ledger.Members`
     j: Int[np.ndarray, "pairs"]
     rank: Int[np.ndarray, "pairs"]
-    inside: Bool[np.ndarray, "pairs"]
-    rows: Int[np.ndarray, "pairs_and_one"]
-    frame: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    ambiguous: Bool[np.ndarray, "flips"]
-    frames: int
+    inside: Bool[np.ndarray, "pairs"]  # at the first frame
+    rows: Int[np.ndarray, "pairs_and_one"]  # flips of pair p are rows[p] to rows[p + 1] of what follows
+    frame: Int[np.ndarray, "flips"]  # position among the frames examined, from 1
+    entered: Bool[np.ndarray, "flips"]  # whether the pair is inside at that frame
+    ambiguous: Bool[np.ndarray, "flips"]  # whether the file's resolution may have made the flip
+    frames: int  # examined
 
     @classmethod
     def of(
@@ -145,31 +135,20 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Contacts:
+class Contacts(Columns):
     """Stays inside, sorted by (i, j, rank, begin).
 
     The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time
     between the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
-
-    Attributes:
-        i, j, rank: the pair; see `ledger.Members`.
-        begin: first frame inside, a position among the frames examined.
-        end: first frame outside again; the number of frames where that was not seen.
-        began: whether the pair was seen to enter. If not the stay is censored on the left: it is older than
-            it looks.
-        ended: whether it was seen to leave. If not the stay is censored on the right: it goes on.
     """
 
-    i: Int[np.ndarray, "stays"]
+    i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
     j: Int[np.ndarray, "stays"]
     rank: Int[np.ndarray, "stays"]
-    begin: Int[np.ndarray, "stays"]
-    end: Int[np.ndarray, "stays"]
-    began: Bool[np.ndarray, "stays"]
-    ended: Bool[np.ndarray, "stays"]
-
-    def __len__(self) -> int:
-        return len(self.i)
+    begin: Int[np.ndarray, "stays"]  # first frame inside, a position among the frames examined
+    end: Int[np.ndarray, "stays"]  # first frame outside again; the number of frames where that was not seen
+    began: Bool[np.ndarray, "stays"]  # whether it was seen to enter, else it is older (censored on the left)
+    ended: Bool[np.ndarray, "stays"]  # whether it was seen to leave, else it goes on (censored on the right)
 
     @property
     def length(self) -> Int[np.ndarray, "stays"]:
@@ -208,8 +187,7 @@ def mended(stays: Contacts, gap: int) -> Contacts:
     joined = same & (stays.begin[1:] - stays.end[:-1] <= gap)
     heads = np.flatnonzero(np.concatenate([[True], ~joined]))
     tails = np.flatnonzero(np.concatenate([~joined, [True]]))
-    values = {name: column[heads] for name, column in vars(stays).items()}
-    return Contacts(**values | {"end": stays.end[tails], "ended": stays.ended[tails]})
+    return replace(stays[heads], end=stays.end[tails], ended=stays.ended[tails])
 
 
 # ---- between the frames

@@ -58,11 +58,8 @@ class ReducedLattice(NamedTuple):
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """How far a computed distance near radius can be off, length.
+        """How far a computed distance near radius can be off, length, with coordinates up to the largest.
 
-        Args:
-            largest: largest coordinate, absolute.
-            radius: the distance.
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
         combined = np.abs(self.combination).sum(axis=1).max()

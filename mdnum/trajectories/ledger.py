@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -16,8 +16,27 @@ from mdnum.trajectories.search import Changed
 _PART = 2048
 
 
+class Columns:
+    """A table: equally long columns, the fields of a frozen dataclass in their order."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, rows: Any) -> Any:
+        return type(self)(*(column[rows] for column in vars(self).values()))
+
+    def equals(self, other: Columns) -> bool:
+        """Whether all columns are the same to the last bit."""
+        return all(map(np.array_equal, vars(self).values(), vars(other).values()))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Any]) -> Any:
+        """The rows of parts, one after the other; at least one part."""
+        return cls(*map(np.concatenate, zip(*(vars(one).values() for one in parts), strict=True)))
+
+
 @dataclass(frozen=True)
-class Members:
+class Members(Columns):
     """The pairs inside at one frame, sorted by (i, j, rank), each once.
 
     Attributes:
@@ -33,9 +52,6 @@ class Members:
     rank: Int[np.ndarray, "pairs"]
     distance: Float[np.ndarray, "pairs"]
 
-    def __len__(self) -> int:
-        return len(self.i)
-
     @classmethod
     def none(cls) -> Members:
         """No pair."""
@@ -44,7 +60,7 @@ class Members:
 
 
 @dataclass(frozen=True)
-class FlipTable:
+class FlipTable(Columns):
     """A row per decision that differs from the frame before, sorted by (frame, i, j, rank).
 
     Attributes:
@@ -72,14 +88,6 @@ class FlipTable:
     margin_before: Float[np.ndarray, "flips"]
     bound: Float[np.ndarray, "flips"]
     ambiguous: Bool[np.ndarray, "flips"]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[FlipTable]) -> FlipTable:
-        """The rows of parts, one after the other; at least one part."""
-        return cls(**{one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(cls)})
 
     @classmethod
     def none(cls) -> FlipTable:
@@ -125,7 +133,8 @@ class LedgerRows:
         start = np.zeros((max(self.atoms, 1) - 1 >> shift) + 2, np.int64)
         _parted(changed, *distances, self.labels, ranks, shift, start, self._rows, thresholds)
         *columns, ambiguous = _sorted(start, shift, self._rows, ranks, bound, count)
-        return FlipTable(np.full(count, frame), *columns, np.full(count, bound), ambiguous)
+        columns = [np.full(count, frame), *columns, np.full(count, bound), ambiguous]
+        return FlipTable(*columns)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import Box, Chosen, Frame
 
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
@@ -51,33 +51,22 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """The resolution of the positions in a file.
+    """The resolution of the positions in a file."""
 
-    Attributes:
-        kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32",
-            "float64", or "unknown" where every coordinate looked at is 0 (bounds are then those of float32).
-        step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are
-            counted, that of the largest coordinate it was found from.
-        digits: significant digits of every number, where it is these that are fixed; else 0.
-        bits: width of a coordinate as the reader hands it over, 32 or 64.
-        frames: frames it was found from.
-        moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
-            file's.
-        box: step of the box's lengths, length, and of its angles, degrees, where the format rounds them.
-        told: whether the coordinates determine it. Where they are all 0, a grid is that which the format has
-            as a rule.
-    """
-
+    # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
+    # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)
     kind: str
+    # of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are counted,
+    # that of the largest coordinate it was found from
     step: float
-    bits: int
-    frames: int
-    moved: bool = True
-    box: tuple[float, float] = (0.0, 0.0)
-    digits: int = 0
-    told: bool = True
+    bits: int  # width of a coordinate as the reader hands it over, 32 or 64
+    frames: int  # that it was found from
+    moved: bool = True  # whether atoms moved between them; else the grid may be the structure's
+    box: tuple[float, float] = (0.0, 0.0)  # step of the box's lengths, and of its angles, degrees
+    digits: int = 0  # significant digits of every number, where it is these that are fixed
+    told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
-    def bound(self, frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> float:
+    def bound(self, frame: Frame, atoms: Chosen = None) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
 
         The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and
@@ -87,8 +76,16 @@ class Resolution:
 
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
-        frame = _of(frame, atoms)
-        largest, lattice = _extent(frame)
+        x = frame.positions if atoms is None else frame.positions[atoms]
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = x.sum()
+        if not np.isfinite(total):
+            # atoms that are nowhere have no distances
+            x = x[np.isfinite(x).all(axis=1)]
+        frame = frame if x is frame.positions else replace(frame, positions=x, velocities=None)
+        largest, rows = float(np.abs(x).max(initial=0.0)), frame.box.matrix[frame.box.pbc]
+        # the largest sum of the lattice's components along an axis
+        lattice = float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
         coordinate, box = self._half(frame), 0.0
         if self._narrow:
             # the box comes through the same reader
@@ -97,7 +94,7 @@ class Resolution:
         if frame.box.periodic:
             box += np.sqrt(3) / 2 * self.box[0]
             # right angles are meant to be right
-            if np.count_nonzero(frame.box.matrix[frame.box.pbc]) > frame.box.pbc.sum():
+            if np.count_nonzero(rows) > len(rows):
                 box += np.sqrt(3) / 2 * np.radians(self.box[1]) * lattice
         arithmetic = 16 * _UNIT[64] * (largest + lattice)
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
@@ -177,23 +174,6 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
     """Positions in fractions of the box."""
     return np.linalg.solve(frame.box.matrix.T, frame.positions.T).T
-
-
-def _of(frame: Frame, atoms: Int[np.ndarray, "chosen"] | None) -> Frame:
-    """The frame of these atoms, without those that are nowhere: they have no distances."""
-    x = frame.positions if atoms is None else frame.positions[atoms]
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = x.sum()
-    if not np.isfinite(total):
-        x = x[np.isfinite(x).all(axis=1)]
-    return frame if x is frame.positions else replace(frame, positions=x, velocities=None)
-
-
-def _extent(frame: Frame) -> tuple[float, float]:
-    """Largest coordinate, and largest sum of the lattice's components along an axis, length."""
-    largest = float(np.abs(frame.positions).max()) if len(frame.positions) else 0.0
-    rows = frame.box.matrix[frame.box.pbc]
-    return largest, float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
 
 
 # ---- which decimals numbers were written with

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.trajectories.history import Contacts, History, Strides, Sums, contacts, doublings, mended
+from mdnum.trajectories.ledger import Columns
 from mdnum.trajectories.topology import AtomTable
 
 #: Stays from which the share that is inside again is taken: all of them in most files.
@@ -293,7 +294,7 @@ class Chatter(Sums):
 
 
 @dataclass(frozen=True)
-class Busiest:
+class Busiest(Columns):
     """Pairs by the number of their flips, most first."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs
@@ -315,12 +316,11 @@ class Busiest:
         """So many of them, without pairs that never flipped."""
         order = np.lexsort((self.rank, self.j, self.i, -self.flips))[:most]
         order = order[self.flips[order] > 0]
-        return Busiest(*(column[order] for column in vars(self).values()))
+        return self[order]
 
     def __add__(self, other: Busiest) -> Busiest:
         """The busiest of two parts that have no pair in common."""
-        columns = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Busiest(*(np.concatenate(both) for both in columns)).first()
+        return Busiest.concatenate([self, other]).first()
 
 
 @dataclass(frozen=True)
@@ -385,7 +385,7 @@ class Statistics(Sums):
         if among > 1:
             # all stays of some of the pairs: enough for an average, however many there are
             mine = (stays.i.astype(np.int64) * 7 + stays.j * 13) % among == 0
-            some = Contacts(*(column[mine] for column in vars(stays).values()))
+            some = stays[mine]
         counted = cls(
             durations=Durations.of(stays, frames),
             intermittent=Durations.of(mended(stays, window), frames),

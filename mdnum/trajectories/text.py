@@ -93,31 +93,21 @@ class AseTrajectory(AseFrames):
         self._has(len(first), self._of_atoms(first))
 
     def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        return self._of_traj(numbers) if self.format == "traj" else self._of_any(numbers)
+        path, at = str(self.path), 0
+        if self.format == "traj":
+            with TrajectoryReader(path) as reader:
+                yield from self._guarded(
+                    numbers, lambda number: reader[number] if number < len(reader) else None
+                )
+            return
+        images = iread(path, index=slice(None), format=self.format, do_not_split_by_at_sign=True)
 
-    def _of_traj(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        with TrajectoryReader(str(self.path)) as reader:
-            for number in numbers:
-                if number >= len(reader):
-                    return
-                try:
-                    atoms = reader[number]
-                except Exception as error:
-                    raise self._unreadable(number, error) from error
-                yield number, atoms
+        def following(number: int) -> Any:
+            nonlocal at
+            skipped, at = number - at, number + 1
+            return next(islice(images, skipped, None), None)
 
-    def _of_any(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        images = iread(str(self.path), index=slice(None), format=self.format, do_not_split_by_at_sign=True)
-        number = 0
-        for wanted in numbers:
-            try:
-                atoms = next(islice(images, wanted - number, None), None)
-            except Exception as error:
-                raise self._unreadable(wanted, error) from error
-            if atoms is None:
-                return
-            number = wanted + 1
-            yield wanted, atoms
+        yield from self._guarded(numbers, following)
 
     def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
         if isinstance(error, UnknownFileTypeError) and self.format == str(error):

@@ -52,25 +52,15 @@ Matrices = Callable[[int, Any], Float[np.ndarray, "3 3"] | None]
 
 @dataclass(frozen=True)
 class AtomTable:
-    """What a topology says of every atom, one entry an atom.
+    """What a topology says of every atom, one entry an atom."""
 
-    Attributes:
-        names: as in the file ("OW"); the species where it has no names.
-        species: chemical element where it is known or can be guessed, else the file's atom type.
-        residue_names: "" where there are none.
-        residue_ids: number of the residue as the file has it; 0 where there are none.
-        residues: index of the atom's residue from 0, different for two residues of one number.
-        named: False where the file says nothing of its atoms but their number.
-        guessed: whether the species were guessed from names.
-    """
-
-    names: np.ndarray
-    species: np.ndarray
-    residue_names: np.ndarray
-    residue_ids: Int[np.ndarray, "atoms"]
-    residues: Int[np.ndarray, "atoms"]
-    named: bool = True
-    guessed: bool = False
+    names: np.ndarray  # as in the file ("OW"); the species where it has no names
+    species: np.ndarray  # chemical element where it is known or can be guessed, else the file's atom type
+    residue_names: np.ndarray  # "" where there are none
+    residue_ids: Int[np.ndarray, "atoms"]  # number as the file has it; 0 where there are none
+    residues: Int[np.ndarray, "atoms"]  # index from 0, different for two residues of one number
+    named: bool = True  # False where the file says nothing of its atoms but their number
+    guessed: bool = False  # whether the species were guessed from names
 
     def __len__(self) -> int:
         return len(self.names)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import Box, Chosen, Frame
 from mdnum.trajectories.lattice import (
     INSIDE,
     Participants,
@@ -42,7 +42,7 @@ Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None
 HORIZON = 0.02
 
 
-def atoms_of(groups: Groups) -> Int[np.ndarray, "atoms"] | None:
+def atoms_of(groups: Groups) -> Chosen:
     """The atoms that are on any side; None for all."""
     some = [one for one in groups if one is not None]
     return np.unique(np.concatenate(some)) if some else None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -28,31 +28,25 @@ _SLICE = re.compile(r"(-?\d+)?(:(-?\d+)?(:(-?\d+)?)?)?")
 class Trajectory(ABC):
     """Frames of one file, read lazily and in order, as often as wanted.
 
-    A reader says how many atoms there are (`_atoms`), finds frames (`_raw`) and decodes them (`_frame`).
+    A reader says how many atoms there are (`_has`), finds frames (`_raw`) and decodes them (`_frame`).
 
     Args:
         path: the file.
         topology: the file that says what the atoms are, where it is another one.
         slice: the frames asked for.
-
-    Attributes:
-        format: the file's format in the reader's word ("XTC", "extxyz").
-        reader: who reads it ("MDAnalysis", "ASE", "mdnum").
-        bits: width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way.
-        length: unit of length in words; "" where the file does not say.
-        time: unit of time in words; "frame" where the file has no times, whose numbers then stand for them
-            (velocities are per ps there, if the file has any).
-        table: what is known of the atoms.
-        notes: what a reader of the results should know about the reading, each a sentence.
     """
 
-    format: str
-    reader: str = "mdnum"
-    bits: int = 64
-    length: str = "Å"
+    format: str  # the file's format in the reader's word ("XTC", "extxyz")
+    reader: str = "mdnum"  # who reads it: "MDAnalysis", "ASE", "mdnum"
+    bits: int = (
+        64  # width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way
+    )
+    length: str = "Å"  # unit in words; "" where the file does not say
+    # unit in words; "frame" where the file has no times, whose numbers then stand for them (velocities are per
+    # ps there, if the file has any)
     time: str = "frame"
-    table: AtomTable
-    notes: tuple[str, ...] = ()
+    table: AtomTable  # what is known of the atoms
+    notes: tuple[str, ...] = ()  # what a reader of the results should know about the reading, each a sentence
     # what a frame that is none raises while it is decoded
     _fails: tuple[type[BaseException], ...] = (OSError, EOFError, ValueError, RuntimeError, LookupError)
     # frames in the file, where they are known
@@ -166,6 +160,17 @@ class Trajectory(ABC):
     @abstractmethod
     def _frame(self, number: int, raw: Any) -> Frame:
         """A frame from what `_raw` gave."""
+
+    def _guarded(self, numbers: Iterator[int], get: Callable[[int], Any]) -> Iterator[tuple[int, Any]]:
+        """Frames by number as a reader gives them, up to None; what it raises is an unreadable frame."""
+        for number in numbers:
+            try:
+                raw = get(number)
+            except self._fails as error:
+                raise self._unreadable(number, error) from error
+            if raw is None:
+                return
+            yield number, raw
 
     def _first(self) -> tuple[int, Any]:
         """The first of the file."""

@@ -10,7 +10,7 @@ from audit.laws import R_CUT, law, subject
 from audit.planted import codes, values
 
 from mdnum.audit import structures, thresholds
-from mdnum.audit.base import idle
+from mdnum.audit.base import Ways, idle
 from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.structures import Pair
 from mdnum.audit.subject import CalculatorSubject
@@ -40,7 +40,7 @@ def checked(asked: CalculatorSubject, routes: int = 0):
 
 def test_a_crossing_among_others_is_measured_to_the_last_bit():
     """Of a pair law, the jump among others is that of the two alone; more than were asked for are listed."""
-    around = walk_surroundings(subject(laws.hard, dozen()), idle, crossings=2, routes=1)
+    around = walk_surroundings(subject(laws.hard, dozen()), idle, Ways(), crossings=2, routes=1)
     measured = [one for one in around.events if one.threshold is not None]
     assert len(measured) == around.measured == 2 and not around.unexplained
     for event in measured:
@@ -50,9 +50,10 @@ def test_a_crossing_among_others_is_measured_to_the_last_bit():
 
 
 def test_crossings_beyond_the_number_that_is_measured_are_listed():
-    around = walk_surroundings(subject(laws.hard, Atoms("Ar8", grid(2, 2, 2))), idle, crossings=1, routes=0)
-    assert (around.measured, around.asked) == (1, around.possible)
-    assert ("1 more crossings of known thresholds", "1 were measured") in around.skipped
+    asked, ways = subject(laws.hard, Atoms("Ar8", grid(2, 2, 2))), Ways()
+    around = walk_surroundings(asked, idle, ways, crossings=1, routes=0)
+    assert (around.measured, ways.asked) == (1, ways.possible)
+    assert ("1 more crossings of known thresholds", "1 were measured") in ways.skipped
 
 
 def test_what_depends_on_three_is_found_where_two_show_nothing():
@@ -121,7 +122,7 @@ def test_pairs_that_were_not_walked_are_named(monkeypatch: pytest.MonkeyPatch):
 
 
 def crowded(most: int = NEIGHBORS, **options):
-    (found,) = crowd(subject(laws.soft, **options), idle, [], most)
+    (found,) = crowd(subject(laws.soft, **options), idle, Ways(), most)
     return found
 
 
@@ -161,7 +162,7 @@ def test_a_crowd_that_is_not_supported_is_made_smaller():
             super().calculate(atoms, *args, **kwargs)
 
     asked = CalculatorSubject("few", lambda: Few(laws.soft), Atoms("Ar8", grid(2, 2, 2)), kT=laws.KT)
-    (found,) = crowd(asked, idle, [], 8)
+    (found,) = crowd(asked, idle, Ways(), 8)
     assert found.neighbors == 4 and found.kept is None
 
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from mdnum.audit.checks.smoothness import place, reach, summary
+from mdnum.audit.checks.smoothness import figures, place, reach
 from mdnum.audit.curve import Curve, bisect, find_jumps, smallest_steps
 from mdnum.audit.record import load_calculator
 from mdnum.audit.structures import Pair, default_structure, trio
@@ -306,7 +306,7 @@ def test_the_smallest_step_is_reported():
     asked = Bare(laws.soft)
     low, high, half, everywhere = walked(asked).steps or (0,) * 4
     assert low < 1.5 and high == pytest.approx(R_CUT - 0.35, abs=0.1) and 0 < half <= everywhere < 1e-6
-    names, told = summary(walk_pairs(asked), EnvironmentWalks((), 0, (), ()), (), asked.kT)
+    (names, told), _ = figures(walk_pairs(asked), EnvironmentWalks((), 0, ()), (), asked.kT)
     assert names[-2:] == ["smoothness_least", "smoothness_least_but"] and told["beside"] == 0.35
     assert everywhere <= told["everywhere"] < 2 * everywhere + 1e-7
 

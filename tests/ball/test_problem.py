@@ -91,18 +91,6 @@ def test_forward_and_reverse_mode_agree():
             assert float(forward) == pytest.approx(float(reverse[name]), rel=1e-10, abs=1e-14)
 
 
-@pytest.mark.slow
-def test_the_loss_inside_value_and_grad_is_the_loss_of_the_run():
-    """Fenced arithmetic: differentiating does not compile another forward pass."""
-    for contact, integrator, names in CASES.values():
-        world = ball.World.create(contact, integrator)
-        problem = ball.BallProblem(world, HEIGHTS, 0.0, 300)
-        run = problem.run()
-        value, _ = problem.value_and_grad(names)
-        assert value == problem.value()
-        assert value == float(jnp.mean(jnp.asarray(run.final[0])))
-
-
 def test_imposed_decisions_pin_the_program():
     world = ball.World.create(ball.Projection(0.5, 0.5, ball.GlobalSum(1e-4)), ball.SemiImplicitEuler(0.01))
     problem = ball.BallProblem(world, 1.0, 0.0, 300, ball.ResidualPenetration(1))

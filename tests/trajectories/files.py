@@ -9,6 +9,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.errors import InputError
+from mdnum.trajectories.frame import FrameCheck
 
 SIDE = 9.0
 
@@ -71,3 +72,8 @@ def read(trajectory) -> tuple[list, InputError | None]:
     except InputError as error:
         return frames, error
     return frames, None
+
+
+def checked(frames, atoms=None, where=None) -> map:
+    """Frames that have been checked."""
+    return map(FrameCheck(atoms, where), frames)

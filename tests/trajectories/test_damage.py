@@ -18,13 +18,13 @@ from ase import Atoms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from MDAnalysisTests import datafiles
-from trajectories.files import images, read, text_of, written
+from trajectories.files import checked, images, read, text_of, written
 
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.binary import XtcFile, head_of
-from mdnum.trajectories.frame import FrameError, UnreadableFrame, checked
+from mdnum.trajectories.frame import FrameError, UnreadableFrame
 from mdnum.trajectories.source import open_trajectory, select
 
 warnings.filterwarnings("ignore", module="MDAnalysis")

@@ -6,9 +6,10 @@ import ase.io
 import numpy as np
 import pytest
 from ase import Atoms
+from trajectories.files import checked
 
 import mdnum
-from mdnum.trajectories.frame import Box, Frame, FrameError, checked, far_out, leap
+from mdnum.trajectories.frame import Box, Frame, FrameError, far_out, leap
 from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs, smallest_radius
 
 

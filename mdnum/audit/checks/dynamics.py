@@ -126,9 +126,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 def _only_molecules(subject: CalculatorSubject) -> bool:
     """Whether the calculator takes whole molecules alone, whose inner distances it does not know."""
-    return rigid(subject.atoms) is not None and isinstance(
-        subject.fresh().try_both(subject.atoms[:-1]), CalculatorError
-    )
+    return rigid(subject.atoms) is not None and not subject.fresh().answers(subject.atoms[:-1])
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def slope(
     off = np.abs(2 * _LADDER * (central - better[best + 1]))
     odd = np.append(False, off[1:] > 0.25 * off[:-1])
     rung = int(np.argmax(np.where(odd, off, 0.0)))
-    if odd[rung] and no_rounding(off[rung], plus[rung], 0.0, None, subject.kT):
+    if odd[rung] and no_rounding(off[rung], 0.0, (plus[rung], None), subject.kT):
         for sign, energies in ((1, plus), (-1, minus)):
             subject.again(displaced(atoms, sign * _LADDER[rung] * line), float(energies[rung]))
     # a difference that grows like 1/h down to the smallest h shows a step of the energy

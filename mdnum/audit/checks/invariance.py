@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
 from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
 from mdnum.audit.structures import group, nearest_distance
-from mdnum.audit.subject import CalculatorSubject, Forces, largest, rms
+from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 
 #: How many times the measured noise a difference may be: the largest of some hundred forces is seen, noise is
 #: a standard deviation, and another order of summation scatters more than moving along a line.
@@ -99,7 +99,7 @@ class InvarianceCheck(AuditCheck):
             if one.code == "NARROW_CELL" and error.cause is not None:
                 ways.skip(one.what, error.message)
                 # a calculator that takes four atoms in a wide cell only is safe
-                if not isinstance(subject.fresh().try_both(one.atoms), CalculatorError):
+                if subject.fresh().answers(one.atoms):
                     values = {"what": one.what, "why": error.message}
                     judge.notes.append(finding("NARROW_CELL_REFUSED", "info", **values))
             else:
@@ -197,8 +197,8 @@ class _Judge:
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
         self.atoms, self.noise = settled(self.worker, rng)
         self.notes: list[Observed] = []
-        self._known: dict[tuple[int, int], tuple[float, Forces, NoiseFloor]] = {}
-        self._bases: list[Atoms] = [self.atoms]
+        # by structures, which are kept so that their ids are theirs
+        self._known: dict[tuple[int, int], tuple[Atoms, float, Forces, NoiseFloor]] = {}
 
     def before(self, same: Same) -> Atoms:
         return self.atoms if same.before is None else same.before
@@ -221,15 +221,15 @@ class _Judge:
         self, worker: CalculatorSubject, same: Same, energy: float, forces: Forces, allowed: NoiseFloor
     ) -> tuple[_Difference, tuple[float, Forces]]:
         answer = worker.both(same.atoms)
-        force = largest(answer[1] - forces[same.order] @ same.turn.T)
-        return _Difference(same, abs(answer[0] / same.copies - energy), force, allowed), answer
+        here = answer[0] / same.copies, answer[1]
+        return _Difference(
+            same, *differences((energy, forces[same.order] @ same.turn.T), here), allowed
+        ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
         """Energy and forces of a structure, and what rounding of this size makes of them."""
-        if not any(base is one for one in self._bases):
-            self._bases.append(base)
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
-        key = (next(n for n, one in enumerate(self._bases) if one is base), power)
+        key = id(base), power
         if key not in self._known:
             worker = self.subject.fresh() if base is not self.atoms else self.worker
             if base is self.subject.atoms:
@@ -242,8 +242,8 @@ class _Judge:
                 if rounding:
                     noise = noise.louder(under_jitter(worker, base, 2.0**power, self._rng))
                 allowed = NoiseFloor(_ALLOWED * noise.energy, _ALLOWED * noise.force)
-            self._known[key] = *worker.both(base), allowed
-        return self._known[key]
+            self._known[key] = base, *worker.both(base), allowed
+        return self._known[key][1:]
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:

@@ -50,8 +50,9 @@ class SmoothnessCheck(AuditCheck):
         if not crowds and len(ways.skipped) == left:
             ways.skip("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
         kT = subject.kT
+        says, numbers = figures(walks, around, crowds, kT)
         return CheckResult(
-            says=summary(walks, around, crowds, kT),
+            says=says,
             findings=[
                 *_jumps(walks, around, kT),
                 *_among_many(around, kT, walks.not_walked),
@@ -60,7 +61,7 @@ class SmoothnessCheck(AuditCheck):
             ],
             tables=_tables(walks, around, crowds, kT),
             charts=_charts(walks, crowds, subject),
-            numbers=_numbers(walks, around, crowds, kT),
+            numbers=numbers,
             **vars(ways),
         )
 
@@ -82,30 +83,41 @@ def _two(threshold: PairThreshold) -> str:
     return f"two {one} atoms" if one == other else f"{one} and {other}"
 
 
-def summary(
+def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
-) -> tuple[list[str], dict[str, Any]]:
-    """Names of sentences, and their values."""
-    thresholds = _all(walks)
-    seen = [(one.order, one.jumps[0], one.jumps[1]) for one in thresholds]
+) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
+    """(names of sentences and their values, numbers)."""
+    # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
+    seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
-    seen = [one for one in seen if one[0] <= 5]
-    order = min((one[0] for one in seen), default=None)
-    energy = max((abs(one[1]) for one in seen if one[0] == 0), default=0.0)
+    step = max((abs(energy) for order, energy, _ in seen if order == 0), default=0.0)
+    force = max((abs(force) for order, _, force in seen if order <= 1), default=0.0)
+    numbers = {
+        "pairs": len(walks.walks), "pairs_not_walked": list(walks.not_walked), "thresholds": len(_all(walks)),
+        "cutoffs": {"-".join(walk.pair.species): walk.cutoff for walk in walks.walks},
+        "order": min((order for order, *_ in seen), default=None), "largest_energy_jump": step,
+        "largest_energy_jump_kT": step / kT if kT else None,
+        "largest_force_jump": max([force, *(max(one.force, one.order_force) for one in crowds)]),
+        "crossings_measured": around.measured,
+        "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
+        "routes": len(around.routes), "unexplained": sum(one.threshold is None for one in around.events),
+        "neighbors_kept": min((one.kept for one in crowds if one.kept), default=None),
+        "order_matters_from": min((one.order_from for one in crowds if one.order_from), default=None),
+        "neighbors_tried": max((one.neighbors for one in crowds), default=0),
+    }  # fmt: skip
+    # what is smooth up to the fifth derivative is not said to jump
+    order = min((order for order, *_ in seen if order <= 5), default=None)
     knots = max((walk.knots for walk in walks.walks), default=0)
     capped = [one for one in crowds if one.kept or one.order_from]
     cutoffs = sorted({f"{walk.cutoff:.6g}" for walk in walks.walks if walk.cutoff})
     worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
     says = ["walked" if walks.walks else "not_walked"]
-    values: dict[str, Any] = {
-        "pairs": len(walks.walks), "of": len(walks.walks) + len(walks.not_walked),
-        "thresholds": len(thresholds), "cutoffs": ", ".join(cutoffs), "energy": 1e3 * energy,
-        "kT": energy / kT if kT else None,
-        "force": max((abs(one[2]) for one in seen if one[0] <= 1), default=0.0),
-        "derivative": ORDERS[order] if order is not None else "", "knots": knots,
-        "not_walked": ", ".join(walks.not_walked),
+    values: dict[str, Any] = numbers | {
+        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs),
+        "energy": 1e3 * numbers["largest_energy_jump"], "kT": numbers["largest_energy_jump_kT"],
+        "force": force, "derivative": ORDERS[order] if order is not None else "",
+        "knots": knots, "not_walked": ", ".join(walks.not_walked), "neighbors": numbers["neighbors_tried"],
         "kept": min((one.kept or (one.order_from or 1) - 1 for one in capped), default=0),
-        "neighbors": max((one.neighbors for one in crowds), default=0),
     }  # fmt: skip
     says += ["ends"] if cutoffs else []
     says.append(f"jumps_{worst}" if order is None or order <= SMOOTH else "jumps_at_an_end")
@@ -117,12 +129,10 @@ def summary(
         low, half, everywhere = (max(one[k] for one in steps) for k in (0, 2, 3))
         high = min(one[1] for one in steps)
         if low < high:
-            says += ["least", "least_but"] if thresholds else ["least"]
-            values |= {
-                "low": low, "high": high, "beside": BESIDE, "half": _rounded_up(half),
-                "everywhere": _rounded_up(everywhere),
-            }  # fmt: skip
-    return [f"smoothness_{one}" for one in says], values
+            says += ["least", "least_but"] if _all(walks) else ["least"]
+            half, everywhere = _rounded_up(half), _rounded_up(everywhere)
+            values |= {"low": low, "high": high, "beside": BESIDE, "half": half, "everywhere": everywhere}
+    return ([f"smoothness_{one}" for one in says], values), numbers
 
 
 def _rounded_up(value: float) -> float:
@@ -285,30 +295,6 @@ def _tables(
         "Smallest step of the force that is found": steps,
         "Crowded atoms": crowded,
     }
-
-
-def _numbers(
-    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
-) -> dict[str, Any]:
-    thresholds = _all(walks)
-    steps = [abs(one.jumps[0]) for one in thresholds if one.order == 0]
-    steps += [abs(one.jump.energy) for one in around.events if one.jump.order == 0]
-    forces = [abs(one.jumps[1]) for one in thresholds if one.order <= 1]
-    forces += [one.force for one in around.events if one.jump.order <= 1]
-    forces += [max(one.force, one.order_force) for one in crowds]
-    orders = [one.order for one in thresholds] + [one.jump.order for one in around.events]
-    return {
-        "pairs": len(walks.walks), "pairs_not_walked": list(walks.not_walked), "thresholds": len(thresholds),
-        "cutoffs": {"-".join(walk.pair.species): walk.cutoff for walk in walks.walks},
-        "order": min(orders, default=None), "largest_energy_jump": max(steps, default=0.0),
-        "largest_energy_jump_kT": max(steps, default=0.0) / kT if kT else None,
-        "largest_force_jump": max(forces, default=0.0), "crossings_measured": around.measured,
-        "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
-        "routes": len(around.routes), "unexplained": sum(one.threshold is None for one in around.events),
-        "neighbors_kept": min((one.kept for one in crowds if one.kept), default=None),
-        "order_matters_from": min((one.order_from for one in crowds if one.order_from), default=None),
-        "neighbors_tried": max((one.neighbors for one in crowds), default=0),
-    }  # fmt: skip
 
 
 def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubject) -> list[Chart]:

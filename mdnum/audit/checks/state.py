@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from mdnum.audit.base import (
 )
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.structures import Pair, molecules, pairs, whole
-from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
+from mdnum.audit.subject import Answered, CalculatorSubject, Forces, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -396,73 +397,70 @@ class Alone:
         self.rows: list[dict[str, Any]] = []
         self.refused: list[tuple[str, CalculatorError]] = []
         self.structures: dict[str, Atoms] = {}
-        self._ask, self._noise = lambda there: subject.fresh().try_both(there), noise
+        self._subject, self._noise = subject, noise
         species = list(dict.fromkeys(atoms.symbols))
         single: dict[str, float] = {}
-        for symbol in species:
-            for periodic in (False, True):
-                one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-                answer = self._ask(one)
-                if not isinstance(answer, CalculatorError):
-                    single.setdefault(symbol, answer[0])
-                what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
-                self._add(what, answer, single.get(symbol), one)
+        for symbol, periodic in product(species, (False, True)):
+            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
+            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
+            energy = self._ask(what, one, single.get(symbol))
+            if energy is not None:
+                single.setdefault(symbol, energy)
         two = (species[0], species[-1])
         pair = Atoms(two, positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]], cell=[_BOX] * 3)
         expected = single[two[0]] + single[two[1]] if set(two) <= set(single) else None
-        self._add(f"{two[0]} and {two[1]} {_FAR:g} Å apart", self._ask(pair), expected, pair)
+        self._ask(f"{two[0]} and {two[1]} {_FAR:g} Å apart", pair, expected)
         cluster = atoms[: min(len(atoms), _CLUSTER)]
         cluster.pbc = False
         cluster.positions += 1.0 - cluster.positions.min(axis=0)
         cluster.set_cell([_BOX + float(np.ptp(cluster.positions, axis=0).max())] * 3)
-        near = self._ask(cluster)
+        near = subject.fresh().try_both(cluster)
         failed = isinstance(near, CalculatorError)
         # one that knows whole molecules alone takes nothing of which an atom is gone; one that fails on an
         # atom without neighbors may fail on the cluster, and takes the structure with a vacancy
         fewer = (atoms[:-1],) if failed else (cluster[:-1], atoms[:-1])
-        self.takes_atoms = any(not isinstance(self._ask(one), CalculatorError) for one in fewer)
+        self.takes_atoms = any(subject.fresh().answers(one) for one in fewer)
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
-        elif not self.takes_atoms:
-            self._molecules(atoms)
-        else:
+        elif self.takes_atoms:
             symbol = str(atoms.symbols[0])
             far = cluster + Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-            both = self._ask(far)
-            if not isinstance(both, CalculatorError):
-                both = both[0], both[1][-1:]
             expected = near[0] + single[symbol] if symbol in single else None
-            self._add(f"a {symbol} atom {_FAR:g} Å from a cluster", both, expected, far)
+            what = f"a {symbol} atom {_FAR:g} Å from a cluster"
+            self._ask(what, far, expected, lambda forces: forces[-1:])
+        else:
+            one = whole(atoms, molecules(atoms)[0])
+            one.positions += [1.0, 2.0, 3.0]
+            one.set_cell([_BOX] * 3)
+            both, formula = one + displaced(one, np.array([_FAR, 0.0, 0.0])), one.get_chemical_formula()
+            # within a molecule there are forces, on it as a whole there is none
+            felt = lambda forces: forces.reshape(-1, len(one), 3).sum(axis=1)  # noqa: E731
+            energy = self._ask(f"one {formula}", one, None, felt)
+            self._ask(f"two {formula} {_FAR:g} Å apart", both, energy and 2 * energy, felt)
 
-    def _molecules(self, atoms: Atoms) -> None:
-        """One molecule alone, and two far apart."""
-        one = whole(atoms, molecules(atoms)[0])
-        one.positions += [1.0, 2.0, 3.0]
-        one.set_cell([_BOX] * 3)
-        other = displaced(one, np.array([_FAR, 0.0, 0.0]))
-        formula, energy = one.get_chemical_formula(), None
-        for what, there in ((f"one {formula}", one), (f"two {formula} {_FAR:g} Å apart", one + other)):
-            answer = self._ask(there)
-            if not isinstance(answer, CalculatorError):
-                # within a molecule there are forces, on it as a whole there is none
-                answer = answer[0], answer[1].reshape(-1, len(one), 3).sum(axis=1)
-                energy = answer[0] if energy is None else energy
-            self._add(what, answer, None if energy is None else energy * len(there) / len(one), there)
-
-    def _add(self, what: str, answer: Answered, expected: float | None, atoms: Atoms) -> None:
-        """Take note of an answer; without an expected energy, only of its force."""
+    def _ask(
+        self,
+        what: str,
+        atoms: Atoms,
+        expected: float | None,
+        felt: Callable[[Forces], np.ndarray] = np.asarray,
+    ) -> float | None:
+        """The energy of a structure, of which note is taken; without an expected one, only of its force."""
+        answer = self._subject.fresh().try_both(atoms)
         if isinstance(answer, CalculatorError):
             self.refused.append((what, answer))
             if answer.cause is None:
                 self.structures["alone-failed"] = atoms
-            return
-        force, expected = largest(answer[1]), answer[0] if expected is None else expected
+            return None
+        energy, force = answer[0], largest(felt(answer[1]))
+        expected = energy if expected is None else expected
         allowed = _ALLOWED * max(self._noise.energy, _EPS * abs(expected))
         self.rows.append({
-            "atoms": what, "energy (eV)": answer[0], "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(answer[0] - expected) <= allowed,
+            "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
+            "adds up": abs(energy - expected) <= allowed,
             "no force": force <= _ALLOWED * max(self._noise.force, _EPS),
         })  # fmt: skip
+        return energy
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""

@@ -28,7 +28,7 @@ from mdnum.references.conformance.judge import (
     measures_well,
     truth,
     without_numbers,
-)  # fmt: skip
+)
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.questions import alike, questions
 from mdnum.references.conformance.questions import large as large_questions
@@ -281,19 +281,15 @@ def examine(
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report, session = examiner.report, examiner.session
-    deadline, answers, saved = (
-        deadline or Deadline(),
-        answers or CaseAnswers(),
-        saved or (lambda urgent: None),
-    )
+    deadline, answers = deadline or Deadline(), answers or CaseAnswers()
+    saved, progress = saved or (lambda urgent: None), progress or (lambda *_: None)
     far = apart and bool(tested.word)
     every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
     every += large_questions() if large and asked is None else ()
     report.questions = len(every)
     stopped = False
     for number, case in enumerate(every):
-        if progress is not None:
-            progress(number, len(every), {"phase": "asking", "unit": "cases"})
+        progress(number, len(every), {"phase": "asking", "unit": "cases"})
         result = answers.of(number, case)
         if stopped or (result is None and deadline.passed):
             continue
@@ -315,8 +311,7 @@ def examine(
         if not deadline.passed:
             report.refusals = _refusals(examiner)
         for number, failed in enumerate(report.failed):
-            if progress is not None:
-                progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
+            progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
             name = f"{failed.code} {failed.case.area} {failed.case.name}"
             smaller = answers.shrunk.get(name)
             if smaller is None and not deadline.passed:

@@ -182,6 +182,10 @@ def test_a_planted_wrong_decision_is_found(seed: int):
     assert found is not None and (found.step, found.subject) == (250, divmod(extra_key, atoms))
     assert (found.a, found.b) == (0, 1)
     assert first_difference(tape, tape) is None
+    # a tape that ended before is not different
+    assert first_difference(replace(extra, steps=249), replace(tape, steps=249)) is None
+    with pytest.raises(ValueError, match="20 and 21 atoms"):
+        first_difference(tape, replace(tape, atoms=21))
     start = first_difference(tape, replace(tape, first=first[1:]))
     assert start is not None and start.step == 0 and start.subject == divmod(first[0], atoms)
 
@@ -233,17 +237,3 @@ def test_what_cannot_be_certified_is_error():
     assert unsupported(liquid()) is None
     with pytest.raises(InputError, match="steps = -1"):
         ExactProgram(liquid()).run(-1)
-
-
-def test_only_the_first_step_that_differs_is_reported():
-    tape = DecisionTape(
-        20, 50, np.array([9]), np.array([10, 10, 30]), np.array([45, 47, 3]), np.array([True, True, True])
-    )
-    bare = replace(tape, step=tape.step[:0], key=tape.key[:0], entered=tape.entered[:0])
-    found = first_difference(bare, tape)
-    assert found is not None
-    assert (found.step, found.subject, found.also, (found.a, found.b)) == (10, (2, 5), 1, (0, 1))
-    # a tape that ended before is not different
-    assert first_difference(replace(bare, steps=9), tape) is None
-    with pytest.raises(ValueError, match="20 and 21 atoms"):
-        first_difference(tape, replace(tape, atoms=21))
