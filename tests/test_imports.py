@@ -69,22 +69,11 @@ def test_help_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize(
-    "verb",
-    [
-        ["run"],
-        ["audit"],
-        ["ball"],
-        ["fork"],
-        ["check", "pairs"],
-        ["conform"],
-        ["systems"],
-        ["report"],
-        ["doctor"],
-    ],
+    "verb", ["run", "audit", "ball", "fork", "check pairs", "conform", "systems", "report", "doctor"]
 )
-def test_help_of_a_verb_imports_nothing_that_it_would_run(verb: list[str]):
+def test_help_of_a_verb_imports_nothing_that_it_would_run(verb: str):
     """typer itself imports pydantic to read the options of a verb, in some versions."""
-    loaded = _modules_after("from mdnum.cli import main; main()", *verb, "--help")
+    loaded = _modules_after("from mdnum.cli import main; main()", *verb.split(), "--help")
     assert not (HEAVY - {"pydantic"}) & loaded
 
 

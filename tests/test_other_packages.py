@@ -126,18 +126,9 @@ def test_a_cutoff_runs_is_compared_and_certified(site, tmp_path):
 
 
 def test_a_cutoff_is_found_by_the_command_line(site, tmp_path):
+    chosen = "cutoff.kind=tilted"
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "mdnum",
-            "systems",
-            "check",
-            "pair/at-cutoff",
-            "--set",
-            "cutoff.kind=tilted",
-            "--json",
-        ],
+        [sys.executable, "-m", "mdnum", "systems", "check", "pair/at-cutoff", "--json", "--set", chosen],
         env={**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
         capture_output=True,
         text=True,

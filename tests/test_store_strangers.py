@@ -474,7 +474,7 @@ def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, sta
         run(None, resume=folder.path)
 
 
-@pytest.mark.parametrize("damages", [6, pytest.param(60, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("damages", [6, pytest.param(30, marks=pytest.mark.nightly)])
 def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch, damages):
     scripts = Path(__file__).resolve().parents[1] / "scripts"
     monkeypatch.syspath_prepend(str(scripts))

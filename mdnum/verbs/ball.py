@@ -385,9 +385,16 @@ def _iterations(view: BallView) -> Iterator[Finding]:
 
 def _remarks(view: BallView) -> Iterator[Finding]:
     """What the system file says that runs, and is probably not what was meant."""
+    from pydantic import ValidationError
+
     from mdnum.systems.ball import BallSpec, remarks
 
-    for code, values in remarks(BallSpec.model_validate(view.system)):
+    try:
+        spec = BallSpec.model_validate(view.system)
+    except ValidationError:
+        # the file is gone or was edited since, which is said where the folder is read
+        return
+    for code, values in remarks(spec):
         yield TEXTS.finding(code, **values)
 
 
