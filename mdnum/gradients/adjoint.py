@@ -360,8 +360,8 @@ def transposed(
             )
             frame = frame_of(at, order, around.matrix)
             scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
-            began = (part * length.astype(dtype) for part in origin)
-            return loss.observe(scaled, LossFrame(origin_step, *began, nan, nan), here)
+            x0, v0 = (part * length.astype(dtype) for part in origin)
+            return loss.observe(scaled, LossFrame(origin_step, x0, v0, nan, nan), here)
 
         nan, origin_step = origin.potential, origin.step
         one = jnp.ones((), jnp.float64)

@@ -111,11 +111,13 @@ def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], N
             progress(stretch.first + stretch.rows - 1, tape.steps)
     numbers, explicit, energetic = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
     by = [name for name in names if known(name)]
-    named = ({name: _by_name(simulation, *parts, name) for name in by} for parts in (explicit, energetic))
-    return Frames(np.concatenate(steps), np.concatenate(where), *numbers, *named)
+    named = [{name: _by_name(simulation, parts, name) for name in by} for parts in (explicit, energetic)]
+    columns: list[Any] = [np.concatenate(steps), np.concatenate(where), *numbers, *named]
+    return Frames(*columns)
 
 
-def _by_name(simulation: Simulation, model, scale, name: str) -> Float[np.ndarray, "frames *types"]:
+def _by_name(simulation: Simulation, by_all, name: str) -> Float[np.ndarray, "frames *types"]:
+    model, scale = by_all
     still, none = np.zeros((3, 0)), np.zeros(simulation.pair_types)
     rows = []
     for k in range(len(scale)):

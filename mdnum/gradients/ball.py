@@ -60,7 +60,8 @@ class BallMethod:
     ) -> Gradient:
         """A gradient of this method."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
-        notes, depends = ({name: one[k] for name, one in use.items()} for k in (1, 0))
+        notes = {name: one.note for name, one in use.items()}
+        depends = {name: one.depends for name, one in use.items()}
         return Gradient(self.name, self.description, value, gradient, notes, details, self.kind, depends)
 
 

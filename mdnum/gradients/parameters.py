@@ -236,7 +236,8 @@ class _Constant(Parameter):
 class _Number(Parameter):
     """A time of the integrator; `inside` and `outside` turn its unit of time into that of files and back."""
 
-    inside, outside = staticmethod(operator.mul), staticmethod(operator.truediv)
+    inside: Any = staticmethod(operator.mul)
+    outside: Any = staticmethod(operator.truediv)
 
     def value(self):
         number = float(getattr(self.simulation.integrator, self.key))
@@ -257,7 +258,8 @@ class _Number(Parameter):
 class _Rate(_Number):
     """One over a time."""
 
-    inside, outside = staticmethod(operator.truediv), staticmethod(operator.mul)
+    inside: Any = staticmethod(operator.truediv)
+    outside: Any = staticmethod(operator.mul)
 
 
 class _Temperature(Parameter):

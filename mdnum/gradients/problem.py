@@ -59,7 +59,8 @@ class Problem:
         # a loss that is no real number is refused before anything is run
         vector = jax.ShapeDtypeStruct((3, self.simulation.atoms), self.simulation.policy.dtype("state"))
         number = jax.ShapeDtypeStruct((), np.float64)
-        frame: Any = LossFrame(jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        frame = LossFrame(*shapes)
         made = jax.eval_shape(
             lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), frame
         )

@@ -86,7 +86,7 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
     record, rows = segment.record, segment.rows
     # the record has room for the longest stretch; powers of two, so that not every length is compiled for
     room = min(len(record.x), max(_LEAST_ROOM, 1 << (rows - 1).bit_length()))
-    kept = {}
+    kept: dict[str, Any] = {}
     for name in _COLUMNS:
         whole = np.asarray(getattr(record, name))
         kept[name] = np.zeros((room, *whole.shape[1:]), whole.dtype)
@@ -288,7 +288,7 @@ class ReversibleTape(RunTape):
         for made in way.stretches():
             self._compare(made)
             self.stretches += 1
-            columns = {name: np.asarray(getattr(made.record, name)) for name in _COLUMNS}
+            columns: Any = {name: np.asarray(getattr(made.record, name)) for name in _COLUMNS}
             yield TapeStretch(made.first, made.rows, **columns, x_before=made.x_before, table=made.table)
         # the first state, every bit of it
         for name in ("x", "v", "images"):

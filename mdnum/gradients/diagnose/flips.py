@@ -281,11 +281,12 @@ def _edge(
     near, far = (line.value(place) for place in (inside, beyond))
     if found is None:
         raise NumericalError(f"{name} = {far!r}: the run blew up")
+    i, j = found.subject
     value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
     value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
     return DecisionEdge(
-        side, len(line.known) - before, True, near, far, abs(near - value), found.step, *found.subject,
-        value_near, value_far, gradient_near, gradient_far,
+        side, len(line.known) - before, True, near, far, abs(near - value), found.step, i, j, value_near,
+        value_far, gradient_near, gradient_far,
     )  # fmt: skip
 
 
