@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
 from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
-from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
 
 K = ALPHA = 0.5
 DEPTH = 0.45
