@@ -61,7 +61,7 @@ class Convergence:
 
 def converge(
     world: World,
-    exact: Callable[[float], ExactImpact | ExactPenalty],
+    exact: Callable[[float], ExactPenalty],
     y0: Float[np.ndarray, "balls"],
     time: float,
     counts: Sequence[int],
