@@ -80,6 +80,7 @@ def test_help_says_the_question_and_how_to_read_the_answer(name: str, monkeypatc
     assert "How to read it." in text
 
 
+@pytest.mark.nightly
 def test_hard_and_shifted_cutoffs_flip_alike_and_conserve_differently(tmp_path: Path) -> None:
     words = ["argon/crystal-108", "--steps", "150", "--kinds", "hard", "shifted", "switched"]
     table = study("cutoff_sensitivity", *words, "--scales", "1", "-o", "c.png", cwd=tmp_path)
@@ -102,6 +103,7 @@ def test_a_cutoff_study_refuses_a_potential_without_one(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.nightly
 def test_blind_rebuilds_lose_pairs_and_checked_ones_do_not(tmp_path: Path) -> None:
     words = ["argon/langevin-500", "--steps", "200", "--skins", "0.3", "--every", "0", "100"]
     table = study("skin_sensitivity", *words, "-o", "s.svg", cwd=tmp_path)
@@ -172,6 +174,7 @@ def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
     assert is_png(tmp_path / "b.png")
 
 
+@pytest.mark.nightly
 def test_a_ball_answers_to_its_knobs(tmp_path: Path) -> None:
     words = ["--points", "9", "--factors", "0.9", "1", "2"]
     table = study("ball_sensitivity", *words, "-o", "k.png", cwd=tmp_path)
@@ -206,6 +209,7 @@ def test_a_projection_that_cannot_converge_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.nightly
 def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path) -> None:
     words = ["--sums", "bfloat16", "--orders", "sequential", "pairwise", "--steps", "60", "-o", "p.png"]
     table = study("termination_precision", *words, cwd=tmp_path)
@@ -233,6 +237,7 @@ def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path)
     assert is_png(tmp_path / "p.png")
 
 
+@pytest.mark.nightly
 def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Path) -> None:
     words = ["--steps", "1300", "--roles", "force", "accumulate", "--repeats", "0", "-o", "f.png"]
     table = study("precision_fork", *words, cwd=tmp_path)
@@ -244,6 +249,7 @@ def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Pa
     assert is_png(tmp_path / "f.png")
 
 
+@pytest.mark.nightly
 def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> None:
     words = ["--reductions", "sequential", "reversed", "exact", "--steps", "60", "-o", "r.png"]
     table = study("reduction_order", *words, cwd=tmp_path)
@@ -304,6 +310,7 @@ def test_a_gradient_in_float32_agrees_with_one_in_float64_over_a_short_horizon(t
     assert is_png(tmp_path / "g.png")
 
 
+@pytest.mark.nightly
 def test_fewer_frames_and_fewer_decimals_lose_flips(tmp_path: Path) -> None:
     words = ["--steps", "200", "--strides", "1,20", "--decimals", "3,2", "-o", "f.png"]
     table = study("flips_of_a_trajectory", *words, cwd=tmp_path)

@@ -57,7 +57,7 @@ def test_flips_are_those_of_the_trajectory(tmp_path, name):
     check(tmp_path, name, STEPS.get(name, 12))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in LONGER else pytest.mark.nightly) for n in names("md")]

@@ -112,7 +112,9 @@ def test_a_mixture_in_a_tilted_box(tmp_path, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", CUTOFFS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.nightly) for k in CUTOFFS]
+)
 @pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
 def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
     atoms = liquid(rattle=0.05)

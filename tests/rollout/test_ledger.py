@@ -207,10 +207,10 @@ def test_a_free_cloud_that_collapses_makes_its_list_grow_on_the_way(tmp_path):
     "tilt, pbc",
     [
         (True, (True, True, False)),
-        pytest.param(True, (True, True, True), marks=pytest.mark.slow),
-        pytest.param(False, (True, False, False), marks=pytest.mark.slow),
+        pytest.param(True, (True, True, True), marks=pytest.mark.nightly),
+        pytest.param(False, (True, False, False), marks=pytest.mark.nightly),
         pytest.param(True, (False, False, True), marks=pytest.mark.slow),
-        pytest.param(False, (False, False, False), marks=pytest.mark.slow),
+        pytest.param(False, (False, False, False), marks=pytest.mark.nightly),
     ],
 )
 def test_boxes_of_every_kind(tmp_path, tilt, pbc):
@@ -224,7 +224,9 @@ def test_boxes_of_every_kind(tmp_path, tilt, pbc):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compare", ["r2 <=", "r <", "r <="])
+@pytest.mark.parametrize(
+    "compare", ["r <=", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("r2 <=", "r <"))]
+)
 def test_every_convention(tmp_path, compare):
     path = write_system(tmp_path, liquid(), cutoff={"compare": compare}, dynamics={"temperature": 2.0})
     result, folder = go(tmp_path, path, 70, save_every=1)
@@ -232,7 +234,7 @@ def test_every_convention(tmp_path, compare):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(2, 6))])
 def test_random_mixtures(tmp_path, seed):
     """Two species with cutoffs of their own, any box, any kind of cutoff."""
     rng = np.random.default_rng(seed)
