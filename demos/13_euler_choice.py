@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from mdnum.ball import (
     BallVerlet,
-    ExactImpact,
     ExactPenalty,
     ExplicitEuler,
     ImplicitMidpoint,

@@ -19,24 +19,24 @@ _HOMES = {
     "MdnumCalculator": "mdnum.references:MdnumCalculator",
     "MdnumError": "mdnum.errors:MdnumError",
     "NumericalError": "mdnum.errors:NumericalError",
-    "audit_calculator": "mdnum.verbs:audit",
-    "bounce": "mdnum.verbs:bounce",
+    "audit_calculator": "mdnum.verbs.audit:audit",
+    "bounce": "mdnum.verbs.ball:bounce",
     "build": "mdnum.systems:build",
-    "conform": "mdnum.verbs:conform",
-    "demonstrate": "mdnum.verbs:demonstrate",
+    "conform": "mdnum.verbs.conform:conform",
+    "demonstrate": "mdnum.verbs.demos:demonstrate",
     "diagnose": "mdnum.doctor:diagnose",
-    "flips": "mdnum.verbs:flips",
-    "fork": "mdnum.verbs:fork",
-    "fork_benign": "mdnum.verbs:fork_benign",
-    "fork_certify": "mdnum.verbs:fork_certify",
-    "fork_folders": "mdnum.verbs:fork_folders",
-    "fork_forecast": "mdnum.verbs:fork_forecast",
-    "fork_map": "mdnum.verbs:fork_map",
-    "fork_processes": "mdnum.verbs:fork_processes",
-    "fork_screen": "mdnum.verbs:fork_screen",
-    "grad": "mdnum.verbs:grad",
+    "flips": "mdnum.verbs.flips:flips",
+    "fork": "mdnum.verbs.fork:fork",
+    "fork_benign": "mdnum.verbs.fork:fork_benign",
+    "fork_certify": "mdnum.verbs.fork_certify:fork_certify",
+    "fork_folders": "mdnum.verbs.fork:fork_folders",
+    "fork_forecast": "mdnum.verbs.fork_map:fork_forecast",
+    "fork_map": "mdnum.verbs.fork_map:fork_map",
+    "fork_processes": "mdnum.verbs.fork_certify:fork_processes",
+    "fork_screen": "mdnum.verbs.fork:fork_screen",
+    "grad": "mdnum.verbs.grad:grad",
     "load": "mdnum.systems:load",
-    "run": "mdnum.verbs:run",
+    "run": "mdnum.verbs.run:run",
     "systems": "mdnum.systems",
 }
 
@@ -51,21 +51,21 @@ if TYPE_CHECKING:
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
-    from mdnum.verbs import audit as audit_calculator
-    from mdnum.verbs import bounce as bounce
-    from mdnum.verbs import conform as conform
-    from mdnum.verbs import demonstrate as demonstrate
-    from mdnum.verbs import flips as flips
-    from mdnum.verbs import fork as fork
-    from mdnum.verbs import fork_benign as fork_benign
-    from mdnum.verbs import fork_certify as fork_certify
-    from mdnum.verbs import fork_folders as fork_folders
-    from mdnum.verbs import fork_forecast as fork_forecast
-    from mdnum.verbs import fork_map as fork_map
-    from mdnum.verbs import fork_processes as fork_processes
-    from mdnum.verbs import fork_screen as fork_screen
-    from mdnum.verbs import grad as grad
-    from mdnum.verbs import run as run
+    from mdnum.verbs.audit import audit as audit_calculator
+    from mdnum.verbs.ball import bounce as bounce
+    from mdnum.verbs.conform import conform as conform
+    from mdnum.verbs.demos import demonstrate as demonstrate
+    from mdnum.verbs.flips import flips as flips
+    from mdnum.verbs.fork import fork as fork
+    from mdnum.verbs.fork import fork_benign as fork_benign
+    from mdnum.verbs.fork import fork_folders as fork_folders
+    from mdnum.verbs.fork import fork_screen as fork_screen
+    from mdnum.verbs.fork_certify import fork_certify as fork_certify
+    from mdnum.verbs.fork_certify import fork_processes as fork_processes
+    from mdnum.verbs.fork_map import fork_forecast as fork_forecast
+    from mdnum.verbs.fork_map import fork_map as fork_map
+    from mdnum.verbs.grad import grad as grad
+    from mdnum.verbs.run import run as run
 
 __all__ = [
     "CapacityError",

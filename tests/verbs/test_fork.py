@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import json
-import sys
 import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
@@ -28,7 +28,7 @@ from mdnum.systems.load import copy
 from mdnum.verbs import fork_pair, frame
 
 #: `mdnum.verbs.fork` is the function.
-MODULE = sys.modules["mdnum.verbs.fork"]
+MODULE = importlib.import_module("mdnum.verbs.fork")
 STEPS = 680
 #: Free runs only.
 BARE: dict[str, Any] = {"counterfactual": False, "repeats": 0}
