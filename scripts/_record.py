@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mdnum.rollout.checks import ListHealth
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder, flip_columns
+from mdnum.rollout.summary import ListHealth
 from mdnum.systems import Simulation
 
 Columns = dict[str, np.ndarray]

@@ -19,7 +19,7 @@ from command_line import Recorder, call, printed
 
 import mdnum
 from mdnum.cli import main, output
-from mdnum.cli.progress import ProgressBar, describe
+from mdnum.cli.output import ProgressBar, describe
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
 from mdnum.report.finding import restore

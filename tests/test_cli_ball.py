@@ -10,7 +10,7 @@ import pytest
 from command_line import Recorder, call, printed
 
 import mdnum
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.output import ProgressBar
 from mdnum.errors import InputError
 from mdnum.verbs import demos
 from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, table

@@ -12,7 +12,7 @@ from command_line import call, printed
 
 import mdnum
 from mdnum.cli.fork import interval
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.output import ProgressBar
 from mdnum.errors import InputError
 from mdnum.forks.choices import shipped
 from mdnum.forks.exact import program

@@ -14,10 +14,17 @@ from ase import Atoms
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.numerics import Ledger
-from mdnum.rollout.checks import EnergyBudget, ListHealth
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
-from mdnum.rollout.summary import RunTally, closest_pair, log_line, series_columns, summarize
+from mdnum.rollout.summary import (
+    EnergyBudget,
+    ListHealth,
+    RunTally,
+    closest_pair,
+    log_line,
+    series_columns,
+    summarize,
+)
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 from mdnum.systems.build import Simulation, build

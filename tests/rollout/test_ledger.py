@@ -21,7 +21,7 @@ from rollout.harness import (
 
 from mdnum.md.neighbors import VerletList
 from mdnum.numerics import Ledger
-from mdnum.rollout.checks import EnergyBudget
+from mdnum.rollout.summary import EnergyBudget
 from mdnum.systems import load
 
 
