@@ -359,7 +359,7 @@ def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:
         raise InputError(
             "many-body potentials are evaluated in float64 only", remedy="Remove the [precision] table"
         )
-    radius = float(potential.r_cut)
+    radius = float(potential.r_cut)  # type: ignore[attr-defined]
     check_radius(simulation.cell, radius, simulation.rule.skin)
     decider = PairDecider((radius,), "r <", "float64", simulation.decider.reach)
     return replace(simulation, model=potential, decider=decider)
