@@ -285,6 +285,33 @@ class EnergyFunction(ManyBody):
     def energy(self, positions, neighbor, cell):
         return self.function(self.parameters, positions, neighbor, cell)
 
+    def check_cell(
+        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
+    ) -> None:
+        """Raise if the function does not follow the cell it is given.
+
+        jax_md.space's own displacements swallow the keyword and keep the box they were made with: energies
+        look right and stresses are silently wrong. Shifting one atom by a lattice vector of a slightly
+        larger cell must not change the energy in that cell.
+
+        Raises:
+            InputError: it does not.
+        """
+        larger = cell * 1.03125
+        axis = next((axis for axis in range(3) if self.pbc[axis]), None)
+        if axis is None:
+            return
+        points = np.asarray(positions)
+        moved = points.copy()
+        moved[0] += np.asarray(larger)[axis]
+        here, there = (float(self.energy(jnp.asarray(one), neighbor, larger)) for one in (points, moved))
+        if not abs(here - there) <= 1e-6 * max(abs(here), 1.0):
+            raise InputError(
+                f"{self.name}: the energy function ignores the cell it is given (a move by a lattice vector "
+                f"changes the energy from {here:g} to {there:g})",
+                remedy="build it on mdnum.md.jaxmd.displacement instead of a space of jax_md.space",
+            )
+
 
 def from_jax_md(
     energy_fn: Callable[..., Array], r_cut: float, format: Format = "dense", **declared: Any
@@ -292,7 +319,7 @@ def from_jax_md(
     """Wrap a jax-md energy function `energy_fn(positions, neighbor, cell=...)`.
 
     Build it on `mdnum.md.jaxmd.displacement(cell, pbc)` (a space of jax_md.space ignores the cell it is
-    given: energies look right, stresses are silently wrong) and hand its constants in as
+    given: energies look right, stresses are silently wrong; `check_cell` tells) and hand its constants in as
     `mdnum.md.jaxmd.scalar(...)`: anything else becomes float32 in silence. The function must test r < r_cut
     itself, or its energy depends on when the list was built.
 

@@ -19,6 +19,7 @@ from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.lattice import Lattice, LatticeDecider, LatticeForce, LatticeStep, on_lattice
+from mdnum.md.manybody import ManyBody
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
@@ -342,6 +343,26 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         integrator,
     )
     return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation
+
+
+def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:
+    """The system with another potential: any energy over a neighbor list, such as one of jax-md's.
+
+    Args:
+        simulation: the system as objects; in float64.
+        potential: an `EnergyFunction`, or another of `mdnum.md.manybody`.
+
+    Raises:
+        InputError: its radius and the skin do not fit the box, or the system is not in float64 throughout.
+    """
+    if simulation.policy != PrecisionPolicy():
+        raise InputError(
+            "many-body potentials are evaluated in float64 only", remedy="Remove the [precision] table"
+        )
+    radius = float(potential.r_cut)  # type: ignore[attr-defined]
+    check_radius(simulation.cell, radius, simulation.rule.skin)
+    decider = PairDecider((radius,), "r <", "float64", simulation.decider.reach)
+    return replace(simulation, model=potential, decider=decider)
 
 
 def _in_whole_numbers(simulation: Simulation) -> Simulation:

@@ -91,6 +91,7 @@ def test_arguments_are_read_and_written_alike(word: str):
         ("builder=cuda", "no list builder"),
         ("translate=0", "other than 0"),
         ("noise=-1", "negative"),
+        ("relabel=-1", "negative"),
         ("noise@exact", "no choice"),
         ("stop=never", "no rule"),
         ("max_iter=0", "0 change nothing"),

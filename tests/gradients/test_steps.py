@@ -21,8 +21,11 @@ from mdnum.gradients.problem import Problem
 from mdnum.gradients.recorded import EventAware, Forward, Symmetric
 from mdnum.gradients.tape import KEPT, RunTape
 from mdnum.gradients.unrolled import Unrolled, departure, marks
+from mdnum.md.jaxmd import neighbor_vectors
+from mdnum.md.manybody import EnergyFunction
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
+from mdnum.systems.build import with_potential
 
 SCALARS = ("timestep", "temperature", "scale")
 
@@ -205,6 +208,54 @@ def test_silicon_has_the_derivatives_of_differences_and_of_jax(silicon):
 def test_flips_of_any_energy_are_refused(silicon):
     with pytest.raises(InputError, match="pair potentials"):
         EventAware()(silicon, ("x0",))
+
+
+ONSET, RADIUS = 1.8, 2.2
+
+
+def lennard_jones(parameters, positions, neighbor, cell):
+    """A switched Lennard-Jones energy, written by somebody who knows nothing of this package."""
+    d = neighbor_vectors(positions, neighbor.idx, cell, (True, True, True))
+    real = neighbor.idx < positions.shape[0]
+    r = jnp.sqrt(jnp.where(real, jnp.sum(d * d, axis=-1), 1.0))
+    s6 = (parameters["size"] / r) ** 6
+    t = jnp.clip((r - ONSET) / (RADIUS - ONSET), 0.0, 1.0)
+    smooth = 1 - 10 * t**3 + 15 * t**4 - 6 * t**5
+    inside = real & (r < RADIUS)
+    return 0.5 * jnp.sum(jnp.where(inside, 4 * parameters["depths"][0] * (s6 * s6 - s6) * smooth, 0.0))
+
+
+@pytest.fixture(scope="module")
+def both():
+    """One system with the package's own pair potential, and with the same energy as a function."""
+    pairs = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": RADIUS, "onset": ONSET}))
+    constants = {"size": jnp.asarray(1.0), "depths": jnp.asarray([1.0])}
+    function = with_potential(pairs, EnergyFunction(constants, lennard_jones, RADIUS))
+    return [Problem(one, everything(one.atoms), 40) for one in (pairs, function)]
+
+
+@pytest.mark.slow
+def test_any_energy_has_the_derivatives_of_the_closed_forms(both):
+    of_pairs, of_function = both
+    assert "potential.parameters.size" in parameters.names(of_function.simulation)
+    shared = ("timestep", "temperature", "scale", "x0", "v0")
+    theirs = Symmetric()(of_pairs, ("sigma", "epsilon", *shared))
+    ours = Symmetric()(of_function, ("size", "potential.parameters.depths", *shared))
+    assert ours.value == pytest.approx(theirs.value, rel=1e-9)
+    expected = dict(theirs.gradient)
+    expected["potential.parameters.size"] = expected.pop("potential.sigma")
+    expected["potential.parameters.depths"] = expected.pop("potential.epsilon").reshape(1)
+    assert expected.keys() == ours.gradient.keys()
+    # two programs, that have grown apart by rounding for 40 steps
+    alike(ours.gradient, expected)
+
+
+@pytest.mark.slow
+def test_tangents_of_any_energy_agree_with_its_reverse_pass(both):
+    simulation = both[1].simulation
+    by_numbers = [name for name in parameters.names(simulation) if not name.startswith("initial.")]
+    ours, theirs = Forward()(both[1], by_numbers), Symmetric()(both[1], by_numbers)
+    alike(ours.gradient, theirs.gradient)
 
 
 # --- answers that no code of the package enters -----------------------------------------------------

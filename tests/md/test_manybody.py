@@ -290,6 +290,27 @@ def test_any_jax_md_energy_function_runs_in_every_format(format):
     np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
     assert math.isnan(potential.smoothness.energy_jump)
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions, format)
+    potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
+
+
+@pytest.mark.jax_md
+def test_an_energy_function_that_ignores_the_cell_is_found_out():
+    from jax_md import energy as jax_md_energy
+    from jax_md import space
+
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
+    atoms.rattle(0.2, seed=5)
+    own_box, _ = space.periodic(jaxmd.scalar(3 * 5.26))
+    constants = {"sigma": 3.405, "epsilon": 0.0103, "r_onset": 1.5, "r_cutoff": 1.9}
+    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
+        own_box, 1.0, **{name: jaxmd.scalar(value) for name, value in constants.items()},
+        neighbor_list_fn=lambda *_, **__: None,
+    )  # fmt: skip
+    potential = manybody.from_jax_md(energy_fn, 6.5, "dense", name="boxed")
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions)
+    with pytest.raises(InputError, match="boxed: the energy function ignores the cell"):
+        potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
 
 
 def test_setfl_keeps_every_digit(tmp_path):

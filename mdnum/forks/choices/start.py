@@ -71,6 +71,10 @@ class Relabel(Summed):
     screened = "relabel relabel@exact"
     seed: int = 1
 
+    def __post_init__(self):
+        super().__post_init__()
+        check(self.seed >= 0, f"seed {self.seed} is negative", "relabel")
+
     def make(self, system: System) -> Twin:
         applies(not is_langevin(system), "the thermostat's noise belongs to labels: other atoms would get it")
         a = built(system, self.both)
