@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.store import RunFolder
+from mdnum.store.files import write_text
 
 TOML = """about = "Liquid argon (Rahman 1964), 864 atoms at 94.4 K, hard cutoff."
 units = "metal"
@@ -51,7 +52,7 @@ def make_run(
     center = RADIUS + rng.normal(0, 0.45, count)
 
     folder = RunFolder.create(path)
-    folder.write_system(toml)
+    write_text(folder.path / "system.toml", toml)
     base = int(27.3 * atoms) - count // 2
     before, energy, start, moved, first_list = None, 0.0, 0, 0.0, 0
     rows: list[dict[str, Any]] = []

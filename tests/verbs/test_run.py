@@ -17,6 +17,7 @@ from mdnum.errors import FolderError
 from mdnum.report import analysis, drawing
 from mdnum.rollout.summary import LineFit
 from mdnum.store import RunFolder
+from mdnum.store.files import write_text
 from mdnum.verbs import frame
 from mdnum.verbs.run import judge
 from mdnum.verbs.run_page import TABLE_ROWS, TEXTS, RunView, page
@@ -176,7 +177,7 @@ def test_a_killed_run_is_judged_up_to_its_checkpoint(tmp_path):
 
 def test_a_folder_without_a_step_is_an_error(tmp_path):
     folder = RunFolder.create(tmp_path / "run")
-    folder.write_system('units = "lj"')
+    write_text(folder.path / "system.toml", 'units = "lj"')
     with pytest.raises(FolderError, match="holds no step of a run"):
         frame.finish(folder)
 
@@ -266,7 +267,7 @@ def test_bad_numbers_do_not_break_the_page(tmp_path):
         columns[name] = columns[name].copy()
         columns[name][-1] = np.nan
     broken = RunFolder.create(tmp_path / "broken")
-    broken.write_system(folder.system_toml)
+    write_text(broken.path / "system.toml", folder.system_toml)
     broken.append("series", columns)
     broken.append("flips", folder.read("flips"))
     broken.finalize()
