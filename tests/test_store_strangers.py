@@ -463,7 +463,7 @@ def test_scripts_of_a_person_stay(tmp_path):
     ],
 )
 def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, state, advice):
-    from mdnum.verbs import run
+    from mdnum import run
 
     folder = RunFolder.create(tmp_path / "killed", world=world)
     folder.write_provenance({})

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 import mdnum
+from mdnum import bounce, run
 from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
 from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
-from mdnum.verbs import ball_record, bounce, frame, run
+from mdnum.verbs import ball_record, frame
 from mdnum.verbs.ball import VERBS, differs, judge
 from mdnum.verbs.ball_page import TEXTS, BallView, page
 from mdnum.verbs.frame import Outcome
