@@ -73,7 +73,7 @@ def test_only_the_radius_costs_a_compilation():
     plain = build("argon/crystal-108")
 
     def run(simulation):
-        list(Engine(simulation, 20).segments())
+        list(Engine(simulation, 120).segments())
 
     run(plain)
     run(dial(plain, "r_cut").turn(plain, 1.5))
