@@ -73,7 +73,7 @@ def test_no_number_costs_a_compilation():
     plain = build("argon/crystal-108")
 
     def run(simulation):
-        list(Engine(simulation, 20).segments())
+        list(Engine(simulation, 120).segments())
 
     run(plain)
     before = run_epoch._cache_size()

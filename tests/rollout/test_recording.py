@@ -14,7 +14,7 @@ from mdnum.rollout.epoch import EpochRecord
 from mdnum.systems import load
 from mdnum.systems.build import build
 
-STEPS = 150
+STEPS = 120
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +101,10 @@ def test_record_buffers_do_not_grow_with_the_steps(path):
     assert len(set(sizes)) == 1
     assert sizes[0] <= _RECORD_BYTES
     rows = []
-    for segment in Engine(simulation, 400).segments():
+    for segment in Engine(simulation, STEPS).segments():
         rows.append(segment.rows)
         assert segment.record.x.shape[0] <= _MOST_ROWS
-    assert sum(rows) == 401
+    assert sum(rows) == STEPS + 1
     # a large system gets fewer rows, not more memory
     engine = Engine(simulation, 10**6)
     engine.simulation = SimpleNamespace(atoms=200_000, policy=simulation.policy)
