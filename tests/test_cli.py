@@ -315,41 +315,6 @@ def test_a_real_run_its_report_and_its_resumption(crystal: str, capsys: pytest.C
     assert json.loads(capsys.readouterr().out)["steps"] == 40
 
 
-_FLYING = """2
-Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3 pbc="T T T"
-Ar 1.0 1.0 1.0
-Ar {x} 1.0 1.0
-"""
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "run pair/leaving-well --steps 2 --no-report",
-        "run pair/at-cutoff --steps 2 --no-report",
-        "check energy pair/at-cutoff",
-        "check pairs pair/at-cutoff",
-        "flips flying.extxyz --cutoff 2.5 --no-report",
-        "flips flying.extxyz other.extxyz --cutoff 2.5 --no-report",
-        "ball ball/drop --steps 20 --no-report",
-        "fork ball/drop --vary precision --steps 20 --no-report",
-    ],
-)
-def test_the_exit_code_of_a_verb_is_that_of_the_worst_it_says(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """Whatever is good to know is no reason to fail."""
-    monkeypatch.chdir(tmp_path)
-    for name, first in (("flying", 3.0), ("other", 3.1)):
-        frames = "".join(_FLYING.format(x=first + 0.3 * k) for k in range(4))
-        (tmp_path / f"{name}.extxyz").write_text(frames)
-    code = call(*words.split(), "--json")
-    document = json.loads(capsys.readouterr().out)
-    severities = {finding["severity"] for finding in document.get("findings", ())}
-    complete = document.get("status", "complete") == "complete" and document.get("ok", True)
-    assert code == (1 if severities & {"warning", "error"} or not complete else 0)
-
-
 def test_what_is_good_to_know_leaves_the_exit_code_alone():
     found = [restore({"severity": severity}) for severity in ("info", "warning", "error")]
     assert [output.exit_code(found[:n]) for n in range(4)] == [0, 0, 1, 1]

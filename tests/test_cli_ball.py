@@ -162,7 +162,7 @@ def test_a_real_run_and_its_report(tmp_path: Path, monkeypatch, capsys: pytest.C
     monkeypatch.chdir(tmp_path)
     code = call(
         "ball", "ball/batch-on-the-boundary", "--set", "variants={}",
-        "--set", 'gradient.methods=["unrolled"]', "--against", "precision.reduction=exact",
+        "--set", "gradient.of=[]", "--against", "precision.reduction=exact",
         "-o", "here", "--json",
     )  # fmt: skip
     assert code == 1, "decisions within rounding are a finding"

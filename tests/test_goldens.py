@@ -40,6 +40,7 @@ class Golden:
     needs: str = ""
     out: bool = True
     slow: bool = False
+    nightly: bool = False
     loose: float = EXACT
 
     def chosen(self) -> list[tuple[str, str, str]]:
@@ -47,6 +48,13 @@ class Golden:
         words = [word for one in self.numbers.split() for word in COMMANDS["numbers"].get(one, one).split()]
         parts = [word.partition("~") for word in words]
         return [(a.rpartition("=")[0] or a, a.rpartition("=")[2], tolerance) for a, _, tolerance in parts]
+
+    @property
+    def parameter(self) -> Any:
+        """The test's parameter, in its call of pytest."""
+        return pytest.param(
+            self.name, marks=[pytest.mark.slow] * self.slow + [pytest.mark.nightly] * self.nightly
+        )
 
 
 BY_NAME = {name: Golden(name, **told) for name, told in COMMANDS["golden"].items()}
@@ -179,6 +187,10 @@ class Seen:
         if not isinstance(document, dict):
             document = {"rows": document}
         findings = [f"{one['severity']} {one['code']}" for one in document.get("findings") or ()]
+        # whatever is good to know is no reason to fail
+        complete = document.get("status", "complete") == "complete" and document.get("ok", True)
+        worst = {text.partition(" ")[0] for text in findings} & {"warning", "error"}
+        assert code == (1 if worst or not complete else 0), golden.name
         paths = [self.folder / golden.name / f"{name}.parquet" for name in golden.tables.split()]
         self.answers[golden.name] = {
             "exit": code,
@@ -196,9 +208,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
 
 # as a user calls it: dtypes are not strict
 @pytest.mark.jax_md
-@pytest.mark.parametrize(
-    "name", [pytest.param(one.name, marks=[pytest.mark.slow] * one.slow) for one in BY_NAME.values()]
-)
+@pytest.mark.parametrize("name", [one.parameter for one in BY_NAME.values()])
 def test_golden(name: str, seen: Seen, request, capsys, monkeypatch):
     monkeypatch.chdir(seen.folder)
     golden = BY_NAME[name]

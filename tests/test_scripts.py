@@ -35,8 +35,8 @@ STUDIES = (
     "topology_flip_report",
 )
 
-# every one starts a Python with jax and compiles; a minute on a busy machine
-pytestmark = pytest.mark.slow
+# every one compiles; and dtypes are not strict, as a user calls it
+pytestmark = [pytest.mark.slow, pytest.mark.jax_md]
 
 
 def study(name: str, *words: str, cwd: Path, code: int = 0) -> str:
@@ -54,6 +54,27 @@ def study(name: str, *words: str, cwd: Path, code: int = 0) -> str:
     return done.stdout if code == 0 else done.stderr
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """What a script prints, run in this process: jax and mdnum are not imported again for it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+    def run(name: str, *words: str, code: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+        ended: object = 0
+        try:
+            runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
+        except SystemExit as done:
+            ended = done.code or 0
+        out, err = capsys.readouterr()
+        assert ended == code, err
+        return err if code else out
+
+    return run
+
+
 def row(table: str, *first: str) -> list[str]:
     """The cells of the only line whose first cells are these."""
     lines = [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
@@ -68,14 +89,8 @@ def is_png(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_help_says_the_question_and_how_to_read_the_answer(name: str, monkeypatch, capsys) -> None:
-    # in this process: what the scripts import would be imported anew for each of them
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
-    with pytest.raises(SystemExit) as done:
-        runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
-    assert not done.value.code
-    text = capsys.readouterr().out
+def test_help_says_the_question_and_how_to_read_the_answer(name: str, here) -> None:
+    text = here(name, "--help")
     assert "?" in text.split("\n\n")[1]
     assert "How to read it." in text
 
@@ -96,8 +111,8 @@ def test_hard_and_shifted_cutoffs_flip_alike_and_conserve_differently(tmp_path: 
     assert is_png(tmp_path / "c.png")
 
 
-def test_a_cutoff_study_refuses_a_potential_without_one(tmp_path: Path) -> None:
-    text = study("cutoff_sensitivity", "silicon/stillinger-weber-512", cwd=tmp_path, code=2)
+def test_a_cutoff_study_refuses_a_potential_without_one(here, tmp_path: Path) -> None:
+    text = here("cutoff_sensitivity", "silicon/stillinger-weber-512", code=2)
     assert "carries its own cutoff" in text
     assert "Traceback" not in text
     assert not list(tmp_path.iterdir())
@@ -117,23 +132,21 @@ def test_blind_rebuilds_lose_pairs_and_checked_ones_do_not(tmp_path: Path) -> No
     assert (tmp_path / "s.svg").read_text().lstrip().startswith("<?xml")
 
 
-def test_flips_of_a_new_run_and_of_its_folder_are_the_same(tmp_path: Path) -> None:
+def test_flips_of_a_new_run_and_of_its_folder_are_the_same(here, tmp_path: Path) -> None:
     words = ["--busiest", "3", "-o", "t.png"]
-    made = study(
-        "topology_flip_report", "argon/crystal-108", "--steps", "150", "--folder", "run", *words, cwd=tmp_path
-    )
+    made = here("topology_flip_report", "argon/crystal-108", "--steps", "150", "--folder", "run", *words)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     flips = summary["flips_entered"] + summary["flips_left"]
     assert flips > 0
     assert row(made, "flips")[1].startswith(f"{flips:,}: ")
     assert (tmp_path / made.splitlines()[-1]).is_file()
     assert is_png(tmp_path / "t.png")
-    assert study("topology_flip_report", "run", *words, cwd=tmp_path) == made
+    assert here("topology_flip_report", "run", *words) == made
 
 
-def test_ase_agrees_and_searches_are_listed_with_where_they_stop(tmp_path: Path) -> None:
+def test_ase_agrees_and_searches_are_listed_with_where_they_stop(here, tmp_path: Path) -> None:
     words = ["argon/crystal-108", "--every-kind", "none", "--pairs", "argon/crystal-108"]
-    table = study("ase_comparison", *words, "-o", "a.png", cwd=tmp_path)
+    table = here("ase_comparison", *words, "-o", "a.png")
     compared = row(table, "argon/crystal-108", "hard")
     assert compared[-1] == "yes"
     assert float(compared[3]) <= 1e-12
@@ -203,8 +216,8 @@ def test_balls_are_timed_against_their_own_recorded_run(tmp_path: Path) -> None:
         assert float(row(printed, world)[4]) > 0
 
 
-def test_a_projection_that_cannot_converge_is_refused(tmp_path: Path) -> None:
-    text = study("ball_sensitivity", "--factors", "1", "9", cwd=tmp_path, code=2)
+def test_a_projection_that_cannot_converge_is_refused(here, tmp_path: Path) -> None:
+    text = here("ball_sensitivity", "--factors", "1", "9", code=2)
     assert "overshoots" in text and "below 8" in text
     assert not list(tmp_path.iterdir())
 
@@ -262,7 +275,7 @@ def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> N
     assert is_png(tmp_path / "r.png")
 
 
-def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(tmp_path: Path) -> None:
+def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(here, tmp_path: Path) -> None:
     columns = "system,cutoff,choice,asked,repeats,verdict,seed,fork,split,told,nats,steps,seconds,note"
     kept = "argon/crystal-108,hard,start,60,0,cause,0,7,11,,2.5,60,1.0,made up"
     # the second line is what a killed process leaves behind, the third what failed
@@ -271,7 +284,7 @@ def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(tmp_path: Path) -
     (tmp_path / "m.csv").write_text("\n".join((columns, kept, failed, torn)))
     words = ["--quick", "--steps", "60", "--kinds", "hard"]
     words += ["--choices", "start", "order", "translate=0.25", "noise", "-o", "m.png"]
-    table = study("fork_atlas", *words, cwd=tmp_path)
+    table = here("fork_atlas", *words)
     column = ["system", "cutoff", "choice", "verdict", "seed", "fork", "split", "told", "nats"].index
     name = ("argon/crystal-108", "hard")
     start, order = row(table, *name, "start"), row(table, *name, "order")

@@ -284,7 +284,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     asked = []
     note = lambda step, steps, info: asked.append(info["phase"])  # noqa: E731
     monkeypatch.setattr(frame, "logged", lambda folder, progress: note)
-    assert call(*words, "whole") == 0
+    assert call(*words, "whole", "--no-report") == 0
     expected = json.loads((tmp_path / "whole/summary.json").read_text())
     calls = (tmp_path / "calls").stat().st_size
     (tmp_path / "calls").unlink()
@@ -301,14 +301,14 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     assert "forces not asked" in (tmp_path / "cut/report.html").read_text()
     asked.clear()
     capsys.readouterr()
-    assert call("audit", "--resume", "cut") == 0 and set(asked) == {"forces"}
+    assert call("audit", "--resume", "cut", "--no-report") == 0 and set(asked) == {"forces"}
     resumed = json.loads((tmp_path / "cut/summary.json").read_text())
     assert without_times(resumed) == without_times(expected)
     one, other = (RunFolder.open(name).table("curves") for name in ("cut", "whole"))
     assert one.equals(other)
     # nothing is left
     asked.clear()
-    assert call("audit", "--resume", "cut") == 0 and not asked
+    assert call("audit", "--resume", "cut", "--no-report") == 0 and not asked
     assert RunFolder.open("cut").table("curves").equals(other)
     for more in (("-o", "x"), ("--checks", "curl"), ("mine.py:Other",)):
         assert call("audit", "--resume", "cut", *more) == 2
