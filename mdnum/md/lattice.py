@@ -203,10 +203,6 @@ class LatticeDecider(PairDecider):
         """Nothing is rounded, and no margin is zero."""
         return (0.0,) * len(self.r_cut)
 
-    def values(self) -> Array:
-        """The limits as integers."""
-        return jnp.asarray(self.limits, jnp.int64)
-
     def inside(self, quantity, value):
         return quantity < value
 
@@ -483,7 +479,7 @@ class LatticeForce(PairForce):
             model.astype(np.float64),
             cell.astype(np.float64),
             zero_bits(np.float64),
-            decider.values(),
+            jnp.asarray(decider.limits, jnp.int64),
             decider.convention,
             policy,
             reduction,
