@@ -140,7 +140,7 @@ class BallProgram:
             return None
         world = self.problem.world
         start = world.start(self.problem.y0, self.problem.v0)
-        imposed = BallDecisions(*map(np.array, undecided(world, start, steps)))
+        imposed = BallDecisions(*map(np.array, undecided(world, start, steps)))  # type: ignore[arg-type]
         for pin in self.pins:
             if pin.step > steps:
                 continue

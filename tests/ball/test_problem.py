@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -87,22 +88,30 @@ def test_the_unrolled_derivative_is_an_artifact_of_the_tolerance():
         assert slopes["k"] == pytest.approx(slope, rel=0.02)
 
 
+@eqx.filter_jit
+def both_modes(at, world):
+    """Gradients of the final height by reverse mode, and by forward mode."""
+
+    def loss(at):
+        return ball.loss_of(world.with_values(at), jnp.asarray(HEIGHTS), 0.0, 120, ball.FinalHeight())
+
+    return jax.grad(loss)(at), jax.jacfwd(loss)(at)
+
+
 @pytest.mark.slow
-def test_forward_and_reverse_mode_agree():
-    for contact, integrator, names in CASES.values():
-        problem = ball.BallProblem(ball.World.create(contact, integrator), HEIGHTS, 0.0, 120)
-
-        @jax.jit
-        def loss(at, world, problem=problem):
-            return ball.loss_of(world.with_values(at), jnp.asarray(HEIGHTS), 0.0, 120, problem.loss)
-
-        at = problem.values(names)
-        reverse = jax.grad(loss)(at, problem.world)
-        for name in names:
-            zero = {other: jnp.zeros_like(value) for other, value in at.items()}
-            along = {**zero, name: jnp.ones_like(at[name])}
-            _, forward = jax.jvp(lambda x, world=problem.world: loss(x, world), (at,), (along,))
-            assert float(forward) == pytest.approx(float(reverse[name]), rel=1e-10, abs=1e-14)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=[pytest.mark.nightly] * (x not in ("penalty", "smooth midpoint", "located")))
+        for x in CASES
+    ],
+)
+def test_forward_and_reverse_mode_agree(name):
+    contact, integrator, names = CASES[name]
+    world = ball.World.create(contact, integrator)
+    reverse, forward = both_modes({name: world.value(name) for name in names}, world)
+    for name in names:
+        assert float(forward[name]) == pytest.approx(float(reverse[name]), rel=1e-10, abs=1e-14)
 
 
 def test_imposed_decisions_pin_the_program():

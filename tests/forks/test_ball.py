@@ -168,7 +168,10 @@ def advanced(world: ball.World, start: ball.BallState) -> Any:
     return jax.lax.scan(step, start, length=60)[1]
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize(
+    "name",
+    ["per-instance", "located", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("global", "newton"))],
+)
 def test_a_run_on_which_nothing_in_particular_is_imposed_has_its_own_bits(name, runs):
     world, run = WORLDS[name], runs[name]
     y, v, *decided = (np.asarray(values) for values in advanced(world, world.start(STARTS)))
@@ -433,6 +436,7 @@ def test_other_steps_are_those_of_the_program(systems):
 # --- maps ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_boundaries_of_a_ball_are_adjacent_floats_with_the_decision_between_them(systems):
     found = boundaries(systems["batch"], "k", 0.45, 0.55, cells=8, most=3, confirm=False)
     assert found.boundaries and found.number.key == "k" and found.number.unit == ""

@@ -25,7 +25,7 @@ def found() -> Fork:
 @pytest.fixture(scope="module")
 def quick() -> Fork:
     """Two crystals 1e-6 apart, whose split hangs on several decisions."""
-    return followed(1e-6, 1500, split=0.03, back=True)
+    return followed(1e-6, 900, split=0.03, repeats=0, counterfactual=False)
 
 
 def test_the_decision_at_the_fork_alone(found):
