@@ -87,7 +87,7 @@ SILICON, COPPER = rattled("Si", "diamond", 5.43, 2), rattled("Cu", "fcc", 3.615,
             "ASE EAM",
             marks=pytest.mark.slow,
         ),
-        (SILICON, ({"kind": "tersoff"}, None, "metal"), "ASE"),
+        pytest.param(SILICON, ({"kind": "tersoff"}, None, "metal"), "ASE", marks=pytest.mark.slow),
         pytest.param(
             SILICON, ({"kind": "stillinger-weber"}, None, "metal"), "numpy", marks=pytest.mark.nightly
         ),
