@@ -178,46 +178,32 @@ def test_float32_is_not_taken_for_jumps():
     assert found.jumps[1] == pytest.approx(-law(R_CUT)[1], rel=1e-4)
 
 
+#: Words, a structure with its species where the one by default takes long to find, and (distance, order) of
+#: each threshold of two, from the calculators' own documentation and source.
+ASES_OWN = {
+    "lj": ("lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)", "Ar", [(8.5, 1)]),
+    "lj smooth": (
+        "lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5, ro=6.0, smooth=True)", "Ar", [(6.0, 2), (8.5, 2)],
+    ),
+    "morse": ("morse:MorsePotential(epsilon=0.5, r0=2.6)", "Ar", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
+    "tip3p": ("tip3p:TIP3P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
+    "tip4p": ("tip4p:TIP4P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
+    "emt": ("emt:EMT", None, [(5.8768, 0)]),
+    "eam": (f"eam:EAM(potential={str(COPPER)!r})", "Cu", [(5.50679, 1)]),
+    "tersoff": ("tersoff:Tersoff.from_lammps('silicon.tersoff')", "Si", [(2.7, 2), (3.0, 2)]),
+}  # fmt: skip
+LONG = ("tip4p", "eam", "tersoff")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "atoms", "expected"),
-    [
-        # (distance, order) of each threshold of two, from the calculators' own documentation and source
-        ("ase.calculators.lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)", "Ar", [(8.5, 1)]),
-        (
-            "ase.calculators.lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5, ro=6.0, smooth=True)",
-            "Ar",
-            [(6.0, 2), (8.5, 2)],
-        ),
-        ("ase.calculators.morse:MorsePotential(epsilon=0.5, r0=2.6)", "Ar", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
-        ("ase.calculators.tip3p:TIP3P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
-        pytest.param(
-            "ase.calculators.tip4p:TIP4P(rc=5.5, width=1.0)",
-            None,
-            [(4.5, 2), (5.5, 2)],
-            marks=pytest.mark.nightly,
-        ),
-        ("ase.calculators.emt:EMT", None, [(5.8768, 0)]),
-        pytest.param(
-            f"ase.calculators.eam:EAM(potential={str(COPPER)!r})",
-            "Cu",
-            [(5.50679, 1)],
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param(
-            "ase.calculators.tersoff:Tersoff.from_lammps('silicon.tersoff')",
-            "Si",
-            [(2.7, 2), (3.0, 2)],
-            marks=pytest.mark.nightly,
-        ),
-    ],
-    ids=["lj", "lj smooth", "morse", "tip3p", "tip4p", "emt", "eam", "tersoff"],
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in LONG)) for name in ASES_OWN]
 )
-def test_ases_own(words: str, atoms: str | None, expected, tmp_path: Path, monkeypatch):
-    """Of two atoms of a structure; the one by default is not looked for where that takes long."""
+def test_ases_own(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "silicon.tersoff").write_text(SILICON)
     monkeypatch.chdir(tmp_path)
-    loaded = load_calculator(words)
+    words, atoms, expected = ASES_OWN[name]
+    loaded = load_calculator(f"ase.calculators.{words}")
     structure = bulk(atoms) if atoms else default_structure(loaded)
     found = walked(CalculatorSubject(words, loaded.make, structure)).thresholds
     assert [one.order for one in found] == [order for _, order in expected]

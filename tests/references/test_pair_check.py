@@ -32,6 +32,8 @@ LIBRARIES = (
     "numpy-r2", "numpy", "ase", "ase-primitive", "vesin", "vesin-half", "mdanalysis", "mdanalysis-brute",
     "scipy",
 )  # fmt: skip
+#: compiled for each box; in the box of a system it is asked below
+AT_NIGHT = (pytest.mark.nightly, pytest.mark.jax_md)
 BOXES = {
     "orthorhombic": (np.diag([13.0, 14.0, 15.0]), (True, True, True)),
     "tilted": (np.array([[13.0, 0, 0], [4, 14, 0], [-3, 2, 15.0]]), (True, True, True)),
@@ -52,16 +54,11 @@ def codes(report) -> list[tuple[str, str]]:
     return [(finding.code, finding.severity) for finding in pair_findings(report)]
 
 
-@pytest.mark.jax_md
 @pytest.mark.parametrize(
     ("name", "box"),
     [
         *product(LIBRARIES, BOXES),
-        ("jax-md", "free"),
-        *(
-            pytest.param("jax-md", box, marks=pytest.mark.nightly)
-            for box in ("orthorhombic", "tilted", "rotated", "left-handed")
-        ),
+        *(pytest.param("jax-md", box, marks=AT_NIGHT) for box in BOXES if box not in ("slab", "small")),
     ],
 )
 def test_finds_the_pairs_of_the_oracle(name: str, box: str):

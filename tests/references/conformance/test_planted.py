@@ -5,11 +5,9 @@ from __future__ import annotations
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import planted_lists
@@ -44,6 +42,7 @@ _CODES = {
 }
 
 
+#: Questions that are asked of several lists, by their identity.
 _known: dict[int, Case] = {}
 
 
@@ -56,22 +55,20 @@ def _questions(kept: bool, padding: float | None = None, rule: bool = False) -> 
     return asked
 
 
-@pytest.fixture(autouse=True, scope="module")
-def true_pairs_once() -> Iterator[None]:
+@cache
+def _true_pairs(question: int, step: int, **options) -> Truth:
+    return truth(_known[question], step, **options)
+
+
+@pytest.fixture(autouse=True)
+def true_pairs_once(monkeypatch: pytest.MonkeyPatch):
     """The pairs of a question are the same whoever is asked: they are found once."""
-    found: dict[Any, Truth] = {}
 
-    def known(case: Case, step: int, **options) -> Truth:
-        if id(case) not in _known:
-            return truth(case, step, **options)
-        key = id(case), step, *sorted(options.items())
-        if key not in found:
-            found[key] = truth(case, step, **options)
-        return found[key]
+    def found(case: Case, step: int, **options) -> Truth:
+        known = id(case) in _known
+        return _true_pairs(id(case), step, **options) if known else truth(case, step, **options)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mdnum.references.conformance.suite.truth", known)
-        yield
+    monkeypatch.setattr("mdnum.references.conformance.suite.truth", found)
 
 
 def _made(defect: str):
@@ -80,7 +77,7 @@ def _made(defect: str):
 
 def _examined(made, rule: bool = False, **options) -> Report:
     """Asked what there is, scaled to the padding that it was seen to have."""
-    tested = from_object(made, "planted")
+    tested = from_object(made, "planted", source="")
     examiner = Examiner(tested, reuse=not rule)
     asked = _questions(tested.kept, examiner.report.padding, rule)
     return examine(tested, **{"asked": asked, "shrink": False} | options, examiner=examiner, large=False)
