@@ -483,7 +483,7 @@ class Evaluator:
             lambda: here.inside(wrapped, table, np.asarray(bits)),
         )
 
-    def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, Array]:
+    def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
         """The simulation in this cell, wrapped positions, the list for them, and positions in its order."""
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))

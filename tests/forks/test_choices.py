@@ -449,4 +449,4 @@ def test_lists_of_another_order_are_not_those_of_the_leader(crystal: System):
     found = fork(made("order", crystal), 30, repeats=0)
     assert np.nanmax(found.series["B|A"]) > 0
     held = fork(made("order@exact", crystal), 30, repeats=0)
-    assert np.nanmax(held.series["B|A"]) == 0 and found.dates.seed == 1
+    assert np.nanmax(held.series["B|A"]) == 0 and found.dates.first_bit == 1
