@@ -107,8 +107,7 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
 
 def test_one_of_several_structures_of_a_file(copper, capsys):
     write(copper / "two.extxyz", [bulk("Cu", cubic=True), bulk("Cu", cubic=True).repeat((2, 1, 1))])
-    for words, atoms in (("two.extxyz@0", 4), ("two.extxyz", 8)):
-        assert call("audit", EMT, "-s", words, "--checks", "forces", "--no-report") == 0
-        assert f"{atoms} atoms" in printed(capsys)[1]
+    assert call("audit", EMT, "-s", "two.extxyz@0", "--checks", "forces", "--no-report") == 0
+    assert "4 atoms" in printed(capsys)[1]
     for words, message in (("two.extxyz@7", "two.extxyz@7"), ("two.extxyz@:", "one structure")):
         assert call("audit", EMT, "-s", words) == 2 and message in capsys.readouterr().err

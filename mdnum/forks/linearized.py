@@ -113,7 +113,7 @@ def tangents(
         tables = simulation.tables(segment.table)
         dynamics = PairDynamics(force, simulation.integrator, jnp.asarray(simulation.masses[order]), tables)
         # of full length, so that every stretch of one kind of list is one compiled program
-        rows = jnp.arange(segment.record.bits.shape[0]) < segment.rows
+        rows = np.arange(segment.record.bits.shape[0]) < segment.rows
         end, out = _carry(
             dynamics,
             jnp.asarray(segment.first),

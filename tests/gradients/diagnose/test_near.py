@@ -14,7 +14,7 @@ from small_systems import LENNARD_JONES, make
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
 from mdnum.gradients.diagnose.near import Near
-from mdnum.gradients.diagnose.trust import halved, spread
+from mdnum.gradients.diagnose.trust import shorter, spread
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.recorded import EventAware, passed
 from mdnum.gradients.tape import pace_of
@@ -154,7 +154,7 @@ def test_nothing_is_trusted_that_was_not_looked_at(monkeypatch):
 @pytest.mark.parametrize("loss", [MeanPotential(every=7, first=5), EinsteinDiffusion(every=10)])
 def test_half_the_time_step_looks_at_the_same_times(loss):
     whole = problem(0.01, 0.002, loss=loss)
-    half = halved(whole)
+    half = shorter(whole, np.array([whole.steps]), per=2)
     assert half.steps == 2 * whole.steps
     assert half.value() == pytest.approx(whole.value(), rel=1e-3)
     assert len(spread(whole, 10)) > 3
