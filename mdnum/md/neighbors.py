@@ -148,7 +148,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 
 @numba.njit(cache=True, nogil=True)
 def _compressed(mask, label, chosen):
-    """Write the labels that the mask keeps: without a branch, each over the one before unless that is kept."""
+    """Write the labels that the mask keeps, without a branch: over the one before unless that is kept."""
     filled = np.uint64(0)
     for k in range(len(label)):
         chosen[filled] = label[k]

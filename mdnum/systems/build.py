@@ -216,7 +216,7 @@ class Simulation:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """As `Evaluator`, for one configuration, with a list of its own."""
+        """`Evaluator.__call__` for one configuration, with a list of its own."""
         return Evaluator(self, skin=0.0)(positions, cell, stress)
 
     def energy(self, positions: Float[np.ndarray, "atoms 3"] | None = None) -> float:
@@ -225,11 +225,8 @@ class Simulation:
         Args:
             positions: length; default the structure's.
         """
-        at = np.asarray(self.positions if positions is None else positions, np.float64)
-        wrapped, _ = wrap_positions(self.cell, at)
-        table = self.verlet_list(skin=0.0).build(wrapped, self.cell)
-        x = jnp.asarray(wrapped[table.order].T, self.policy.dtype("state"))
-        return float(_total(self.force, x, self.tables(table)))
+        _, _, _, tables, x = Evaluator(self, skin=0.0)._sorted(positions, None)
+        return float(_total(self.force, x, tables))
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
@@ -475,13 +472,7 @@ class Evaluator:
         Raises:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
-        own = self.simulation
-        same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
-        here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))
-        at = np.asarray(own.positions if positions is None else positions, np.float64)
-        wrapped, _ = wrap_positions(here.cell, at)
-        table, tables = self._list(here, wrapped)
-        x = jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
+        here, wrapped, table, tables, x = self._sorted(positions, cell)
         result, bits, virial = _evaluate(here.force, x, tables, stress)
         forces = np.empty((here.atoms, 3))
         forces[table.order] = np.asarray(result.force, np.float64).T
@@ -495,6 +486,16 @@ class Evaluator:
             energies,
             lambda: here.inside(wrapped, table, np.asarray(bits)),
         )
+
+    def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
+        """The simulation in this cell, wrapped positions, the list for them, and positions in its order."""
+        own = self.simulation
+        same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
+        here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))
+        at = np.asarray(own.positions if positions is None else positions, np.float64)
+        wrapped, _ = wrap_positions(here.cell, at)
+        table, tables = self._list(here, wrapped)
+        return here, wrapped, table, tables, jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
         """The list in use, rebuilt where it no longer holds every pair inside."""

@@ -194,7 +194,7 @@ def test_one_inverted_contact_is_found_exactly(name, runs):
     assert decision is not None and (decision.step, decision.channel) == (pin.step, "contact")
     assert (decision.subject, decision.a, decision.b) == ((pin.ball,), 0, 1)
     # nothing before, and at the fork the bits of that ball alone
-    assert found.dates.seed == pin.step
+    assert found.dates.first_bit == pin.step
     other = np.delete(np.arange(3), pin.ball)
     a, b = (found.runs[run].y[: pin.step + 1, other] for run in "AB")
     np.testing.assert_array_equal(a, b)
@@ -384,7 +384,7 @@ def test_the_order_of_a_batch_is_heard_by_its_sum_alone():
     )
     assert heard.decision is not None and (heard.dates.fork, heard.decision.channel) == (1, "stop")
     assert heard.decision.ambiguous_in
-    assert exact.dates == alone.dates and exact.dates.seed is None and exact.dates.fork is None
+    assert exact.dates == alone.dates and exact.dates.first_bit is None and exact.dates.fork is None
 
 
 @pytest.mark.parametrize(

@@ -449,4 +449,4 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
 def test_lists_of_another_order_are_not_those_of_the_leader(crystal: System, word: str, first_bit):
     """B under A's decisions has B's order of pairs: with A's lists it would be A."""
     found = fork(made(word, crystal), 30, repeats=0)
-    assert found.dates.seed == first_bit and (np.nanmax(found.series["B|A"]) > 0) == (word == "order")
+    assert found.dates.first_bit == first_bit and (np.nanmax(found.series["B|A"]) > 0) == (word == "order")

@@ -80,7 +80,7 @@ def test_dates_are_those_of_the_runs_followed_again(folders):
     keys = [key for key, _, _ in found.differences]
     assert "precision.force" in keys
     again = fork(twin_of(found), STEPS, split=10.0, repeats=0, counterfactual=False)
-    assert found.first_bit == again.dates.seed == 0
+    assert found.first_bit == again.dates.first_bit == 0
     assert found.fork == again.dates.fork
     if found.fork is not None:
         assert again.decision is not None

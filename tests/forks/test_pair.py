@@ -24,7 +24,7 @@ def test_in_a_cold_crystal_the_flips_are_the_cause():
     assert decision is not None and decision.step == found.dates.fork
     # the margin is of the size of what separates the runs, and far above rounding
     assert abs(decision.margin) < 20 * decision.separation
-    assert not decision.ambiguous and found.dates.seed == 0
+    assert not decision.ambiguous and found.dates.first_bit == 0
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_run_that_ends_before_any_decision_differs_is_a_fork_by_itself():
     b = crystal(dynamics__timestep=2.0)
     found = fork(pair(crystal(), b), 4, repeats=0, counterfactual=False)
     assert found.failed.keys() == {"B"} and not found.flips
-    assert found.dates.seed == found.dates.fork == found.steps
+    assert found.dates.first_bit == found.dates.fork == found.steps
     assert found.verdict.word == "open"
 
 
@@ -108,7 +108,7 @@ def test_the_verdict_on_a_liquid_rests_on_repeats():
     # alone, from its start, the pair of runs is followed by another path through the code
     starts = hot.b.nudged(perturbation(found), 4, seed=0)
     alone = fork(replace(hot, b=starts[2]), steps, repeats=0, back=False)
-    assert (alone.splits["B"], alone.splits["B|A"]) == (found.repeats[2].free, found.repeats[2].handed)
+    assert (alone.splits["B"], alone.splits["B|A"]) == (found.repeats[2].free, found.repeats[2].imposed)
     # and the first starts do not depend on how many there are
     ((free, _),) = hot.a.repeats(
         hot.b.nudged(perturbation(found), 1, 0), steps, found.tolerance, 3 * found.tolerance
