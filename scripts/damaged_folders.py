@@ -83,8 +83,8 @@ def _grad(path: Path) -> None:
     mdnum.grad("pair/leaving-well", of="potential", wrt="potential.epsilon", steps=40, out=path, report=False)
 
 
-def _ball(path: Path, steps: int = 60) -> None:
-    mdnum.bounce("ball/drop", steps=steps, out=path, report=False)
+def _ball(path: Path, height: float = 1.0) -> None:
+    mdnum.bounce("ball/drop", steps=60, overrides={"start.height": height}, out=path, report=False)
 
 
 def _flips(path: Path) -> None:
@@ -362,7 +362,7 @@ class Campaign:
         if {"finished", "killed"} & set(kinds):
             _run(root / "other-run", seed=2)
         if "ball" in kinds:
-            _ball(root / "other-ball", steps=50)
+            _ball(root / "other-ball", height=1.5)
         self.expected: dict[tuple[str, ...], dict[str, object]] = {}
 
     def other(self, kind: str) -> Path:

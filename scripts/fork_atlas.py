@@ -165,7 +165,7 @@ def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, re
         ended(found.verdict.word, failed),
         **asdict(found.dates),
         told=found.splits.get("B|A"),
-        nats=found.verdict.nats,
+        nats=found.verdict.e_foldings,
         steps=found.steps,
     )
 

@@ -84,7 +84,7 @@ def main() -> None:
         ("float32", "seed", "fork", "split", "told", "growth", "verdict"),
         (
             (
-                role, one.dates.seed, one.dates.fork, one.dates.split, one.splits.get("B|A"),
+                role, one.dates.first_bit, one.dates.fork, one.dates.split, one.splits.get("B|A"),
                 f"{one.growth['B'].rate:.2g}", one.verdict.word,
             )
             for role, one in found.items()

@@ -58,7 +58,7 @@ def study(system: System, word: str, steps: int) -> Row:
     own = shuffled.twin.a.simulation
     twin = twin_or_reason(parse(f"reduction={word}"), system)
     found = None if isinstance(twin, str) else fork(twin, steps, counterfactual=False)
-    return Row(word, force_error(own, exact), found, shuffled.dates.seed)
+    return Row(word, force_error(own, exact), found, shuffled.dates.first_bit)
 
 
 def draw(rows: list[Row], system: System, path: Path) -> None:
@@ -103,7 +103,7 @@ def main() -> None:
         (
             (
                 row.word, f"{row.error:.2g}",
-                *((one.dates.seed, one.dates.fork, one.dates.split, f"{one.series['B'][-1]:.2g}")
+                *((one.dates.first_bit, one.dates.fork, one.dates.split, f"{one.series['B'][-1]:.2g}")
                   if (one := row.found) is not None else (None,) * 4),
                 row.shuffled,
             )

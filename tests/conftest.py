@@ -61,6 +61,7 @@ _CHECKED = [
 # first call with them and its second without.
 if os.environ.get("MDNUM_TEST_TYPES") != "off":
     typing_rules.keep_numba_whole()
+    typing_rules.check_lazily()
     jaxtyping.install_import_hook(_CHECKED, "typing_rules.check")
 
 # compiling takes seconds and happens in the first example

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from mdnum.gradients.losses import Custom
+from mdnum.gradients.losses import Loss
 
 
-def everything(atoms: int, seed: int = 0) -> Custom:
+class Everything(Loss):
     """A loss that looks at all that a frame holds, with weights that no symmetry cancels."""
-    rng = np.random.default_rng(seed)
-    way, turn = (jnp.asarray(rng.standard_normal((3, atoms))) for _ in range(2))
 
-    def see(frame, origin, around):
-        moved = jnp.sum(way * (frame.x - origin.x)) + jnp.sum(turn * frame.v * jnp.square(origin.v))
-        return moved + 1e-2 * frame.potential + 1e-2 * frame.virial / around.volume
+    name = "everything"
+    way: Float[Array, "3 atoms"] = eqx.field(kw_only=True)
+    turn: Float[Array, "3 atoms"] = eqx.field(kw_only=True)
+    energies: Float[Array, ""] = eqx.field(kw_only=True)
 
-    return Custom(see=see, every=7, first=5)
+    def observe(self, frame, origin, around):
+        moved = jnp.sum(self.way * (frame.x - origin.x)) + jnp.sum(self.turn * frame.v * jnp.square(origin.v))
+        return moved + self.energies * (frame.potential + frame.virial / around.volume)
+
+
+def everything(atoms: int) -> Everything:
+    """Of so many atoms."""
+    way, turn = (jnp.asarray(part) for part in np.random.default_rng(0).standard_normal((2, 3, atoms)))
+    return Everything(every=7, first=5, way=way, turn=turn, energies=jnp.asarray(1e-2))

@@ -18,9 +18,9 @@ EMT = "ase.calculators.emt:EMT"
 
 @pytest.fixture
 def copper(tmp_path: Path, monkeypatch) -> Path:
-    """A folder with a structure, which is where the person is."""
+    """A folder with a file of two structures, which is where the person is; the last is asked about."""
     monkeypatch.chdir(tmp_path)
-    write(tmp_path / "cu.extxyz", bulk("Cu", cubic=True))
+    write(tmp_path / "cu.extxyz", [bulk("Cu", cubic=True).repeat((2, 1, 1)), bulk("Cu", cubic=True)])
     return tmp_path
 
 
@@ -30,6 +30,8 @@ def copper(tmp_path: Path, monkeypatch) -> Path:
         (("nowhere.py",), "no such file"),
         ((EMT, "--checks", "curls"), "Did you mean curl?"),
         ((EMT, "-s", "no.xyz"), "no.xyz"),
+        ((EMT, "-s", "cu.extxyz@7"), "cu.extxyz@7"),
+        ((EMT, "-s", "cu.extxyz@:"), "one structure"),
         ((EMT, "-s", "cu.extxyz", "--timestep", "0", "--checks", "dynamics"), "expected one above 0"),
     ],
 )
@@ -103,12 +105,3 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     assert call("audit", EMT, "-s", "cu.extxyz", "-o", "other", "--checks", "curl") == 130
     assert "stopped. Continue with `mdnum audit --resume other`" in capsys.readouterr().err
     assert not (copper / "other/summary.json").exists()
-
-
-def test_one_of_several_structures_of_a_file(copper, capsys):
-    write(copper / "two.extxyz", [bulk("Cu", cubic=True), bulk("Cu", cubic=True).repeat((2, 1, 1))])
-    for words, atoms in (("two.extxyz@0", 4), ("two.extxyz", 8)):
-        assert call("audit", EMT, "-s", words, "--checks", "forces", "--no-report") == 0
-        assert f"{atoms} atoms" in printed(capsys)[1]
-    for words, message in (("two.extxyz@7", "two.extxyz@7"), ("two.extxyz@:", "one structure")):
-        assert call("audit", EMT, "-s", words) == 2 and message in capsys.readouterr().err

@@ -76,7 +76,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
     """Findings, scripts that reproduce them in another process, a page, and the same page again."""
-    assert call("conform", "mine.py:made(scale=2)", "--cases", "20", "--no-large", "-o", "run") == 1
+    assert call("conform", "mine.py:made(scale=2)", "--cases", "4", "--no-large", "-o", "run") == 1
     lines = printed(capsys)
     assert any(line.startswith("error: pairs inside the cutoff are missing") for line in lines)
     folder = mine / "run"
@@ -99,7 +99,7 @@ def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
 
 def test_limits_make_it_conform(mine: Path, capsys: pytest.CaptureFixture[str]):
     limits = "minimum-image,orthorhombic,all-axes"
-    arguments = ("conform", "mine.py:nearest_image", "--cases", "10", "--no-large", "--limits", limits)
+    arguments = ("conform", "mine.py:nearest_image", "--cases", "4", "--no-large", "--limits", limits)
     assert call(*arguments, "--json", "--no-report", "-o", "out") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["conforms"] and not document["findings"] and document["wrong"] == 0

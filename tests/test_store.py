@@ -188,7 +188,10 @@ def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
     assert len(resumed.read("series")["step"]) == 100
 
 
-@pytest.mark.parametrize("killed_at", range(1, 20))
+# what is done to the first of three tables, six replacements and removals, and the last of all
+@pytest.mark.parametrize(
+    "killed_at", [*range(1, 7), 19, *(pytest.param(at, marks=pytest.mark.nightly) for at in range(7, 19))]
+)
 def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, killed_at):
     folder = RunFolder.create(tmp_path / "run")
     write_run(folder, 0, 60, chunk=20)

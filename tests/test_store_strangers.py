@@ -474,13 +474,20 @@ def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, sta
         run(None, resume=folder.path)
 
 
-@pytest.mark.parametrize("damages", [6, pytest.param(30, marks=pytest.mark.nightly)])
-def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch, damages):
+@pytest.mark.parametrize(
+    ("kinds", "damages"),
+    [
+        (("killed",), 5),
+        pytest.param(("ball",), 5, marks=pytest.mark.slow),
+        pytest.param(("killed", "ball"), 30, marks=pytest.mark.nightly),
+    ],
+)
+def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch, kinds, damages):
     scripts = Path(__file__).resolve().parents[1] / "scripts"
     monkeypatch.syspath_prepend(str(scripts))
     monkeypatch.setattr(sys, "argv", ["damaged_folders.py"])
     script = runpy.run_path(str(scripts / "damaged_folders.py"), run_name="damaged_folders")
-    rows = script["campaign"](tmp_path, ("killed", "ball"), damages, seed=1)
+    rows = script["campaign"](tmp_path, kinds, damages, seed=1)
     mistakes = [json.dumps(row) for row in rows if row["outcome"] in script["MISTAKES"]]
     assert not mistakes
     if damages > 20:

@@ -36,17 +36,13 @@ def test_a_contact_is_a_pair_inside_the_cutoff():
     dynamics = PairDynamics(simulation.force, simulation.integrator, masses, simulation.tables(table))
     state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
 
-    @jax.jit
-    def advance(state):
+    def advance(state, _):
         own = dynamics.decide(state)
-        return dynamics.step(state, own), jnp.max(dynamics.margins(state)), jnp.any(own > 0)
+        distance = jnp.abs(state.x[0, 0] - state.x[0, 1])
+        return dynamics.step(state, own), (distance, jnp.max(dynamics.margins(state)), jnp.any(own > 0))
 
-    distance, margin, inside = [], [], []
-    for _ in range(steps + 1):
-        distance.append(float(abs(state.x[0, 0] - state.x[0, 1])))
-        state, nearest, touches = advance(state)
-        margin.append(float(nearest))
-        inside.append(bool(touches))
+    _, rows = jax.jit(lambda state: jax.lax.scan(advance, state, length=steps + 1))(state)
+    distance, margin, inside = (np.asarray(column) for column in rows)
 
     world = ball.World.create(ball.Penalty(k), ball.BallVerlet(h), gravity=0.0)
     rollout = ball.simulate(world, world.start(0.2, -speed), steps)
@@ -55,4 +51,4 @@ def test_a_contact_is_a_pair_inside_the_cutoff():
     contacts = rollout.contacts
     assert isinstance(contacts, Ledger) and broken_alternations(contacts) == 0
     assert list(contacts.entered) == [True, False]
-    np.testing.assert_allclose(contacts.margin, np.array(margin)[contacts.step], rtol=0, atol=2e-13)
+    np.testing.assert_allclose(contacts.margin, margin[contacts.step], rtol=0, atol=2e-13)

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Literal
@@ -329,9 +330,13 @@ class Pair:
 
     def at(self, distance: float) -> Atoms:
         """The two at a distance (of the reference atoms), which is exact in the last bit."""
-        moved = self.second.copy()
-        moved.positions[:, 0] += distance
-        both = self.first + moved
+        both = self._together.copy()
+        both.positions[len(self.first) :, 0] += distance
+        return both
+
+    @cached_property
+    def _together(self) -> Atoms:
+        both = self.first + self.second
         if self.box:
             both.set_cell([self.box] * 3)
         both.pbc = self.periodic

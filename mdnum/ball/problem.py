@@ -117,8 +117,9 @@ class BallProblem:
         }
 
     def value(self, overrides: Mapping[str, Any] | None = None) -> float:
-        """The loss."""
-        return float(_loss(self.bare, self.world, *self.start_arrays, dict(overrides or {}), None))
+        """The loss, also with other values of named parameters: one compiled program for all of them."""
+        problem = self.with_values(overrides or {})
+        return float(_loss(problem.bare, problem.world, *problem.start_arrays))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
         """Where it is, as `loss_at` takes it: parameters by value, the start by how far it is moved, 0.
@@ -214,8 +215,8 @@ def loss_at(bare, world, y0, v0, values, imposed, shifts=False):
 
 
 @eqx.filter_jit
-def _loss(bare, world, y0, v0, values, imposed):
-    return loss_at(bare, world, y0, v0, values, imposed)
+def _loss(bare, world, y0, v0):
+    return loss_of(world, y0, v0, *bare)
 
 
 @eqx.filter_jit

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from mdnum.ball.limits import spacing
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.rollout import BallRun, CrossDecision, cross_decisions, overridden, simulate
+from mdnum.ball.rollout import BallRun, CrossDecision, cross_decisions, overridden, simulate, undecided
 from mdnum.ball.step import BallDecisions, Projection
 from mdnum.errors import InputError
 from mdnum.numerics.events import Ledger
@@ -139,18 +139,15 @@ class BallProgram:
         if not self.pins:
             return None
         world = self.problem.world
-        solve = jax.eval_shape(
-            lambda: world.advance(world.start(self.problem.y0, self.problem.v0))[1].solve.iterations
-        )
-        contact = np.full((steps, self.size), -1, np.int8)
-        iterations = np.full((steps, *solve.shape), -1, np.int32)
+        start = world.start(self.problem.y0, self.problem.v0)
+        imposed = BallDecisions(*map(np.array, undecided(world, start, steps)))  # type: ignore[arg-type]
         for pin in self.pins:
             if pin.step > steps:
                 continue
-            decided = contact if pin.channel == "contact" else iterations
+            decided = imposed.contact if pin.channel == "contact" else imposed.iterations
             # the last of one column is all that there is: a count that all balls share is that of ball -1
             decided.reshape(steps, -1)[pin.step - 1, pin.ball] = pin.value
-        return BallDecisions(contact, iterations)  # type: ignore[arg-type]
+        return imposed
 
     def lockstep(
         self, other: BallProgram, last: int, *, forward: bool, back: bool, guard: float | None

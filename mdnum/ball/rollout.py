@@ -142,13 +142,16 @@ def simulate(
         raise InputError(f"steps = {steps}; expected at least 1")
     balls = start.y.shape[0]
     chunk = max(1, min(steps, _CHUNK // max(balls, 1)))
+    # one compiled program for runs that decide by themselves, under pins, and under another's decisions
+    own = undecided(world, start, steps) if imposed is None else imposed
+    imposed = BallDecisions(np.asarray(own.contact, np.int8), np.asarray(own.iterations, np.int32))  # type: ignore[arg-type]
     parts: list[dict[str, np.ndarray]] = [{"y": np.asarray(start.y)[None], "v": np.asarray(start.v)[None]}]
     ledgers: list[dict[str, np.ndarray]] = []
     state, made, before = start, 0, np.asarray(start.touching)
     while made < steps:
         length = min(chunk, steps - made)
-        given = None if imposed is None else jax.tree.map(lambda x: x[made : made + length], imposed)  # noqa: B023
-        state, out = _chunk(world, state, given, length, history)
+        given = [x[made : made + length] for x in imposed]
+        state, out = _chunk(world, state, BallDecisions(*given), length, history)
         rows = {name: np.asarray(value) for name, value in out.items()}
         ledgers.append(_flips(world, made, before, parts[-1]["y"][-1], parts[-1]["v"][-1], rows))
         before = rows["contact"][-1]
@@ -167,6 +170,20 @@ def simulate(
     velocity = flips.pop("velocity")
     contacts = Ledger(channel="contact", **flips, extra={"velocity": velocity})
     return BallRun(world=world, steps=steps, balls=balls, **{"history": None, **whole}, contacts=contacts)
+
+
+#: Shape of a step's counts, by the structure of a world and the number of balls.
+_COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
+
+
+def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
+    """Imposed decisions that leave every one to the world: -1 throughout, leading axis steps."""
+    kind = jax.tree.structure(world), len(start.y)
+    if kind not in _COUNTS:
+        solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
+        _COUNTS[kind] = solve.iterations.shape
+    contact = np.broadcast_to(np.int8(-1), (steps, len(start.y)))
+    return BallDecisions(contact, np.broadcast_to(np.int32(-1), (steps, *_COUNTS[kind])))  # type: ignore[arg-type]
 
 
 @eqx.filter_jit

@@ -184,15 +184,7 @@ class World(eqx.Module):
             y: heights, m, a number or shape (balls,).
             v: velocities, m/s, a number or shape (balls,).
         """
-        dtype, arithmetic = self.policy.dtype("state"), self.policy.dtype("arithmetic")
-        y = jnp.atleast_1d(jnp.asarray(y)).astype(dtype)
-        v = jnp.broadcast_to(jnp.asarray(v).astype(dtype), y.shape)
-        step = jnp.zeros((), jnp.int32)
-        touching = self.touches(y.astype(arithmetic), jnp.zeros(y.shape, bool))
-        a = self.contact.acceleration(
-            y.astype(arithmetic), v.astype(arithmetic), self._free(step, y.shape), touching, self.rounding
-        )
-        return BallState(step, y, v, a, touching)
+        return _start(self, jnp.asarray(y), jnp.asarray(v))
 
     def advance(
         self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
@@ -250,6 +242,19 @@ class World(eqx.Module):
             return self.rounding(x.astype(dtype))
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.policy.seed), step), which)
         return stochastic_round(x, self.policy.state, key).astype(dtype)
+
+
+@eqx.filter_jit
+def _start(world: World, y: Array, v: Array) -> BallState:
+    dtype, arithmetic = world.policy.dtype("state"), world.policy.dtype("arithmetic")
+    y = jnp.atleast_1d(y).astype(dtype)
+    v = jnp.broadcast_to(v.astype(dtype), y.shape)
+    step = jnp.zeros((), jnp.int32)
+    touching = world.touches(y.astype(arithmetic), jnp.zeros(y.shape, bool))
+    a = world.contact.acceleration(
+        y.astype(arithmetic), v.astype(arithmetic), world._free(step, y.shape), touching, world.rounding
+    )
+    return BallState(step, y, v, a, touching)
 
 
 def _get(node: Any, path: tuple[str, ...]) -> Any:

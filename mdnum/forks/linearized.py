@@ -112,13 +112,11 @@ def tangents(
         order = segment.table.order
         tables = simulation.tables(segment.table)
         dynamics = PairDynamics(force, simulation.integrator, jnp.asarray(simulation.masses[order]), tables)
-        # of full length, so that every stretch of one kind of list is one compiled program
-        rows = jnp.arange(segment.record.bits.shape[0]) < segment.rows
         end, out = _carry(
             dynamics,
             jnp.asarray(segment.first),
+            jnp.asarray(segment.rows),
             (jnp.asarray(segment.record.x), jnp.asarray(segment.record.v), jnp.asarray(segment.record.bits)),
-            rows,
             (jnp.asarray(tangent[0][:, order], dtype), jnp.asarray(tangent[1][:, order], dtype)),
             jnp.asarray(np.float64(clock)),
             reach,
@@ -172,10 +170,10 @@ def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.nda
 def _carry(
     dynamics: PairDynamics,
     first: Int[Array, ""],
+    count: Int[Array, ""],
     recorded: tuple[
         Float[Array, "rows 3 atoms"], Float[Array, "rows 3 atoms"], UInt8[Array, "rows words atoms"]
     ],
-    used: Array,
     tangent: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]],
     clock: Float[Array, ""],
     reach: bool,
@@ -201,7 +199,7 @@ def _carry(
 
     def step(carry, row):
         dx, dv = carry
-        number, x, v, bits, use = row
+        number, x, v, bits = row
         state = MdState(number, x, v)
         length = jnp.sqrt(jnp.sum(dx * dx) + (clock * clock).astype(dx.dtype) * jnp.sum(dv * dv))
         furthest = jnp.sqrt(jnp.max(jnp.sum(dx * dx, axis=0)))
@@ -216,12 +214,17 @@ def _carry(
             return after.x, after.v
 
         _, after = jax.jvp(advance, (x, v), (dx, dv))
-        carry = tuple(jnp.where(use, new, old) for new, old in zip(after, carry, strict=True))
-        return carry, (length, furthest, *near)
+        return after, (length, furthest, *near)
 
-    x, v, bits = recorded
-    numbers = first + jnp.arange(x.shape[0])
-    return lax.scan(step, tangent, (numbers, x, v, bits, used))
+    def body(n, held):
+        carry, rows = held
+        carry, row = step(carry, (first + n, *(part[n] for part in recorded)))
+        return carry, jax.tree.map(lambda whole, one: whole.at[n].set(one), rows, row)
+
+    # a record has one length for every stretch, so that they share a program; not all of its rows are steps
+    one = jax.eval_shape(step, tangent, (first, *(part[0] for part in recorded)))[1]
+    rows = jax.tree.map(lambda leaf: jnp.zeros((len(recorded[0]), *leaf.shape), leaf.dtype), one)
+    return lax.fori_loop(0, count, body, (tangent, rows))
 
 
 # --- Lyapunov exponents -------------------------------------------------------------------------------

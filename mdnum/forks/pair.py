@@ -210,7 +210,7 @@ def perturbation(fork: Fork) -> float:
 
     A smaller perturbation would leave the rounding errors of both runs the same, and their splits with them.
     """
-    begins = (fork.dates.fork if fork.dates.seed is None else fork.dates.seed) or 0
+    begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
     return min(float(np.nanmax(soon, initial=0.0)), _LARGEST * fork.tolerance)
 
@@ -258,16 +258,16 @@ def _judged(
     free = series["B"]
     splits = {name: split_of(series[name], tolerance) for name in series if name[0] in "AB"}
     first = flips[0].step if flips else None
-    seed = int(bits.argmax()) if bits.any() else None
+    first_bit = int(bits.argmax()) if bits.any() else None
     cause = None
     if first is None and len(ended) == 1:
         # that one run can go on and the other cannot is a fork if anything is; the one that ended has no
         # state after it, so no bit can be the same
         first = len(free) - 1
-        seed = first if seed is None else seed
+        first_bit = first if first_bit is None else first_bit
         (name,) = ended
         cause = {"run": name, "word": failed[name], "step": first, "other": "AB"[name == "A"]}
-    dates = Dates(seed, first, splits["B"])
+    dates = Dates(first_bit, first, splits["B"])
     together = [flip for flip in flips if flip.step == first]
     decision = None
     if together:
@@ -376,7 +376,7 @@ def screen(
         found = fork(twin, steps, counterfactual=False, repeats=0)
         dates = found.dates
         failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())
-        date = dates.seed, dates.fork, dates.split
+        date = dates.first_bit, dates.fork, dates.split
         rows.append(
             Screened(choice.name, twin.difference, *date, choice.must_hold, None, found.steps, failed)
         )

@@ -195,9 +195,9 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """What the reverse pass carries from step to step.
 
-    Where it is watched, rows of what it carried: row k belongs to the state (x, half-kicked v) that step
-    first + k begins with, before the crossings that lead there, in the order of the stretch's list; rows
-    beyond the used ones are void, and the origin is left out.
+    In the trace of a stretch, row k belongs to the state (x, half-kicked v) that step first + k begins with,
+    before the crossings that lead there, in the order of the stretch's list; rows beyond the used ones are
+    void, and the origin is left out.
 
     Attributes:
         x: cotangent of the positions at the step that comes next in time.
@@ -246,8 +246,8 @@ def reverse(
     back = StretchReversal(tape, wanted, guard if saltation else None)
     found: list[Crossings] = []
     for stretch in tape.backward():
-        weights, trace = back.through(stretch, traced=watch is not None)
-        if watch is not None and trace is not None:
+        weights, trace = back.through(stretch)
+        if watch is not None:
             watch(stretch, trace)
         if back.met is not None:
             found.append(back.met.weighed(weights))
@@ -285,7 +285,7 @@ class StretchReversal:
             nothing, nothing, model, integrator, scale, (nothing, nothing), r_cut, (zero, zero)
         )
 
-    def arguments(self, stretch: TapeStretch, traced: bool) -> tuple[Any, ...]:
+    def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
         """What `transposed` is called with for a stretch, from where the pass stands."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None
@@ -299,14 +299,12 @@ class StretchReversal:
         crossed = None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms)
         return (
             self.force, simulation.integrator, simulation.masses[order], tables, stretch.columns,
-            stretch.bits, stretch.rows, tape.seen(stretch), looking, crossed, self.carry, self.wanted, traced,
+            stretch.bits, stretch.rows, tape.seen(stretch), looking, crossed, self.carry, self.wanted,
         )  # fmt: skip
 
-    def through(
-        self, stretch: TapeStretch, *, traced: bool = False
-    ) -> tuple[Float[np.ndarray, "room most"], AdjointCarry | None]:
+    def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
         """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
-        self.carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
+        self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
@@ -319,7 +317,7 @@ class StretchReversal:
         return Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
 
 
-@partial(jax.jit, static_argnames=("wanted", "traced"))
+@partial(jax.jit, static_argnames=("wanted",))
 def transposed(
     force: PairForce | ManyBodyForce,
     integrator: Integrator,
@@ -333,7 +331,6 @@ def transposed(
     crossed,
     carry: AdjointCarry,
     wanted: frozenset[str],
-    traced: bool,
 ):
     """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace."""
     loss, origin, around, onto_total, pace = looking
@@ -416,9 +413,7 @@ def transposed(
         after = AdjointCarry(
             onto_x, onto_v, model, numbers_bar, scale, started, carry.r_cut, (potential, virial)
         )
-        trace = None
-        if traced:
-            trace = after._replace(origin=())
+        trace = after._replace(origin=())
         weights = jnp.zeros(0)
         if met is not None:
             # the forces are there wherever the derivative by scale is wanted

@@ -219,25 +219,34 @@ class _Rollout(eqx.Module):
 
 
 def used(
-    problem: BallProblem, names: Sequence[str], slopes: Mapping[str, float], run: BallRun | None = None
+    problem: BallProblem,
+    names: Sequence[str],
+    slopes: Mapping[str, float],
+    run: BallRun | None = None,
+    *,
+    own: bool = True,
 ) -> dict[str, Use]:
     """Whether the run used each parameter on the way to the loss.
 
     Args:
         slopes: derivatives already known.
         run: of this problem, made here when None.
+        own: the slopes are those of the problem's own operations: one that is not 0 came through a use.
     """
-    run = problem.run(keep=False) if run is None else run
-    rollout, rest = _Rollout(problem.steps, problem.loss), (problem.world, *problem.start_arrays)
-    found = dependence(rollout, problem.origin(names), names, rest)
+    found = dict.fromkeys(names, Dependence(True, True))
+    if not own or any(slopes[name] == 0 or not np.isfinite(slopes[name]) for name in names):
+        run = problem.run(keep=False) if run is None else run
+        rollout, rest = _Rollout(problem.steps, problem.loss), (problem.world, *problem.start_arrays)
+        found = dependence(rollout, problem.origin(names), names, rest)
     return {name: Use(one.used, _note(name, one, slopes[name], problem, run)) for name, one in found.items()}
 
 
-def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run: BallRun) -> str:
+def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run: BallRun | None) -> str:
     if not found.written:
         return f"the program has no path from {name} to the loss: the loss does not depend on {name}"
     if not found.used:
         why = f"nothing that ran used {name}"
+        assert run is not None
         if not run.contact.any():
             why = f"no ball touched the floor, and nothing else used {name}"
         elif isinstance(problem.world.contact, Projection) and not run.iterations.any():
@@ -384,7 +393,7 @@ class RandomizedSmoothing(BallMethod):
             each = half * noise[:, column] / widths[name]
             slopes[name] = float(np.mean(each))
             errors[name] = float(np.std(each, ddof=1) / np.sqrt(self.samples))
-        use = used(problem, names, slopes)
+        use = used(problem, names, slopes, own=False)
         for name in names:
             if np.any(half) and not use[name].depends:
                 use[name] = Use(True, f"the loss jumps with {name}, which the run itself did not use")

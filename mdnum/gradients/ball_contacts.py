@@ -202,7 +202,7 @@ class Implicit(BallMethod):
         # what the run would be if every solve ended at its fixed point
         ideal = _with_contact(problem, replace(contact, stop=FixedCount(0), derivative=_Settled()))
         asked = problem if self.at_iterate else ideal
-        use = used(asked, names, slopes)
+        use = used(asked, names, slopes, own=False)
         for name in names:
             if not self.at_iterate and not use[name].depends:
                 use[name] = Use(False, f"the fixed point does not depend on {name}")
@@ -384,7 +384,7 @@ class ThroughContacts(BallMethod):
                 f"contacts that graze the floor: {int(flagged)}; their time has no derivative",
                 remedy="Move the start or the step until the ball crosses the floor, or smooth the contact.",
             )
-        use = used(problem, names, slopes, run)
+        use = used(problem, names, slopes, run, own=located or smooth)
         for name in names:
             if slopes[name] != 0 and not use[name].depends:
                 use[name] = Use(True, f"the time of a contact depends on {name}")

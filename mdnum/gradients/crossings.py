@@ -25,6 +25,10 @@ from mdnum.numerics.saltation import saltation_flagged
 from mdnum.systems.build import Simulation
 
 
+#: Crossings of one step that there is room for at least, as a power of two.
+_ROOM_BITS = 6
+
+
 class Met(NamedTuple):
     """The crossings of some rows on the device, padded to one length.
 
@@ -100,8 +104,9 @@ class Crossings:
     def on_device(self, room: int, atoms: int) -> Met:
         """Padded to the rows of the stretch."""
         order, row, place = self._places(room)
-        # a power of two, so that not every stretch is compiled for
-        most = 1 << max(3, int(place.max(initial=0)).bit_length())
+        # a power of four, so that few are compiled for
+        bits = max(_ROOM_BITS, int(place.max(initial=0)).bit_length())
+        most = 1 << (bits + bits % 2)
 
         def padded(values: np.ndarray, nothing: int = 0) -> Array:
             out = np.full((room, *values.shape[1:], most), nothing, values.dtype)

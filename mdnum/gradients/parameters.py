@@ -396,8 +396,6 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     """The simulation with other values of some parameters.
 
-    A radius is a static part of compiled programs, so each new one compiles again.
-
     Raises:
         InputError: a value that is not finite, or of another shape.
     """

@@ -82,7 +82,8 @@ def passed(
     Args:
         names: full names of the parameters. saltation: whether flips count.
         guard: as a share of the rms radial speed of a pair. budget: bytes of the recorded run that are kept.
-        tape: the run, where it has been made (with flips, if saltation is asked for).
+        tape: the run, where it has been made; with flips, if saltation is asked for. Without saltation these
+            graze, all of them: that is the program of event-aware, which need not be compiled twice.
 
     Raises:
         InputError: saltation without a pair potential. NumericalError: the run blew up.
@@ -96,11 +97,11 @@ def passed(
         tape = tape_of(problem, saltation, budget, progress)
     speed = guard * radial_speed(problem.simulation)
     parts, crossings = reverse(
-        tape, wanted=wanted(names), saltation=saltation, guard=speed,
-        progress=in_phase(progress, "reverse pass"), watch=watch if watches else None,
+        tape, wanted=wanted(names), saltation=tape.flips, guard=speed if saltation else np.inf,
+        progress=in_phase(progress, "reverse pass"), watch=watch,
     )  # fmt: skip
     gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
-    return ReversePass(tape, parts, gradient, crossings, speed)
+    return ReversePass(tape, parts, gradient, crossings if saltation else [], speed)
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -25,14 +25,12 @@ from mdnum.md.lattice import LatticeLangevin
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
-from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point, room_for
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
 
 #: Bytes of recorded stretches that a tape keeps.
 KEPT = 2**29
-#: Fewest rows that a stretch is kept with.
-_LEAST_ROOM = 16
 #: States of which a reversed run remembers a fingerprint, so that one that goes astray is found where it did.
 _FINGERPRINTS = 256
 
@@ -66,6 +64,20 @@ class TapeStretch:
         kept = (self.x, self.v, self.images, self.bits, self.x_before, self.table.index)
         return sum(array.nbytes for array in kept)
 
+    def cut(self, room: int | None = None) -> TapeStretch:
+        """A copy with room for so many rows; default those in use."""
+        kept: dict[str, Any] = {}
+        for name in _COLUMNS:
+            rows = getattr(self, name)[: self.rows]
+            kept[name] = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
+            kept[name][: self.rows] = rows
+        return replace(self, **kept)
+
+    def roomy(self) -> TapeStretch:
+        """A copy with room for as many rows as other stretches have: not every length is compiled for."""
+        per_row = sum(getattr(self, name)[0].nbytes for name in _COLUMNS)
+        return self.cut(room_for(self.rows - 1, per_row))
+
     @property
     def steps(self) -> Int[np.ndarray, "room"]:
         """Step of each row."""
@@ -83,16 +95,10 @@ _COLUMNS = ("x", "v", "images", "bits", "potential", "virial")
 
 def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> TapeStretch:
     """A copy of what a segment recorded from a start; the segment's own record is used again."""
-    record, rows = segment.record, segment.rows
-    # the record has room for the longest stretch; powers of two, so that not every length is compiled for
-    room = min(len(record.x), max(_LEAST_ROOM, 1 << (rows - 1).bit_length()))
-    kept: dict[str, Any] = {}
-    for name in _COLUMNS:
-        whole = np.asarray(getattr(record, name))
-        kept[name] = np.zeros((room, *whole.shape[1:]), whole.dtype)
-        kept[name][:rows] = whole[:rows]
+    columns: dict[str, Any] = {name: np.asarray(getattr(segment.record, name)) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
-    return TapeStretch(segment.first, rows, **kept, x_before=x_before, table=segment.table, ledger=ledger)
+    made = TapeStretch(segment.first, segment.rows, **columns, x_before=x_before, table=segment.table)
+    return replace(made, ledger=ledger).roomy()
 
 
 class Pace(NamedTuple):
@@ -185,9 +191,10 @@ class RunTape:
         self._observe(stretch)
         if self._each is not None:
             self._each(stretch)
-        kept = self.held + stretch.nbytes <= self.budget
-        self._made.append(stretch if kept else (self._next, ledger))
-        self.held += stretch.nbytes if kept else 0
+        packed = stretch.cut()
+        kept = self.held + packed.nbytes <= self.budget
+        self._made.append(packed if kept else (self._next, ledger))
+        self.held += packed.nbytes if kept else 0
         self._next = resume_point(segment)
 
     @property
@@ -213,7 +220,7 @@ class RunTape:
         return len(self._made)
 
     def _whole(self, one: TapeStretch | tuple[Start, Ledger | None]) -> TapeStretch:
-        return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one
+        return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one.roomy()
 
     def backward(self) -> Iterator[TapeStretch]:
         """The stretches, last first."""

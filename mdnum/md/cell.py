@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike
@@ -149,13 +150,43 @@ def _subtract(lattice, x, y, z, n):
     return x, y, z
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def nearest_image(lattice, x, y, z):
+    """`Cell.minimum_image` of one displacement in compiled loops over pairs, with the same bits.
+
+    Args:
+        lattice: `HostCell.lattice`, in the dtype of the displacement.
+    """
+    a, m, pbc, orthorhombic = lattice
+    if not (pbc[0] or pbc[1] or pbc[2]):
+        return x, y, z
+    if orthorhombic:
+        f, g, h = np.rint(x * m[0, 0]), np.rint(y * m[1, 1]), np.rint(z * m[2, 2])
+        return x - f * a[0, 0], y - g * a[1, 1], z - h * a[2, 2]
+    f = np.rint(x * m[0, 0] + y * m[1, 0] + z * m[2, 0])
+    g = np.rint(x * m[0, 1] + y * m[1, 1] + z * m[2, 1])
+    h = np.rint(x * m[0, 2] + y * m[1, 2] + z * m[2, 2])
+    if pbc[0]:
+        x, y, z = x - f * a[0, 0], y - f * a[0, 1], z - f * a[0, 2]
+    if pbc[1]:
+        x, y, z = x - g * a[1, 0], y - g * a[1, 1], z - g * a[1, 2]
+    if pbc[2]:
+        x, y, z = x - h * a[2, 0], y - h * a[2, 1], z - h * a[2, 2]
+    return x, y, z
+
+
 class HostCell:
-    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls."""
+    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls.
+
+    Attributes:
+        lattice: lattice vectors, their inverse (lengths and inverse lengths, in the dtype), periodicity and
+            whether the vectors lie along x, y and z.
+    """
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
         matrix, inverse = np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype)
-        self._lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
+        self.lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
 
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
@@ -163,9 +194,9 @@ class HostCell:
         """Components of the nearest image of end - start, with the bits that the force loop computes."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
-        if not any(self._lattice[2]):
+        if not any(self.lattice[2]):
             return x, y, z
-        return _subtract(self._lattice, x, y, z, _images(self._lattice, x, y, z, np.rint))
+        return _subtract(self.lattice, x, y, z, _images(self.lattice, x, y, z, np.rint))
 
 
 def wrap_positions(

@@ -63,9 +63,9 @@ class PairDecider:
             )
 
     @property
-    def bare(self) -> PairDecider:
-        """Without what only bounds need: a box of another size is then the same compiled program."""
-        return replace(self, reach=_NO_REACH, state="float64")
+    def convention(self) -> PairDecider:
+        """Without radii, which a program is given, and without what only bounds need."""
+        return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
     def space(self) -> str:
@@ -209,18 +209,26 @@ class SlotJudge:
 
     Args:
         decider: the convention.
+        thresholds: in its dtype and space, shape (types,).
         cell: the box.
         zero: integer zero that XLA must not know.
         positions: sorted, wrapped, shape (3, atoms).
     """
 
-    def __init__(self, decider: PairDecider, cell: Cell, zero: jax.Array, positions: Float[Array, "3 atoms"]):
+    def __init__(
+        self,
+        decider: PairDecider,
+        thresholds: Float[Array, "types"],
+        cell: Cell,
+        zero: jax.Array,
+        positions: Float[Array, "3 atoms"],
+    ):
         dtype = np.dtype(decider.dtype)
         self.decider, self.zero = decider, zero
         self.cell = cell.astype(dtype)
         self.components = tuple(positions.astype(dtype))
         self.atoms = positions.shape[1]
-        self.value = decider.values()
+        self.value = thresholds
 
     def start(self) -> jax.Array:
         """An empty tally: the nearest margin of each atom."""

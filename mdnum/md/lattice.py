@@ -414,14 +414,14 @@ def _counted_jvp(primals, tangents):
 class LatticeJudge(SlotJudge):
     """Decides as `SlotJudge` does, with integers in the units of a lattice."""
 
-    def __init__(self, decider: LatticeDecider, cell: Cell, zero, positions, lattice: Lattice):
+    def __init__(self, decider: LatticeDecider, limits, cell: Cell, zero, positions, lattice: Lattice):
         inverse = 1 / lattice.spacing
         self.decider, self.zero, self.lattice = decider, zero, lattice
         # powers of two, so nothing is rounded but positions that were not on the lattice
         self.cell = Cell(cell.matrix * inverse, cell.inverse * lattice.spacing, cell.pbc, cell.orthorhombic)
         self.components = tuple(jnp.round(positions.astype(jnp.float64) * inverse))
         self.atoms = positions.shape[1]
-        self.value = jnp.asarray(decider.limits, jnp.int64)
+        self.value = limits
 
     def start(self) -> jax.Array:
         """An empty tally: the smallest distance from the limit of each atom, in squared spacings."""
@@ -479,7 +479,8 @@ class LatticeForce(PairForce):
             model.astype(np.float64),
             cell.astype(np.float64),
             zero_bits(np.float64),
-            decider.bare,
+            jnp.asarray(decider.limits, jnp.int64),
+            decider.convention,
             policy,
             reduction,
             lattice=lattice,
@@ -494,11 +495,7 @@ class LatticeForce(PairForce):
     def judge(self, positions: Float[Array, "3 atoms"]) -> LatticeJudge:
         """What decides at these positions."""
         assert isinstance(self.decider, LatticeDecider)
-        return LatticeJudge(self.decider, self.cell, self.zero, positions, self.lattice)
-
-    def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
-        """The decisions of a list at given positions, without forces."""
-        return self.judge(positions).decide(tables)
+        return LatticeJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.lattice)
 
     def __call__(self, positions, tables, *, decisions, given=None, where=None):
         """As `PairForce`: forces that are whole multiples of the unit of force.
@@ -511,7 +508,7 @@ class LatticeForce(PairForce):
         unit = lattice.spacing * lattice.spacing
         steps = lattice.spacing / lattice.force
         # what a pair outside is evaluated at
-        far = max(self.decider.r_cut) ** 2
+        far = jnp.max(self.model.r_cut) ** 2
 
         def block(carry, listed):
             totals, nearest, close = carry

@@ -20,6 +20,9 @@ from mdnum.md.cell import Cell, displacement, strain_loss
 from mdnum.numerics import set_bits
 from mdnum.registry import Registry
 
+# atoms whose slots are written together: 16 of four bytes are a cache line
+_TOGETHER = 16
+
 # a pair at the edge of the list must not be lost to rounding: the skin criterion assumes that every
 # unlisted pair was at least r_list apart
 _SAFETY = 1.0 + 1e-12
@@ -48,9 +51,13 @@ def _bin_atoms(fractional, bins, bin_of, start, order):
 
 
 @numba.njit(cache=True, nogil=True)
-def _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shift):
-    """Runs of bin-sorted atoms around one bin, with the lattice vector that brings each run near."""
-    found = 0
+def _columns(b0, b1, bins, reach, periodic, matrix, row, shift):
+    """The columns of bins (along the third axis) around one, with the lattice vector that brings each near.
+
+    Returns:
+        how many, and the place of the one in the middle. row: the first bin of each.
+    """
+    found = middle = 0
     for d0 in range(-reach[0], reach[0] + 1):
         c0 = b0 + d0
         n0 = 0
@@ -67,92 +74,144 @@ def _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shi
                     continue
                 n1 = 1 if c1 >= bins[1] else -1
                 c1 -= n1 * bins[1]
-            row = (c0 * bins[1] + c1) * bins[2]
-            for n2 in range(-1, 2):
-                if n2 != 0 and not periodic[2]:
-                    continue
-                low = max(b2 - reach[2], n2 * bins[2])
-                high = min(b2 + reach[2], (n2 + 1) * bins[2] - 1)
-                if low > high:
-                    continue
-                first[found] = start[row + low - n2 * bins[2]]
-                last[found] = start[row + high - n2 * bins[2] + 1]
-                for c in range(3):
-                    shift[found, c] = n0 * matrix[0, c] + n1 * matrix[1, c] + n2 * matrix[2, c]
-                found += 1
-    return found
-
-
-@numba.njit(cache=True, nogil=True)
-def _gather(x, runs, first, last, shift, near):
-    """Copy the atoms of all runs side by side, moved by their lattice vectors; returns how many."""
-    count = 0
-    for q in range(runs):
-        for j in range(first[q], last[q]):
+            if d0 == 0 and d1 == 0:
+                middle = found
+            row[found] = (c0 * bins[1] + c1) * bins[2]
             for c in range(3):
-                near[c, count] = x[c, j] + shift[q, c]
-            near[3, count] = j
-            count += 1
-    return count
+                shift[found, c] = n0 * matrix[0, c] + n1 * matrix[1, c]
+            found += 1
+    return found, middle
 
 
 @numba.njit(cache=True, nogil=True)
-def _distances(near, count, xi, yi, zi, squares):
-    """Squared distances to all candidates; a loop without branches, which vectorizes."""
-    for k in range(count):
-        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
-        squares[k] = dx * dx + dy * dy + dz * dz
+def _gather(x, start, row, shift, columns, middle, bins, reach, periodic, matrix, near, label, begin, home):
+    """Copy the atoms of all columns, layer after layer, moved by their lattice vectors.
+
+    What is near a bin are the layers around its own: one stretch, so that every atom is copied once for a
+    whole column of bins.
+
+    Returns:
+        whether all fit. begin: where each layer begins, and the end; home: where its middle bin does.
+    """
+    count = 0
+    layers = begin.shape[0] - 1
+    for layer in range(layers):
+        begin[layer] = count
+        b2, n2 = layer - reach[2], 0
+        if b2 < 0 or b2 >= bins[2]:
+            if not periodic[2]:
+                continue
+            n2 = 1 if b2 >= bins[2] else -1
+            b2 -= n2 * bins[2]
+        for q in range(columns):
+            first, last = start[row[q] + b2], start[row[q] + b2 + 1]
+            if count + last - first > label.shape[0]:
+                return False
+            if q == middle:
+                home[layer] = count
+            x0 = shift[q, 0] + n2 * matrix[2, 0]
+            x1 = shift[q, 1] + n2 * matrix[2, 1]
+            x2 = shift[q, 2] + n2 * matrix[2, 2]
+            for j in range(first, last):
+                near[0, count], near[1, count], near[2, count] = x[0, j] + x0, x[1, j] + x1, x[2, j] + x2
+                label[count] = j
+                count += 1
+    begin[layers] = count
+    return True
+
+
+# Each of the short loops below is a function of its own over whole slices: written into the loop over atoms,
+# they are not vectorized, and a search takes twice as long.
 
 
 @numba.njit(cache=True, nogil=True)
-def _image_distances(near, count, xi, yi, zi, matrix, inverse, squares):
-    """As `_distances`, where an axis has a single bin and the nearest image is looked for pair by pair."""
-    for k in range(count):
-        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
+def _within(x, y, z, xi, yi, zi, r2_list, mask):
+    """Which candidates are near."""
+    for k in range(len(x)):
+        dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
+        mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
+
+
+@numba.njit(cache=True, nogil=True)
+def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
+    """As `_within`, where an axis has a single bin and the nearest image is looked for pair by pair."""
+    for k in range(len(x)):
+        dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
         g = np.rint(dx * inverse[0, 1] + dy * inverse[1, 1] + dz * inverse[2, 1])
         h = np.rint(dx * inverse[0, 2] + dy * inverse[1, 2] + dz * inverse[2, 2])
         dx -= f * matrix[0, 0] + g * matrix[1, 0] + h * matrix[2, 0]
         dy -= f * matrix[0, 1] + g * matrix[1, 1] + h * matrix[2, 1]
         dz -= f * matrix[0, 2] + g * matrix[1, 2] + h * matrix[2, 2]
-        squares[k] = dx * dx + dy * dy + dz * dz
+        mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
+
+
+@numba.njit(cache=True, nogil=True)
+def _compressed(mask, label, chosen):
+    """Write the labels that the mask keeps, without a branch: over the one before unless that is kept."""
+    filled = np.uint64(0)
+    for k in range(len(label)):
+        chosen[filled] = label[k]
+        filled += mask[k]
+    return np.int64(filled)
+
+
+@numba.njit(cache=True, nogil=True)
+def _padded(chosen, filled, padding, out):
+    for k in range(len(out)):
+        out[k] = chosen[k] if k < filled else padding
+
+
+@numba.njit(cache=True, nogil=True)
+def _transposed(rows, table, first):
+    """The slots of consecutive atoms, which share cache lines: written together."""
+    for k in range(table.shape[0]):
+        for i in range(_TOGETHER):
+            table[k, first + i] = rows[i, k]
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
     """Neighbors of every (bin-sorted) atom; returns the largest number found, which may exceed the room."""
-    n = x.shape[1]
-    room = table.shape[0]
+    room, n = table.shape
     most = 0
     by_pair = False
     for k in range(3):
         by_pair = by_pair or (periodic[k] and reach[k] == 0)
-    near, squares, chosen = np.empty((4, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int32)
-    first, last = np.empty(75, np.int64), np.empty(75, np.int64)
-    shift = np.empty((75, 3))
+    row, shift = np.empty(25, np.int64), np.empty((25, 3))
+    layers = bins[2] + 2 * reach[2]
+    begin, home = np.empty(layers + 1, np.int64), np.empty(layers, np.int64)
+    capacity = 0
+    near, label = np.empty((3, capacity)), np.empty(capacity, np.int32)
+    mask, chosen = np.empty(capacity, np.uint8), np.empty(capacity, np.int32)
+    rows = np.empty((_TOGETHER, room), np.int32)
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
+            columns, middle = _columns(b0, b1, bins, reach, periodic, matrix, row, shift)
+            while not _gather(
+                x, start, row, shift, columns, middle, bins, reach, periodic, matrix, near, label, begin, home
+            ):
+                capacity = 2 * capacity + 1024
+                near, label = np.empty((3, capacity)), np.empty(capacity, np.int32)
+                mask, chosen = np.empty(capacity, np.uint8), np.empty(max(capacity, room) + 1, np.int32)
             for b2 in range(bins[2]):
                 here = (b0 * bins[1] + b1) * bins[2] + b2
-                if start[here] == start[here + 1]:
-                    continue
-                runs = _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shift)
-                count = _gather(x, runs, first, last, shift, near)
+                low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
+                px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
                 for i in range(start[here], start[here + 1]):
                     if by_pair:
-                        _image_distances(near, count, x[0, i], x[1, i], x[2, i], matrix, inverse, squares)
+                        _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)
                     else:
-                        _distances(near, count, x[0, i], x[1, i], x[2, i], squares)
-                    filled = 0
-                    # no branch to mispredict: every candidate is written, and overwritten unless it is kept
-                    for k in range(count):
-                        j = np.int32(near[3, k])
-                        chosen[filled] = j
-                        filled += int((squares[k] <= r2_list) & (j != i))
+                        _within(px, py, pz, x[0, i], x[1, i], x[2, i], r2_list, mask)
+                    mask[home[b2 + reach[2]] - low + i - start[here]] = 0  # the atom itself
+                    filled = _compressed(mask, label[low:high], chosen)
                     most = max(most, filled)
-                    # the slots of consecutive atoms share cache lines, so this is no slower than by rows
-                    for k in range(min(filled, room)):
-                        table[k, i] = chosen[k]
+                    _padded(chosen, filled, n, rows[i % _TOGETHER])
+                    first = i - i % _TOGETHER
+                    if i - first == _TOGETHER - 1:
+                        _transposed(rows, table, first)
+                    elif i == n - 1:
+                        table[:, first:] = rows[: n - first].T
     return most
 
 
@@ -208,7 +267,7 @@ def neighbor_table(
     start = np.zeros(int(np.prod(bins)) + 1, np.int64)
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
-    table = np.full((room, atoms), atoms, np.int32)
+    table = np.empty((room, atoms), np.int32)
     most = _fill(
         np.ascontiguousarray(components[:, order]),
         np.asarray(cell.matrix, np.float64),

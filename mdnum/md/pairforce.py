@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, Real, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
@@ -61,7 +61,8 @@ class PairForce(eqx.Module):
         model: the potential with its cutoff.
         cell: the box.
         zero: an integer zero that XLA must not know (see precision.exact).
-        decider: the pair decision.
+        thresholds: of the pair decision, by pair type, in the dtype and space that it compares in.
+        decider: its convention.
         policy: dtype by role.
         reduction: order of the sum over neighbors.
     """
@@ -69,6 +70,7 @@ class PairForce(eqx.Module):
     model: CutPotential
     cell: Cell
     zero: Int[Array, ""]
+    thresholds: Real[Array, "types"]
     decider: PairDecider = eqx.field(static=True)
     policy: PrecisionPolicy = eqx.field(static=True)
     reduction: Reduction = eqx.field(static=True, default=Sequential())
@@ -80,7 +82,8 @@ class PairForce(eqx.Module):
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
             zero_bits(policy.dtype("decision")),
-            decider.bare,
+            decider.values(),
+            decider.convention,
             policy,
             reduction,
         )
@@ -99,9 +102,13 @@ class PairForce(eqx.Module):
         x = x.astype(self.policy.dtype("force"))
         return fence(x, self.zero) if self._short else x
 
+    def judge(self, positions: Float[Array, "3 atoms"]) -> SlotJudge:
+        """What decides at these positions."""
+        return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions)
+
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions, without forces."""
-        return SlotJudge(self.decider, self.cell, self.zero, positions).decide(tables)
+        return self.judge(positions).decide(tables)
 
     def __call__(
         self,
@@ -122,7 +129,7 @@ class PairForce(eqx.Module):
                 are its own all the same, so that the two can be compared.
             where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
-        judge = SlotJudge(self.decider, self.cell, self.zero, positions)
+        judge = self.judge(positions)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
         cell = self.cell.astype(geometry)
@@ -174,7 +181,7 @@ class PairForce(eqx.Module):
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
         """Sum over pairs of r_ij ⊗ F_ij, energy; minus the derivative of the energy by strain."""
-        judge = SlotJudge(self.decider, self.cell, self.zero, positions)
+        judge = self.judge(positions)
         geometry, law = self.policy.geometry, self.law
         cell = self.cell.astype(geometry)
         components = tuple(positions.astype(geometry))
@@ -237,25 +244,25 @@ class ManyBodyForce(eqx.Module):
 
     Attributes:
         potential: energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`.
-        cell, zero, decider, policy: as in PairForce. The energy itself is always float64.
+        cell, zero, thresholds, decider, policy: as in PairForce. The energy itself is always float64.
     """
 
     potential: eqx.Module
     cell: Cell
     zero: Int[Array, ""]
+    thresholds: Float[Array, "types"]
     decider: PairDecider = eqx.field(static=True)
     policy: PrecisionPolicy = eqx.field(static=True)
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
         """The box as jax arrays."""
-        return cls(
-            potential, cell.astype(np.float64), zero_bits(policy.dtype("decision")), decider.bare, policy
-        )
+        zero = zero_bits(policy.dtype("decision"))
+        return cls(potential, cell.astype(np.float64), zero, decider.values(), decider.convention, policy)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions."""
-        return SlotJudge(self.decider, self.cell, self.zero, positions).decide(tables)
+        return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions).decide(tables)
 
     def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
         """Forces at wrapped positions; as PairForce, the whole energy counted on the first atom."""
@@ -337,7 +344,7 @@ class PairDynamics(eqx.Module):
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
         """Threshold minus quantity of every slot, positive inside; -inf for padding."""
-        judge = SlotJudge(self.force.decider, self.force.cell, self.force.zero, state.x)
+        judge = self.force.judge(state.x)
         index, types = self.tables.groups()
 
         def margin(j, kinds):

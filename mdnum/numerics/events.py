@@ -150,14 +150,31 @@ class Ledger:
 
 def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
     """Order of rows by step, then by the labels of the subject, first label first."""
-    sizes = [int(column.max(initial=0)) + 1 for column in subject.T]
-    key = step - step.min(initial=0)
-    if float(key.max(initial=0) + 1) * float(np.prod(np.array(sizes, float))) >= 2**63:
-        return np.lexsort((*subject.T[::-1], step))
-    # one integer sorts several times faster than three keys; rows are distinct, so the order is unique
-    for column, size in zip(subject.T, sizes, strict=True):
-        key = key * size + column
-    return np.argsort(key)
+    order = np.arange(len(step))
+    for column in (*subject.T[::-1], step):
+        low, high = int(column.min(initial=0)), int(column.max(initial=0))
+        # a pass over as many places as there are labels; where rows are few beside those, comparing is less
+        if high - low < 8 * len(step):
+            order = _counted(column, low, high - low + 1, order)
+        else:
+            order = order[np.argsort(column[order], kind="stable")]
+    return order
+
+
+@numba.njit(cache=True, nogil=True)
+def _counted(column, low, size, order):
+    """An order sorted by a column of integers from low to low + size - 1; rows that are equal keep theirs."""
+    start = np.zeros(size + 1, np.int64)
+    for value in column:
+        start[value - low + 1] += 1
+    for k in range(size):
+        start[k + 1] += start[k]
+    out = np.empty_like(order)
+    for q in order:
+        k = column[q] - low
+        out[start[k]] = q
+        start[k] += 1
+    return out
 
 
 # --- packed bits: eight slots to a byte --------------------------------------------------------------
@@ -165,31 +182,33 @@ def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
 # A step of a list with W*8 slots for each of C columns leaves a (W, C) array of bytes; slot k of column c is
 # bit k % 8 of byte [k // 8, c].
 
-_POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
+# which bit of a word is its only one, by the six bits that this factor moves to the front (de Bruijn)
+_FACTOR = np.uint64(0x03F79D71B4CB0A89)
+_ONLY_BIT = np.empty(64, np.int64)
+_ONLY_BIT[[(0x03F79D71B4CB0A89 << bit & 2**64 - 1) >> 58 for bit in range(64)]] = np.arange(64)
 
 
 @numba.njit(cache=True, nogil=True)
-def _scan(rows, columns, row, slot, column, values):
+def _scan(before, rows, columns, row, slot, column, values):
     """Note the bits that change from row to row; returns their number, of which those that fit are noted."""
     at, room = 0, row.shape[0]
-    for r in range(1, rows.shape[0]):
+    for r in range(rows.shape[0]):
+        # the eight slots that the scan is in, and the places of their bytes
+        slots, begin, end = 0, 0, columns
         for w in range(rows.shape[1]):
-            changed = rows[r, w] ^ rows[r - 1, w]
-            if changed:
-                now = rows[r, w]
-                for byte in range(8):
-                    bits = (changed >> np.uint64(8 * byte)) & np.uint64(255)
-                    if bits and at + 8 > room:
-                        at += _POPULATION[bits]
-                    elif bits:
-                        place = 8 * w + byte
-                        for k in range(8):
-                            if (bits >> np.uint64(k)) & np.uint64(1):
-                                row[at] = r - 1
-                                slot[at] = 8 * (place // columns) + k
-                                column[at] = place % columns
-                                values[at] = (now >> np.uint64(8 * byte + k)) & np.uint64(1)
-                                at += 1
+            now = rows[r, w]
+            changed = now ^ (rows[r - 1, w] if r else before[w])
+            while changed:
+                rest = changed & (changed - np.uint64(1))
+                bit = _ONLY_BIT[((changed ^ rest) * _FACTOR) >> np.uint64(58)]
+                changed = rest
+                if at < room:
+                    place = 8 * w + (bit >> 3)
+                    while place >= end:
+                        slots, begin, end = slots + 8, end, end + columns
+                    row[at], slot[at], column[at] = r, slots + (bit & 7), place - begin
+                    values[at] = (now >> np.uint64(bit)) & np.uint64(1)
+                at += 1
     return at
 
 
@@ -209,20 +228,21 @@ def changes_in_time(
     """
     count, words, columns = rows.shape
     size = words * columns
-    padded = np.zeros((count + 1, -(-size // 8) * 8), np.uint8)
-    padded[0, :size] = before.reshape(-1)
-    padded[1:, :size] = rows.reshape(count, size)
+    spare = -size % 8
+    flat = rows.reshape(count, size), before.reshape(1, size)
+    if spare:
+        flat = tuple(np.pad(part, ((0, 0), (0, spare))) for part in flat)
     # on a big-endian machine the bytes of a word would be met in the other order
-    wide = padded.view("<u8").astype(np.uint64, copy=False)
+    wide, ahead = (np.ascontiguousarray(p).view("<u8").astype(np.uint64, copy=False) for p in flat)
     # rarely too little; where it is, the count says how much is needed
     room = wide.size // 4 + 64
     while True:
-        row, slot, column = (np.empty(room, np.int64) for _ in range(3))
+        row, slot, column = (np.empty(room, np.int32) for _ in range(3))
         values = np.empty(room, np.uint8)
-        total = _scan(wide, max(columns, 1), row, slot, column, values)
-        if total + 8 <= room:
+        total = _scan(ahead[0], wide, max(columns, 1), row, slot, column, values)
+        if total <= room:
             return row[:total], slot[:total], column[:total], values[:total]
-        room = total + 8
+        room = total
 
 
 def set_bits(

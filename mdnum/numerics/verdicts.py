@@ -32,20 +32,20 @@ class Delay:
     """When one pair splits, free and under the first run's decisions.
 
     Attributes:
-        free, handed: steps of the two splits; None for one that was not seen.
-        free_until, handed_until: last steps at which the separations are known.
+        free, imposed: steps of the two splits; None for one that was not seen.
+        free_until, imposed_until: last steps at which the separations are known.
     """
 
     free: int | None
-    handed: int | None
+    imposed: int | None
     free_until: int
-    handed_until: int
+    imposed_until: int
 
     @classmethod
-    def of(cls, free: Float[np.ndarray, "steps"], handed: Float[np.ndarray, "steps"], tolerance: float):
+    def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
         """From separations at each step, length; NaN after a run was ended."""
         found = []
-        for separation in (free, handed):
+        for separation in (free, imposed):
             beyond = separation > tolerance
             seen = np.flatnonzero(np.isfinite(separation))
             found.append((int(beyond.argmax()) if beyond.any() else None, int(seen[-1]) if len(seen) else -1))
@@ -54,12 +54,12 @@ class Delay:
 
     def beyond(self, steps: float) -> bool | None:
         """Whether the split comes more than so many steps later without the flips; None if not seen."""
-        if self.free is not None and self.handed is not None:
-            return self.handed - self.free > steps
+        if self.free is not None and self.imposed is not None:
+            return self.imposed - self.free > steps
         if self.free is not None:
-            return True if self.handed_until + 1 - self.free > steps else None
-        if self.handed is not None:
-            return False if self.handed - self.free_until - 1 <= steps else None
+            return True if self.imposed_until + 1 - self.free > steps else None
+        if self.imposed is not None:
+            return False if self.imposed - self.free_until - 1 <= steps else None
         return None
 
 
@@ -165,7 +165,7 @@ PATIENCE = 1.2
 #: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
 _SAVED = 5.0
 #: A delay of less than one e-folding is no delay: the separation was never as much as e times smaller.
-NATS = 1.0
+E_FOLDINGS = 1.0
 #: r² of a fit that counts as growth.
 FITS = 0.5
 #: E-foldings that the later half of a fit must grow by before it predicts anything. What the first steps do
@@ -178,12 +178,12 @@ class Dates:
     """When two runs part; None where they do not within the horizon.
 
     Attributes:
-        seed: first step whose state bits differ.
+        first_bit: first step whose state bits differ.
         fork: first step whose decisions differ.
         split: first step at which the separation passes the tolerance.
     """
 
-    seed: int | None
+    first_bit: int | None
     fork: int | None
     split: int | None
 
@@ -294,8 +294,8 @@ class ForkVerdict:
             separation), "bystander" (the split came before any flip, or most pairs do not split later by
             that much), "undecided" (the repeats that were allowed do not tell the two apart).
         free: split of the free run, step.
-        handed: split of the run under the other's decisions, step; None where there is none.
-        nats: growth rate times the steps gained: how many e-foldings the flips of this pair were worth;
+        imposed: split of the run under the other's decisions, step; None where there is none.
+        e_foldings: growth rate times the steps gained: how many e-foldings the flips of this pair were worth;
             infinite for a cause.
         threshold: delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise;
             None where no pairs were counted.
@@ -305,8 +305,8 @@ class ForkVerdict:
 
     word: Word
     free: int | None
-    handed: int | None
-    nats: float | None
+    imposed: int | None
+    e_foldings: float | None
     reasons: tuple[Reason, ...]
     threshold: float | None = None
     count: Count | None = None
@@ -320,7 +320,7 @@ class ForkVerdict:
 def judge(
     dates: Dates,
     free: Float[np.ndarray, "steps"],
-    handed: Float[np.ndarray, "steps"] | None,
+    imposed: Float[np.ndarray, "steps"] | None,
     tolerance: float,
     repeats: Sequence[Delay] = (),
     most: int = REPEATS,
@@ -332,7 +332,7 @@ def judge(
     Args:
         dates: of the pair.
         free: separation of the two free runs at each step, length.
-        handed: separation of the counterfactual from the first run, length; NaN after it was ended. None
+        imposed: separation of the counterfactual from the first run, length; NaN after it was ended. None
             where there is no counterfactual.
         tolerance: of the split, length.
         repeats: of the pair, the start perturbed by as much as the choice does.
@@ -342,28 +342,28 @@ def judge(
     last = len(free) - 1
     if ended is not None:
         return ForkVerdict("open", dates.split, None, None, (("ended", {**ended, "steps": last}),))
-    if dates.seed is None:
+    if dates.first_bit is None:
         return ForkVerdict("same", None, None, None, (("same", {"steps": last}),))
     if dates.fork is None:
         reasons: tuple[Reason, ...] = (("no_fork", {"steps": last, "separation": float(np.nanmax(free))}),)
         reasons += () if dates.split is not None else _outlook(free, tolerance)
         return ForkVerdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
-        other = None if handed is None else split_of(handed, tolerance)
+        other = None if imposed is None else split_of(imposed, tolerance)
         kept = () if other is None else (("together", {"step": other}),)
         return ForkVerdict("open", None, other, None, (*_outlook(free, tolerance), *kept))
     if dates.split < dates.fork:
         had: Reason = ("had_split", {"split": dates.split, "fork": dates.fork})
         return ForkVerdict("bystander", dates.split, None, None, (had,))
-    if handed is None:
+    if imposed is None:
         return ForkVerdict("open", dates.split, None, None, (("not_run", {"split": dates.split}),))
-    delay = Delay.of(free, handed, tolerance)
+    delay = Delay.of(free, imposed, tolerance)
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
-    if delay.handed is None:
-        return _kept(dates.split, handed, tolerance, (delay, *repeats), most, rate)
-    gained = delay.handed - dates.split
-    values = {"split": dates.split, "imposed": delay.handed, "steps": abs(gained)}
+    if delay.imposed is None:
+        return _kept(dates.split, imposed, tolerance, (delay, *repeats), most, rate)
+    gained = delay.imposed - dates.split
+    values = {"split": dates.split, "imposed": delay.imposed, "steps": abs(gained)}
     return _counted((delay, *repeats), most, rate, gained, (("later" if gained >= 0 else "earlier", values),))
 
 
@@ -372,10 +372,10 @@ def _counted(
 ) -> ForkVerdict:
     """The verdict where the runs split either way: how many of the pair and its repeats split later."""
     pair = delays[0]
-    threshold = 0.0 if rate is None else NATS / rate
-    nats = None if rate is None else rate * gained
-    if nats is not None:
-        reasons += (("worth", {"e_foldings": nats}),)
+    threshold = 0.0 if rate is None else E_FOLDINGS / rate
+    e_foldings = None if rate is None else rate * gained
+    if e_foldings is not None:
+        reasons += (("worth", {"e_foldings": e_foldings}),)
     found = count(delays, threshold, 1 + most)
     counted = {"repeats": found.pairs - 1, "later": found.later, "not_later": found.not_later}
     reasons += (("counted_any" if rate is None else "counted", {**counted, "threshold": threshold}),)
@@ -387,31 +387,31 @@ def _counted(
         reasons += (("too_few", {"needed": FEWEST}),)
     elif made is None and need is not None:
         reasons += (("not_clear", {"need": need[1], "of": need[0]}),)
-    return ForkVerdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
+    return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found)
 
 
 def _kept(
     free: int,
-    handed: Float[np.ndarray, "steps"],
+    imposed: Float[np.ndarray, "steps"],
     tolerance: float,
     delays: tuple[Delay, ...],
     most: int,
     rate: float | None,
 ) -> ForkVerdict:
     """The verdict where the runs do not split under the first run's decisions."""
-    some = np.isfinite(handed)
+    some = np.isfinite(imposed)
     seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
-    reach = float(np.nanmax(handed)) if some.any() else 0.0
+    reach = float(np.nanmax(imposed)) if some.any() else 0.0
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
     values = {"split": free, "until": seen, "reach": reach, "below": below}
     kept: Reason = ("kept" if reach > 0 else "kept_bits", values)
     if seen < PATIENCE * free:
         short: Reason = ("short", {"steps": seen - free}) if seen > free else ("cut_off", {})
         return ForkVerdict("open", free, None, None, (kept, short))
-    late = _expected(handed, tolerance, seen)
+    late = _expected(imposed, tolerance, seen)
     if late is not None and late < _SAVED * free:
         return _counted(delays, most, rate, late - free, (kept, ("late", {"step": round(late)})))
-    if below < NATS:
+    if below < E_FOLDINGS:
         return ForkVerdict("open", free, None, None, (kept, ("within", {})))
     return ForkVerdict("cause", free, None, float("inf"), (kept, ("rests", {"ratio": seen / free})))
 
@@ -485,14 +485,14 @@ class Share:
         reference: the run that is compared with.
         steps: by which the split comes later; below 0 where it comes earlier.
         at_least: whether the split had not come when it was followed no longer.
-        nats: growth rate times steps: powers of e of the separation; None without a rate.
+        e_foldings: growth rate times steps: e-foldings of the separation; None without a rate.
     """
 
     what: What
     reference: Name
     steps: int
     at_least: bool
-    nats: float | None
+    e_foldings: float | None
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
@@ -540,6 +540,6 @@ def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
             # ended before it could have come later
             continue
         steps = (cell.until if cell.split is None else cell.split) - free
-        nats = rate * steps if np.isfinite(rate) else None
-        found.append(Share(what, cell.reference, steps, cell.split is None, nats))
+        e_foldings = rate * steps if np.isfinite(rate) else None
+        found.append(Share(what, cell.reference, steps, cell.split is None, e_foldings))
     return tuple(sorted(found, key=lambda share: (share.what == "arithmetic", share.reference)))

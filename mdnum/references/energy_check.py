@@ -94,7 +94,7 @@ class EnergyReport:
         precision: "float64", or the narrowest type in use.
         frames: one comparison per frame, or per group of atoms in it where a sample was compared.
         ok: every frame within tolerance.
-        sampled: atoms of each frame that were compared; None for all.
+        sampled: atoms that were compared in one of the frames; None for all.
     """
 
     system: str
@@ -146,7 +146,8 @@ def check_energy(
         judge: instead of the reference chosen by `ase_models.reference`.
 
     Of more than `SAMPLED` atoms with a pair potential, energies and forces of a few hundred are compared, at
-    random places by `neighborhoods`: an exact statement about those.
+    random places by `neighborhoods`: an exact statement about those. Each frame has its own places, so that
+    two frames show twice the atoms.
 
     Raises:
         InputError: the system cannot be built.
@@ -158,14 +159,14 @@ def check_energy(
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
     compared: list[FrameComparison] = []
-    sampled: set[int] | None = None
-    for name, atoms in named.items():
-        whole, mine = _evaluated(atoms, simulation)
-        if system.spec.cutoff is None or len(whole) <= SAMPLED:
+    sampled: set[int] = set()
+    for seed, (name, atoms) in enumerate(named.items()):
+        sample = system.spec.cutoff is not None and len(atoms) > SAMPLED
+        whole, mine = _evaluated(atoms, simulation, stress=not sample)
+        if not sample:
             compared.append(_compare(name, whole, mine, simulation, system, calculator, other))
             continue
-        sampled = set()
-        for cluster, chosen in neighborhoods(whole, simulation.r_cut):
+        for cluster, chosen in neighborhoods(whole, simulation.r_cut, seed=seed):
             of = f"{name}, around atom {chosen[0]}"
             part = _part(mine, cluster, chosen, simulation.r_cut)
             compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
@@ -179,7 +180,7 @@ def check_energy(
         precision,
         tuple(compared),
         all(frame.ok for frame in compared),
-        None if sampled is None else len(sampled),
+        len(sampled) or None,
     )
 
 
@@ -213,14 +214,14 @@ def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any
     return {"initial": system.atoms, f"step {steps}": later}
 
 
-def _evaluated(atoms: Atoms, simulation: Any) -> tuple[Atoms, Evaluation]:
+def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
     """A frame as the state can hold it, and what mdnum makes of it."""
     positions = atoms.get_positions()
     if simulation.system.spec.precision.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
     pbc = simulation.system.atoms.pbc
     stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=pbc)
-    return stored, simulation.evaluate(positions, np.asarray(atoms.cell))
+    return stored, simulation.evaluate(positions, np.asarray(atoms.cell), stress)
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:

@@ -140,7 +140,7 @@ def _force_loop(system: System) -> Callable[..., Any]:
         key = (len(positions), pbc.tobytes(), r_cut)
         if key not in built:
             built[key] = systems.build(_variant(system, positions, cell, pbc, r_cut))
-        evaluation = built[key].evaluate(positions, cell)
+        evaluation = built[key].evaluate(positions, cell, stress=False)
         return np.asarray(evaluation.i), np.asarray(evaluation.j)
 
     return search

@@ -159,11 +159,15 @@ class CrossFlips(Sequence[CrossFlip]):
         if isinstance(at, slice):
             return CrossFlips(self.flips.where(at), self.from_b[at], self.differs[at], self.atoms)
         place = range(len(self))[at]
-        return next(iter(self[place : place + 1]))
+        return next(self._of(slice(place, place + 1)))
 
     def __iter__(self) -> Iterator[CrossFlip]:
-        i, j = np.divmod(self.flips.key, self.atoms)
-        columns = (self.flips.step, i, j, self.differs, self.from_b, *self.flips[2:])
+        return self._of(slice(None))
+
+    def _of(self, rows: slice) -> Iterator[CrossFlip]:
+        flips = self.flips.where(rows)
+        i, j = np.divmod(flips.key, self.atoms)
+        columns = (flips.step, i, j, self.differs[rows], self.from_b[rows], *flips[2:])
         for step, i, j, differs, from_b, entered, margin, bound in zip(
             *(column.tolist() for column in columns), strict=True
         ):

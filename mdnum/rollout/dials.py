@@ -1,28 +1,22 @@
 """A number of a system that can be turned without compiling the program anew.
 
-Constants of the potential, the time step and the start enter a compiled epoch as arguments. The cutoff radius
-does not: its threshold is written into the program. It is turned in a twin of the program that is given the
-threshold, and what is found there is confirmed in the program proper.
+Constants of the potential, the cutoff's threshold, the time step and the start enter a compiled epoch as
+arguments.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
-from mdnum.md.cell import Cell
-from mdnum.md.decide import Decisions, PairDecider, Tables
 from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import check_radius
-from mdnum.md.pairforce import Forces, PairForce
 from mdnum.registry import nearest
 from mdnum.systems.build import Simulation
 
@@ -46,20 +40,13 @@ class Dial:
         key: its name, as system files have it where they do.
         value: what the system says, in the units of its file.
         turn: the simulation with another value, without compiling anew.
-        proper: the simulation with another value, as the program that a user runs.
         positive: whether only values above 0 make sense.
     """
 
     key: str
     value: float
     turn: Turn
-    proper: Turn
-    positive: bool
-
-    @property
-    def compiles(self) -> bool:
-        """Whether the program that a user runs is compiled for each value."""
-        return self.turn is not self.proper
+    positive: bool = True
 
 
 def dial(simulation: Simulation, key: str) -> Dial:
@@ -119,24 +106,20 @@ def _fixed(simulation: Simulation) -> dict[str, Dial]:
     factor = simulation.units.time_factor
     integrator = simulation.integrator
     dials = [
-        _plain("dynamics.timestep", float(integrator.timestep) / factor, _integrator("timestep", factor)),
-        _plain("velocity.scale", 1.0, _scaled),
-        _plain("neighbors.skin", simulation.rule.skin, _skin),
+        Dial("dynamics.timestep", float(integrator.timestep) / factor, _integrator("timestep", factor)),
+        Dial("velocity.scale", 1.0, _scaled),
+        Dial("neighbors.skin", simulation.rule.skin, _skin),
     ]
     if isinstance(integrator, Langevin):
         k_B = simulation.units.k_B
         friction = float(integrator.friction) * factor
-        dials.append(_plain("dynamics.friction", friction, _integrator("friction", factor, inverse=True)))
+        dials.append(Dial("dynamics.friction", friction, _integrator("friction", factor, inverse=True)))
         # velocities that are drawn are drawn at the temperature: then it is more than one number
         if simulation.system.velocities is not None:
-            dials.append(_plain("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)))
+            dials.append(Dial("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)))
     if simulation.pairwise:
         dials += _constants(simulation) + _radii(simulation)
     return {one.key: one for one in dials}
-
-
-def _plain(key: str, value: float, turn: Turn, positive: bool = True) -> Dial:
-    return Dial(key, value, turn, turn, positive)
 
 
 def _number(value: float) -> Float[Array, ""]:
@@ -176,7 +159,7 @@ def _constants(simulation: Simulation) -> list[Dial]:
         for kind, (i, j) in enumerate(zip(*np.triu_indices(len(species)), strict=True)):
             pair = "" if len(leaf) == 1 else f"pairs.{species[i]}-{species[j]}."
             value = float(leaf[kind])
-            dials.append(_plain(f"potential.{pair}{name}", value, _constant(name, kind), value > 0))
+            dials.append(Dial(f"potential.{pair}{name}", value, _constant(name, kind), value > 0))
     return dials
 
 
@@ -194,9 +177,9 @@ def _radii(simulation: Simulation) -> list[Dial]:
     radii = simulation.decider.r_cut
     if len(set(radii)) > 1:
         return []
-    dials = [Dial("cutoff.radius", radii[0], _given_radius, _radius, True)]
+    dials = [Dial("cutoff.radius", radii[0], _radius)]
     if simulation.cutoff.switches:
-        dials.append(_plain("cutoff.onset", float(np.asarray(simulation.model.r_onset)[0]), _onset))
+        dials.append(Dial("cutoff.onset", float(np.asarray(simulation.model.r_onset)[0]), _onset))
     return dials
 
 
@@ -222,18 +205,6 @@ def _radius(simulation: Simulation, value: float) -> Simulation:
     return replace(simulation, model=model, decider=decider)
 
 
-def _given_radius(simulation: Simulation, value: float) -> Simulation:
-    if simulation.lattice is not None:
-        # the limit of a decision between whole numbers is a part of its program
-        return _radius(simulation, value)
-    return _GivenSimulation(**_parts(_radius(simulation, value)), compiled=simulation.decider)
-
-
-def _parts(one: Any) -> dict[str, Any]:
-    """The fields of a dataclass, for another of the same fields and more."""
-    return {field.name: getattr(one, field.name) for field in fields(one)}
-
-
 def _start(simulation: Simulation, key: str) -> Dial | None:
     parts = key.split(".")
     if len(parts) != 3 or parts[0] not in ("position", "velocity") or parts[2] not in ("x", "y", "z"):
@@ -252,65 +223,4 @@ def _start(simulation: Simulation, key: str) -> Dial | None:
         array[place] = value / factor
         return replace(simulation, **{name: array})
 
-    return _plain(key, float(getattr(simulation, name)[place]) * factor, turn, positive=False)
-
-
-# --- a cutoff radius that is an argument --------------------------------------------------------------
-
-
-class _GivenDecider(PairDecider):
-    """The same decision with thresholds that the compiled program is given."""
-
-    given: Array
-
-    def values(self) -> Array:
-        return self.given
-
-
-class _GivenForce(PairForce):
-    """The pair force with its thresholds as an argument instead of constants.
-
-    Attributes:
-        values: thresholds in the dtype and space that the program compares in, shape (types,).
-    """
-
-    values: Float[Array, "types"] = eqx.field(kw_only=True)
-
-    def _told(self) -> PairForce:
-        decider = _GivenDecider(self.decider.r_cut, self.decider.compare, self.decider.dtype)
-        object.__setattr__(decider, "given", self.values)
-        return PairForce(self.model, self.cell, self.zero, decider, self.policy, self.reduction)
-
-    def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
-        return self._told().decide(positions, tables)
-
-    def __call__(
-        self,
-        positions: Float[Array, "3 atoms"],
-        tables: Tables,
-        *,
-        decisions: bool,
-        given: UInt8[Array, "words atoms"] | None = None,
-        where: UInt8[Array, "words atoms"] | None = None,
-    ) -> Forces:
-        return self._told()(positions, tables, decisions=decisions, given=given, where=where)
-
-
-@dataclass(frozen=True)
-class _GivenSimulation(Simulation):
-    """A simulation whose program does not know its cutoff radius.
-
-    Attributes:
-        compiled: the decision that the program is compiled for; its radii are never compared with.
-    """
-
-    compiled: PairDecider | None = None
-
-    @cached_property
-    def force(self) -> _GivenForce:  # type: ignore[override]
-        assert self.compiled is not None
-        policy = self.policy
-        cell: Cell = self.cell
-        plain = PairForce.create(self.model, cell, self.compiled, policy, self.reduction)
-        values = jnp.asarray(np.asarray([t.value for t in self.decider.thresholds], policy.dtype("decision")))
-        return _GivenForce(**_parts(plain), values=values)
+    return Dial(key, float(getattr(simulation, name)[place]) * factor, turn, positive=False)

@@ -31,6 +31,8 @@ from mdnum.systems.build import Simulation
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
 _RECORD_BYTES = 64 * 2**20
 _MOST_ROWS = 128
+# a record this small has its rows whatever it is for: each number of rows is another program
+_SMALL_BYTES = 4 * 2**20
 
 
 # how a rollout ends that should not have
@@ -148,6 +150,16 @@ def first_state(simulation: Simulation) -> Start:
     return Start(state, np.asarray(wrapped, np.float64))
 
 
+def room_for(rows: int, per_row: int) -> int:
+    """Rows, a power of two above `rows`, to record them in; more where that costs little memory.
+
+    Args:
+        per_row: bytes of a row.
+    """
+    few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
+    return 1 << max(few.bit_length() - 1, rows.bit_length())
+
+
 class Engine:
     """Runs a simulation from a start to a last step.
 
@@ -197,7 +209,7 @@ class Engine:
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if self.record else 64
         rows = max(2, min(_MOST_ROWS, _RECORD_BYTES // per_row))
         # no list is expected to live longer than the run
-        return min(1 << (rows.bit_length() - 1), 1 << max(1, int(self.last + 1).bit_length()))
+        return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
         """The record buffer whose turn it is; it is donated to the epoch that fills it."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.md.cell import HostCell, displacement
+from mdnum.md.cell import HostCell, displacement, nearest_image
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.rollout.engine import Segment
@@ -54,36 +54,75 @@ def _fingerprint_of_keys(keys):
 
 @numba.njit(cache=True, nogil=True)
 def _from_first_end(row, slot, column, values, index, order):
-    """The changes seen from the atom with the smaller label: row, sorted atoms, decision, labels."""
-    total = row.shape[0]
-    kept = 0
-    rows, first, second = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total, np.int64)
-    entered = np.empty(total, np.bool_)
-    low, high = np.empty(total, np.int64), np.empty(total, np.int64)
-    for q in range(total):
+    """The changes seen from the atom with the smaller label: row, sorted atoms, decision, labels.
+
+    There are as many as from the other end; more of either are counted and not noted.
+    """
+    kept, room = 0, row.shape[0] // 2
+    rows, first, second = np.empty((3, room + 1), np.int32)
+    entered = np.empty(room + 1, np.uint8)
+    labels = np.empty((room + 1, 2), np.int32)
+    for q in range(row.shape[0]):
         c = column[q]
         n = index[slot[q], c]
         i, j = order[c], order[n]
-        if i < j:
-            rows[kept], first[kept], second[kept], entered[kept] = row[q], c, n, values[q] == 1
-            low[kept], high[kept] = i, j
-            kept += 1
-    return rows[:kept], first[:kept], second[:kept], entered[:kept], low[:kept], high[:kept]
+        # written always and kept where i < j: half of the branches would be mispredicted
+        at = min(kept, room)
+        rows[at], first[at], second[at], entered[at], labels[at, 0], labels[at, 1] = (
+            row[q],
+            c,
+            n,
+            values[q],
+            i,
+            j,
+        )
+        kept += np.int64(i < j)
+    return kept, rows[:room], first[:room], second[:room], entered[:room], labels[:room]
+
+
+# atoms in one place have no radial speed: not a number, as in numpy
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _measure(x, v, row, first, second, entered, kind, by_type, bounds, root, narrow, lattice):
+    """Margin, bound, energy jump, distance, radial speed and force jump of each flip, shape (6, flips).
+
+    Args:
+        by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
+        root: whether distances are compared, not their squares.
+        narrow, lattice: of the cell in the dtype of the decision, and in float64.
+    """
+    out = np.empty((6, row.shape[0]))
+    small, wide = narrow[0].dtype.type, np.float64
+    for f in range(row.shape[0]):
+        r, a, b, k = row[f], first[f], second[f], kind[f]
+        x0, y0, z0, x1, y1, z1 = x[r, 0, a], x[r, 1, a], x[r, 2, a], x[r, 0, b], x[r, 1, b], x[r, 2, b]
+        dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
+        r2 = dx * dx + dy * dy + dz * dz
+        distance = np.sqrt(r2)
+        quantity = distance if root else r2
+        if narrow[0].itemsize < 8:
+            sx, sy, sz = nearest_image(
+                narrow, small(x1) - small(x0), small(y1) - small(y0), small(z1) - small(z0)
+            )
+            short = sx * sx + sy * sy + sz * sz
+            quantity = wide(np.sqrt(short) if root else short)
+        u0, u1, u2 = v[r, 0, b] - v[r, 0, a], v[r, 1, b] - v[r, 1, a], v[r, 2, b] - v[r, 2, a]
+        approach = wide(u0) * dx + wide(u1) * dy + wide(u2) * dz
+        sign = 1.0 if entered[f] else -1.0
+        out[0, f], out[1, f], out[2, f] = by_type[0, k] - quantity, bounds[r, k], sign * by_type[1, k]
+        out[3, f], out[4, f], out[5, f] = distance, approach / distance, sign * by_type[2, k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(values, row, place, out):
-    """out[c, f] = values[row[f], c, place[f]]: a column of a record at the flips, component by component."""
-    for c in range(3):
-        for f in range(row.shape[0]):
-            out[c, f] = values[row[f], c, place[f]]
-
-
-def _at(values: np.ndarray, row: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Rows of a (rows, 3, atoms) record at given rows and atoms, shape (flips, 3)."""
-    out = np.empty((3, len(row)), values.dtype)
-    _gather(values, row, place, out)
-    return out.T
+def _longest(start, end, order, lattice):
+    """The longest way of an atom between two configurations, the second of shape (3, atoms) and sorted."""
+    longest = 0.0
+    for k in range(order.shape[0]):
+        i = order[k]
+        x, y, z = end[0, k] - start[i, 0], end[1, k] - start[i, 1], end[2, k] - start[i, 2]
+        x, y, z = nearest_image(lattice, np.float64(x), np.float64(y), np.float64(z))
+        longest = max(longest, x * x + y * y + z * z)
+    return np.sqrt(longest)
 
 
 class AmbiguousPairs(NamedTuple):
@@ -136,7 +175,8 @@ class PairRecorder:
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
         self._inclusive = decider.compare.endswith("<=")
-        self._energy_jumps, self._force_jumps = simulation.jumps()
+        thresholds = np.array([threshold.value for threshold in decider.thresholds])
+        self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
         """Number of pairs inside; a full list holds each twice."""
@@ -173,7 +213,9 @@ class PairRecorder:
             first, second, i, j = first[once], second[once], i[once], j[once]
         for row in close:
             x = segment.rows_of("x")[row]
-            kind, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
+            kind = self.simulation.type_of(i, j)
+            d = self._decision_cell.displacement(x[:, first].T, x[:, second].T)
+            margin = self.simulation.decider.host_margin(d, kind)
             bound = bounds[row][kind]
             at = np.flatnonzero(np.abs(margin) <= bound)
             at = at[sort_rows(np.zeros(len(at), np.int64), np.stack([i[at], j[at]], axis=1))]
@@ -182,12 +224,6 @@ class PairRecorder:
                 AmbiguousPairs(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
             )
         return AmbiguousPairs.joined(parts)
-
-    def _margins(self, start, end, i, j):
-        """Pair types and margins of pairs at given positions, with the bits of the program's decision."""
-        kind = self.simulation.type_of(i, j)
-        d = self._decision_cell.displacement(start, end)
-        return kind, self.simulation.decider.host_margin(d, kind)
 
     def flips(self, segment: Segment) -> Ledger:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).
@@ -207,21 +243,20 @@ class PairRecorder:
             before = bits[0]
         row, slot, column, values = changes_in_time(before, bits)
         table = segment.table
-        ends = _from_first_end(row, slot, column, values, table.index, table.order)
-        if 2 * len(ends[0]) != len(row):
+        found, *ends = _from_first_end(row, slot, column, values, table.index, table.order)
+        if 2 * found != len(row):
             raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
-        row, column, neighbor, entered, i, j = ends
         if replaced is not None:
             keys, now = replaced
-            low, high = np.divmod(keys, self.simulation.atoms)
-            place = np.argsort(segment.table.order)
-            row = np.concatenate([np.zeros(len(keys), np.int64), row])
-            column, neighbor = np.append(place[low], column), np.append(place[high], neighbor)
-            entered, i, j = np.append(now, entered), np.append(low, i), np.append(high, j)
+            labels = np.stack(np.divmod(keys, self.simulation.atoms), axis=1)
+            first, second = np.argsort(table.order)[labels.T]
+            added = np.zeros(len(keys), np.int64), first, second, now, labels
+            ends = [np.concatenate(parts) for parts in zip(added, ends, strict=True)]
         if segment.closes:
-            self._held_segment, self._held_keys = (segment.table, np.array(bits[-1])), None
+            self._held_segment, self._held_keys = (table, np.array(bits[-1])), None
             self._held_positions = segment.unsorted("x", segment.rows - 1)
-        return self._ledger(segment, row, column, neighbor, entered, np.stack([i, j], axis=1))
+        order = sort_rows(ends[0], ends[-1])
+        return self._ledger(segment, *(part[order] for part in ends))
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""
@@ -234,8 +269,8 @@ class PairRecorder:
         rule = self.simulation.rule
         if self._held_segment is None or self._held_positions is None or not rule.safe:
             return False
-        steps = self._cell.displacement(self._held_positions, segment.unsorted("x", 0))
-        longest = np.sqrt(np.max(sum(c * c for c in steps), initial=0.0))
+        x, order = segment.rows_of("x")[0], segment.table.order
+        longest = _longest(self._held_positions, x, order, self._cell.lattice)
         return bool(2 * longest < rule.skin) and self.inside(self._held_segment[1]) == self.inside(before)
 
     def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
@@ -261,40 +296,23 @@ class PairRecorder:
         return keys, np.isin(keys, now, assume_unique=True)
 
     def _ledger(self, segment: Segment, row, first, second, entered, labels) -> Ledger:
-        simulation = self.simulation
-        x, v = segment.rows_of("x"), segment.rows_of("v")
-        start, end = _at(x, row, first), _at(x, row, second)
-        kind, margin = self._margins(start, end, labels[:, 0], labels[:, 1])
+        x, v, entered = segment.rows_of("x"), segment.rows_of("v"), entered.astype(bool)
+        kind = self.simulation.type_of(labels[:, 0], labels[:, 1])
+        measured = _measure(
+            x, v, row, first, second, entered, kind, self._by_type, self.bounds(segment),
+            self.simulation.decider.space == "r", self._decision_cell.lattice, self._cell.lattice,
+        )  # fmt: skip
+        margin, bound, jump, distance, speed, force_jump = measured
         if not np.array_equal(margin >= 0 if self._inclusive else margin > 0, entered):
             raise MdnumError(
                 "a recorded margin contradicts its decision",
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
             )
-        dx, dy, dz = self._cell.displacement(start, end)
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        u = (_at(v, row, second) - _at(v, row, first)).astype(np.float64)
-        approach = u[:, 0] * dx + u[:, 1] * dy + u[:, 2] * dz
-        sign = np.where(entered, 1.0, -1.0)
-        step = segment.first + row
-        order = sort_rows(step, labels)
-        bound = self.bounds(segment)[row, kind] if len(row) else np.zeros(0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            extra = {
-                "distance": distance[order],
-                # user units of time: the ledger is for people
-                "radial_speed": (approach / distance)[order] * simulation.units.time_factor,
-                "force_jump": (sign * self._force_jumps[kind])[order],
-            }
-        return Ledger(
-            "pair",
-            step[order],
-            labels[order],
-            entered[order],
-            margin[order],
-            bound[order],
-            (sign * self._energy_jumps[kind])[order],
-            extra,
-        )
+        # user units of time: the ledger is for people
+        speed = speed * self.simulation.units.time_factor
+        extra = {"distance": distance, "radial_speed": speed, "force_jump": force_jump}
+        step = segment.first + row.astype(np.int64)
+        return Ledger("pair", step, labels.astype(np.int64), entered, margin, bound, jump, extra)
 
 
 def flip_columns(ledger: Ledger) -> dict[str, np.ndarray]:

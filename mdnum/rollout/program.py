@@ -15,7 +15,7 @@ from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 from mdnum.rollout.compared import Apart, CrossFlip, ReferenceFrame
-from mdnum.rollout.dials import Dial, dial, unit
+from mdnum.rollout.dials import dial, unit
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
 from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
@@ -184,12 +184,11 @@ class MdProgram:
     def number(self, key: str) -> Number:
         """A number of the system, as `rollout.dials.dial` names them."""
         found = dial(self.simulation, key)
-        at = self._turned(found, found.turn)
-        proper = self._turned(found, found.proper) if found.compiles else at
-        return Number(found.key, found.value, unit(self.simulation, found.key), at, proper, found.positive)
 
-    def _turned(self, found: Dial, turn: Callable[[Simulation, float], Simulation]):
-        return lambda value: replace(self, simulation=turn(self.simulation, value))
+        def at(value: float) -> MdProgram:
+            return replace(self, simulation=found.turn(self.simulation, value))
+
+        return Number(found.key, found.value, unit(self.simulation, found.key), at, at, found.positive)
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
         """What a run decides (see `Program.history`); the loss is the squared displacement by default."""

@@ -49,6 +49,7 @@ _NOTHING_YET = (
     _LOCK,
     "parts",
 )
+_RESTORE = "Restore it from a copy, or run again in a new folder"
 # what people do with system.toml and log.txt changes no number that was recorded
 _EDITED = ("system.toml", "log.txt")
 
@@ -124,15 +125,7 @@ class RunFolder:
             for name in (*_FILES, manifest.NAME, *(made.files if made is not None else ())):
                 if (folder.path / name).parent == folder.path:
                     (folder.path / name).unlink(missing_ok=True)
-            for pattern in (
-                "parts/*.parquet",
-                "figures/*.svg",
-                "structures/*.extxyz",
-                ".*.part",
-                "parts/.*.part",
-            ):
-                for file in folder.path.glob(pattern):
-                    file.unlink()
+            folder._sweep("parts/*.parquet", "figures/*.svg", "structures/*.extxyz")
             folder._foreign = frozenset(entry.name for entry in folder.path.iterdir())
             folder._owner = True
             manifest.save(folder.path, manifest.Manifest(world))
@@ -432,11 +425,7 @@ class RunFolder:
             # part files by their number only
             sound = [each for each in tables if each not in others and "/" not in each]
             told = f"; {', '.join(sound)} can still be read" if sound else ""
-            raise FolderError(
-                f"{wrong}{told}",
-                remedy="Restore it from a copy, or run again in a new folder",
-                where=str(self.path / name),
-            )
+            raise FolderError(f"{wrong}{told}", remedy=_RESTORE, where=str(self.path / name))
 
     @contextmanager
     def explained(self) -> Iterator[None]:
@@ -457,11 +446,8 @@ class RunFolder:
                 raise
             seen = " ".join(str(error).split())[:200]
             names = f" (damaged: {', '.join(wrong)})" if wrong else ""
-            raise FolderError(
-                f"what it holds is not what mdnum writes{names}: {type(error).__name__} {seen}".rstrip(),
-                remedy="Restore it from a copy, or run again in a new folder",
-                where=str(self.path),
-            ) from error
+            message = f"what it holds is not what mdnum writes{names}: {type(error).__name__} {seen}".rstrip()
+            raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
         """Compares what a run begins with, its system and what belongs to it, with the manifest.
@@ -470,9 +456,8 @@ class RunFolder:
             FolderError: it was changed, so that a run of it would be another one.
         """
         for name in self._listed():
-            if name in ("system.toml", "structure.extxyz") or (
-                name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
-            ):
+            further = name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
+            if further or name in ("system.toml", "structure.extxyz"):
                 self.check(name)
 
     def noted(self) -> list[str]:
@@ -496,9 +481,9 @@ class RunFolder:
             self.check(merged)
         return TableStream(self.path, name, self.world, lambda path: self.check(manifest.place(path)[1]))
 
-    def _sweep(self) -> None:
-        """Removes what a kill left of files that were being replaced."""
-        for pattern in (".*.part", "parts/.*.part"):
+    def _sweep(self, *patterns: str) -> None:
+        """Removes what a kill left of files that were being replaced, and files of these patterns."""
+        for pattern in (*patterns, ".*.part", "parts/.*.part"):
             for file in self.path.glob(pattern):
                 file.unlink()
 
@@ -543,13 +528,8 @@ class RunFolder:
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
         fixed = {name for name in _FILES if name != _WRITTEN_ANEW and not name.endswith(".parquet")}
-        names = [
-            name
-            for name in there
-            if name in ("log.txt", "trajectory.traj")
-            or (name not in listed and (name in fixed or _FURTHER.fullmatch(name)))
-        ]
-        now = manifest.listed_files(self.path, names)
+        new = [name for name in there if name not in listed and (name in fixed or _FURTHER.fullmatch(name))]
+        now = manifest.listed_files(self.path, {*new, *({"log.txt", "trajectory.traj"} & set(there))})
         for name, allowed in listed.items():
             # what was about to be replaced has been
             if len(allowed) > 1 and name not in now and (one := manifest.digest(self.path / name)) in allowed:
@@ -582,9 +562,7 @@ class RunFolder:
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():
-            raise FolderError(
-                "has no checkpoint to resume from", remedy=f"{_again(self.path)}", where=str(self.path)
-            )
+            raise FolderError("has no checkpoint to resume from", remedy=self.again, where=str(self.path))
         self.check("checkpoint.npz")
         path = self.path / "checkpoint.npz"
         state, store = checkpoint.read(path)
@@ -690,11 +668,8 @@ def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
 def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
     """Raises what there is to say of a folder that is not empty."""
     if not any(name in (*_FILES, "parts", manifest.NAME) for name in present):
-        raise FolderError(
-            f"is not empty (it holds {present[0]!r})",
-            remedy="Choose an empty or a new folder",
-            where=str(path),
-        )
+        seen = f"is not empty (it holds {present[0]!r})"
+        raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
     made = manifest.load(path)
     stopped = made is not None and not made.finished
     remedy = _again(path) if stopped or manifest.resumable(path) else "Choose another folder, or remove it"

@@ -214,9 +214,10 @@ class Simulation:
         self,
         positions: Float[np.ndarray, "atoms 3"] | None = None,
         cell: Float[np.ndarray, "3 3"] | None = None,
+        stress: bool = True,
     ) -> Evaluation:
-        """As `Evaluator`, for one configuration, with a list of its own."""
-        return Evaluator(self, skin=0.0)(positions, cell)
+        """`Evaluator.__call__` for one configuration, with a list of its own."""
+        return Evaluator(self, skin=0.0)(positions, cell, stress)
 
     def energy(self, positions: Float[np.ndarray, "atoms 3"] | None = None) -> float:
         """The potential energy of one configuration alone, with a list of its own.
@@ -224,11 +225,8 @@ class Simulation:
         Args:
             positions: length; default the structure's.
         """
-        at = np.asarray(self.positions if positions is None else positions, np.float64)
-        wrapped, _ = wrap_positions(self.cell, at)
-        table = self.verlet_list(skin=0.0).build(wrapped, self.cell)
-        x = jnp.asarray(wrapped[table.order].T, self.policy.dtype("state"))
-        return float(_total(self.force, x, self.tables(table)))
+        _, _, _, tables, x = Evaluator(self, skin=0.0)._sorted(positions, None)
+        return float(_total(self.force, x, tables))
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
@@ -411,7 +409,8 @@ class Evaluation:
     Attributes:
         energy: total energy.
         forces: shape (atoms, 3), energy/length.
-        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume.
+        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume, and
+            where it was not asked for.
         energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
         find_pairs: finds the pairs inside the (longest) cutoff, i < j, and their distances, once asked for.
     """
@@ -461,24 +460,20 @@ class Evaluator:
         self,
         positions: Float[np.ndarray, "atoms 3"] | None = None,
         cell: Float[np.ndarray, "3 3"] | None = None,
+        stress: bool = True,
     ) -> Evaluation:
         """Energy, forces, stress and pairs.
 
         Args:
             positions: length; default the structure's.
             cell: lattice vectors as rows; default the system's.
+            stress: whether it is needed; it takes about as long as the forces.
 
         Raises:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
-        own = self.simulation
-        same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
-        here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))
-        at = np.asarray(own.positions if positions is None else positions, np.float64)
-        wrapped, _ = wrap_positions(here.cell, at)
-        table, tables = self._list(here, wrapped)
-        x = jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
-        result, bits, virial = _evaluate(here.force, x, tables)
+        here, wrapped, table, tables, x = self._sorted(positions, cell)
+        result, bits, virial = _evaluate(here.force, x, tables, stress)
         forces = np.empty((here.atoms, 3))
         forces[table.order] = np.asarray(result.force, np.float64).T
         energies = np.full(here.atoms, np.nan)
@@ -487,10 +482,20 @@ class Evaluator:
         return Evaluation(
             float(jnp.sum(result.energy, dtype=jnp.float64)),
             forces,
-            -np.asarray(virial) / here.cell.volume,
+            np.full((3, 3), np.nan) if virial is None else -np.asarray(virial) / here.cell.volume,
             energies,
             lambda: here.inside(wrapped, table, np.asarray(bits)),
         )
+
+    def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
+        """The simulation in this cell, wrapped positions, the list for them, and positions in its order."""
+        own = self.simulation
+        same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
+        here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))
+        at = np.asarray(own.positions if positions is None else positions, np.float64)
+        wrapped, _ = wrap_positions(here.cell, at)
+        table, tables = self._list(here, wrapped)
+        return here, wrapped, table, tables, jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
         """The list in use, rebuilt where it no longer holds every pair inside."""
@@ -509,11 +514,11 @@ class Evaluator:
 
 
 @eqx.filter_jit
-def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables):
-    """Forces, decisions, and the virial tensor sum r_ij ⊗ F_ij."""
+def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool):
+    """Forces, decisions, and the virial tensor sum r_ij ⊗ F_ij where the stress is needed."""
     result = force(x, tables, decisions=True)
     assert result.decisions is not None
-    return result, result.decisions.bits, force.virial_tensor(x, tables)
+    return result, result.decisions.bits, force.virial_tensor(x, tables) if stress else None
 
 
 @eqx.filter_jit

@@ -96,7 +96,8 @@ def lattice_of(box: Box) -> ReducedLattice:
             )
         if np.count_nonzero(matrix) > pbc.sum():
             # a box with right angles is reduced, and stays in its order
-            combination = np.asarray(minkowski_reduce(matrix, pbc.tolist())[1], np.int64)
+            # in the layout of the one above: of another, numba would compile every search a second time
+            combination = np.ascontiguousarray(minkowski_reduce(matrix, pbc.tolist())[1], np.int64)
         vectors = np.where(pbc[:, None], combination @ matrix, 0.0)
     inverse = np.linalg.inv(complete_cell(vectors))
     widths = np.where(pbc, 1.0 / np.linalg.norm(inverse, axis=0), np.inf)

@@ -285,10 +285,21 @@ def _choose(
                 squares[k], js[k] = rows.square[first + k], rows.other[first + k]
             else:
                 squares[k], js[k] = own[(k - count) // 2], i
-        # by index first, so that the stable sort by square breaks ties by index
-        order = np.argsort(js, kind="mergesort")
-        squares, js = squares[order], js[order]
-        order = np.argsort(squares, kind="mergesort")
+        # Shell's sort by (square, index): numba takes seconds to compile its own
+        order, gap = np.arange(length), 1
+        while 9 * gap < length:
+            gap = 3 * gap + 1
+        while gap > 0:
+            for m in range(gap, length):
+                k, at = order[m], m
+                while at >= gap:
+                    other = order[at - gap]
+                    if squares[other] < squares[k] or (squares[other] == squares[k] and js[other] <= js[k]):
+                        break
+                    order[at] = other
+                    at -= gap
+                order[at] = k
+            gap //= 3
         inside = 0
         for k in range(length):
             inside += int(squares[k] < reach * reach)

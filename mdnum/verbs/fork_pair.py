@@ -159,7 +159,7 @@ def followed(
 def _numbers(made: Fork) -> dict[str, Any]:
     """What the summary of any pair says: dates, verdict, growth, the table of two by two."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
-    dates = {"first_bit": made.dates.seed, "fork": made.dates.fork, "split": made.dates.split}
+    dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
         values[np.isfinite(values)] for values in
         (made.series.get(name, np.zeros(0)).astype(float) for name in ("B", "B|A", "overridden"))
@@ -174,17 +174,17 @@ def _numbers(made: Fork) -> dict[str, Any]:
         **{f"{name}_time": None if at is None else at * step for name, at in dates.items()},
         "tolerance": made.tolerance, "effect": verdict.word,
         "reasons": [{"code": code, **values} for code, values in verdict.reasons],
-        "e_foldings": verdict.nats, "count": count, "growth_rate": growth.rate,
+        "e_foldings": verdict.e_foldings, "count": count, "growth_rate": growth.rate,
         "growth_rate_time": growth.rate / step, "r_squared": growth.r_squared,
         "growth": {name: _fit(fit, made.series[name]) for name, fit in made.growth.items()},
         "splits": {name: made.splits[name] for name in ("B", "B|A", "A|B") if name in made.splits},
         "table": made.table,
         "shares": [
             {"what": one.what, "reference": one.reference, "steps": one.steps, "at_least": one.at_least,
-             "e_foldings": one.nats}
+             "e_foldings": one.e_foldings}
             for one in made.shares
         ],
-        "repeated": [{"free": one.free, "imposed": one.handed} for one in made.repeats],
+        "repeated": [{"free": one.free, "imposed": one.imposed} for one in made.repeats],
         "imposed_until": len(imposed) - 1 if len(imposed) else None,
         "imposed_largest": imposed.max() if len(imposed) else None,
         "separation_end": free[-1] if len(free) else None,
@@ -345,7 +345,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
         return {"lyapunov": None, "lyapunov_reason": TEXTS(f"lyapunov_{name}", **values)}
 
     a = made.twin.a.simulation
-    if made.dates.seed is None:
+    if made.dates.first_bit is None:
         return why("same")
     if not a.pairwise:
         return why("many_body")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ase import Atoms
+from ase.build import bulk
 from audit import laws
 from audit.laws import R_CUT, R_ON, Bare, law, stepped, subject
 from audit.planted import codes
@@ -177,30 +178,34 @@ def test_float32_is_not_taken_for_jumps():
     assert found.jumps[1] == pytest.approx(-law(R_CUT)[1], rel=1e-4)
 
 
+#: Words, a structure with its species where the one by default takes long to find, and (distance, order) of
+#: each threshold of two, from the calculators' own documentation and source.
+ASES_OWN = {
+    "lj": ("lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)", "Ar", [(8.5, 1)]),
+    "lj smooth": (
+        "lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5, ro=6.0, smooth=True)", "Ar", [(6.0, 2), (8.5, 2)],
+    ),
+    "morse": ("morse:MorsePotential(epsilon=0.5, r0=2.6)", "Ar", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
+    "tip3p": ("tip3p:TIP3P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
+    "tip4p": ("tip4p:TIP4P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
+    "emt": ("emt:EMT", None, [(5.8768, 0)]),
+    "eam": (f"eam:EAM(potential={str(COPPER)!r})", "Cu", [(5.50679, 1)]),
+    "tersoff": ("tersoff:Tersoff.from_lammps('silicon.tersoff')", "Si", [(2.7, 2), (3.0, 2)]),
+}  # fmt: skip
+LONG = ("tip4p", "eam", "tersoff")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        # (distance, order) of each threshold of two, from the calculators' own documentation and source
-        ("ase.calculators.lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)", [(8.5, 1)]),
-        (
-            "ase.calculators.lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5, ro=6.0, smooth=True)",
-            [(6.0, 2), (8.5, 2)],
-        ),
-        ("ase.calculators.morse:MorsePotential(epsilon=0.5, r0=2.6)", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
-        ("ase.calculators.tip3p:TIP3P(rc=5.5, width=1.0)", [(4.5, 2), (5.5, 2)]),
-        ("ase.calculators.tip4p:TIP4P(rc=5.5, width=1.0)", [(4.5, 2), (5.5, 2)]),
-        ("ase.calculators.emt:EMT", [(5.8768, 0)]),
-        (f"ase.calculators.eam:EAM(potential={str(COPPER)!r})", [(5.50679, 1)]),
-        ("ase.calculators.tersoff:Tersoff.from_lammps('silicon.tersoff')", [(2.7, 2), (3.0, 2)]),
-    ],
-    ids=["lj", "lj smooth", "morse", "tip3p", "tip4p", "emt", "eam", "tersoff"],
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in LONG)) for name in ASES_OWN]
 )
-def test_ases_own(words: str, expected, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_ases_own(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "silicon.tersoff").write_text(SILICON)
     monkeypatch.chdir(tmp_path)
-    loaded = load_calculator(words)
-    found = walked(CalculatorSubject(words, loaded.make, default_structure(loaded))).thresholds
+    words, atoms, expected = ASES_OWN[name]
+    loaded = load_calculator(f"ase.calculators.{words}")
+    structure = bulk(atoms) if atoms else default_structure(loaded)
+    found = walked(CalculatorSubject(words, loaded.make, structure)).thresholds
     assert [one.order for one in found] == [order for _, order in expected]
     assert [one.radius for one in found] == [pytest.approx(r, abs=2e-4) for r, _ in expected]
 
@@ -220,7 +225,7 @@ def raised(pair, place: float, size: float):
 
 @pytest.mark.parametrize(("change", "pair", "row"), [(raised, wall, 0), (stepped, laws.soft, 1)])
 @given(place=st.floats(3.2, 5.9), power=st.floats(0.0, 1.0))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_a_step_is_found_wherever_it_is(change, pair, row: int, place: float, power: float):
     """On a wall of eV/Å; by what the force's work does not explain, long before the values stand out."""
     size = 10.0 ** (-5.5 + 4.5 * power if row == 0 else -8.0 + 6.0 * power)

@@ -50,7 +50,9 @@ def test_located_impacts_meet_the_exact_motion_at_every_step():
     np.testing.assert_allclose(run.v[away, 0], v.value[away], atol=2e-13)
 
 
-@pytest.mark.parametrize("name", ["y0", "v0", "gravity", "restitution"])
+@pytest.mark.parametrize(
+    "name", ["y0", "restitution", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("v0", "gravity"))]
+)
 def test_located_impacts_have_the_exact_derivatives(name):
     world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
     # 2.9 s: eight impacts of the lowest ball, five of the highest
@@ -64,8 +66,8 @@ def test_located_impacts_have_the_exact_derivatives(name):
     ("contact", "scheme"),
     [
         (Impact(), ExplicitEuler),
-        (Impact(), SemiImplicitEuler),
-        (Impact(), BallVerlet),
+        pytest.param(Impact(), SemiImplicitEuler, marks=pytest.mark.nightly),
+        pytest.param(Impact(), BallVerlet, marks=pytest.mark.nightly),
         (Projection(0.5, 0.5, PerInstance(1e-9, 200)), SemiImplicitEuler),
     ],
 )
@@ -79,10 +81,10 @@ def test_a_reset_at_the_end_of_a_step_is_of_order_one_and_its_derivative_is_zero
 @pytest.mark.parametrize(
     ("scheme", "order"),
     [
-        (ExplicitEuler, 1),
+        pytest.param(ExplicitEuler, 1, marks=pytest.mark.nightly),
         (SemiImplicitEuler, 1),
         (BallVerlet, 2),
-        (ImplicitMidpoint, 2),
+        pytest.param(ImplicitMidpoint, 2, marks=pytest.mark.nightly),
     ],
 )
 def test_a_penalty_approaches_the_spring_floor(scheme, order):

@@ -16,11 +16,15 @@ from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Sequential
 
 
-def solve(depths, stop, k=0.5, alpha=0.5, policy=None, steps=1):
-    """Balls below the floor at rest and without gravity: the first step is the projection alone."""
+def solve(depths, stop, k=0.5, alpha=0.5, policy=None, steps=1, history=False):
+    """Balls below the floor at rest and without gravity: the first step is the projection alone.
+
+    Balls on the floor fill up the batch, so that a rule is compiled once.
+    """
     contact = ball.Projection(k, alpha, stop)
     world = ball.World.create(contact, ball.SemiImplicitEuler(0.1), gravity=0.0, policy=policy)
-    return ball.simulate(world, world.start(-np.asarray(depths, float)), steps, history=True)
+    start = world.start(-np.pad(np.asarray(depths, float), (0, max(0, 4 - len(depths)))))
+    return ball.simulate(world, start, steps, history=history)
 
 
 @pytest.mark.parametrize(("tol", "iterations"), [(1e-2, 14), (1e-4, 30), (1e-6, 46)])
@@ -34,7 +38,7 @@ def test_known_iteration_counts(tol, iterations):
     st.floats(0.05, 1.0),
 )
 def test_iterations_follow_from_the_contraction(gain, tol, depth):
-    run = solve([depth], ball.GlobalSum(tol, 1000), k=gain, alpha=1.0)
+    run = solve([depth], ball.GlobalSum(tol, 1000), k=gain, alpha=1.0, history=True)
     count = int(run.iterations[0])
     exact = math.log(tol / depth) / math.log1p(-gain)
     # within rounding of a whole number of iterations either neighbor is right
@@ -47,10 +51,10 @@ def test_iterations_follow_from_the_contraction(gain, tol, depth):
 
 
 def test_the_cap_is_named_and_the_margin_says_by_how_much():
-    run = solve([0.45], ball.GlobalSum(1e-6, 20))
+    run = solve([0.45], ball.GlobalSum(1e-9, 46))
     assert run.ended() == {"cap": 1}
-    assert run.iterations[0] == 20
-    np.testing.assert_allclose(run.margin[0], 1e-6 - 0.45 * 0.75**20, rtol=1e-12)
+    assert run.iterations[0] == 46
+    np.testing.assert_allclose(run.margin[0], 1e-9 - 0.45 * 0.75**46, rtol=1e-12)
     met = solve([0.45], ball.GlobalSum(1e-6, 46))
     assert met.ended() == {"tolerance": 1}
     assert met.margin[0] > 0 > met.before[0]
@@ -93,7 +97,9 @@ def test_relative_tolerance_scales():
     assert solve([0.0], ball.Relative(1e-3)).iterations[0] == 0
 
 
-@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
+@pytest.mark.parametrize(
+    "dtype", ["float16", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("bfloat16", "float32"))]
+)
 def test_nothing_to_solve_is_below_a_relative_tolerance_in_every_dtype(dtype):
     run = solve([0.0], ball.Relative(1e-2, 7), policy=RolePrecision(dtype, dtype, dtype, dtype, "float64"))
     assert run.ended() == {"tolerance": 1}
@@ -104,8 +110,8 @@ def test_nothing_to_solve_is_below_a_relative_tolerance_in_every_dtype(dtype):
     ("float32", "float32", 1),
     ("bfloat16", "bfloat16", 0),
     ("bfloat16", "float32", 1),
-    ("float16", "float16", 0),
-    ("float16", "float32", 1),
+    pytest.param("float16", "float16", 0, marks=pytest.mark.nightly),
+    pytest.param("float16", "float32", 1, marks=pytest.mark.nightly),
 ])  # fmt: skip
 def test_a_fragile_sum_stops_before_the_first_iteration(dtype, accumulate, iterations):
     low = "bfloat16" if dtype == "float32" else dtype

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from ball import oracles
@@ -33,17 +35,27 @@ def same_bits(run, rows, decided, index):
     np.testing.assert_array_equal(run.contact[:, index], decided)
 
 
-@pytest.mark.parametrize("dtype", oracles.DTYPES)
-@pytest.mark.parametrize("scheme", SCHEMES)
+MODELS = {
+    "penalty": (ball.Penalty(900.0, damping=0.5), oracles.penalty, (900, 0.5)),
+    "impact": (ball.Impact(0.8), oracles.impact, (0.8, 1e-6)),
+}
+#: Each model by each scheme, and every format.
+TELLING = {
+    ("penalty", "semi-implicit-euler", "float64"), ("impact", "semi-implicit-euler", "float64"),
+    ("penalty", "velocity-verlet", "bfloat16"), ("impact", "explicit-euler", "bfloat16"),
+    ("penalty", "explicit-euler", "float16"), ("impact", "velocity-verlet", "float32"),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("contact", "oracle", "numbers"),
+    ("model", "scheme", "dtype"),
     [
-        (ball.Penalty(900.0, damping=0.5), oracles.penalty, (900, 0.5)),
-        (ball.Impact(0.8), oracles.impact, (0.8, 1e-6)),
+        pytest.param(*case, marks=[] if case in TELLING else pytest.mark.nightly)
+        for case in itertools.product(MODELS, SCHEMES, oracles.DTYPES)
     ],
 )
-def test_a_step_has_the_bits_of_numpy(contact, oracle, numbers, scheme, dtype):
-    kind = oracles.DTYPES[dtype]
+def test_a_step_has_the_bits_of_numpy(model, scheme, dtype):
+    (contact, oracle, numbers), kind = MODELS[model], oracles.DTYPES[dtype]
     run = run_of(contact, SCHEMES[scheme](0.01), dtype)
     for index, (y, v) in enumerate(zip(Y0, V0, strict=True)):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -52,7 +64,10 @@ def test_a_step_has_the_bits_of_numpy(contact, oracle, numbers, scheme, dtype):
     assert run.contact.any()
 
 
-@pytest.mark.parametrize("dtype", oracles.DTYPES)
+@pytest.mark.parametrize(
+    "dtype",
+    ["float64", "bfloat16", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("float32", "float16"))],
+)
 def test_projection_has_the_bits_and_the_iterations_of_numpy(dtype):
     kind = oracles.DTYPES[dtype]
     rule = ball.GlobalSum(1e-3, 50, Sequential())
@@ -105,7 +120,7 @@ def test_one_inverted_contact_is_found(step, index):
 def test_one_more_solver_iteration_is_found():
     world = ball.World.create(*ALL["projection"])
     start = world.start(Y0, V0)
-    free = ball.simulate(world, start, STEPS, history=True)
+    free = ball.simulate(world, start, STEPS)
     step = int(np.flatnonzero(free.iterations > 5)[3]) + 1
     iterations = free.iterations.copy()
     iterations[step - 1] += 1
@@ -121,8 +136,12 @@ def test_a_ball_does_not_feel_the_batch_it_is_in():
         world = ball.World.create(*ALL[name])
         whole = ball.simulate(world, world.start(Y0, V0), STEPS)
         for index in range(len(Y0)):
-            alone = ball.simulate(world, world.start(Y0[index], V0[index]), STEPS)
-            np.testing.assert_array_equal(whole.y[:, index], alone.y[:, 0])
+            # two that start in contact beside it; and one of the models by itself, as another program
+            other = np.where(np.arange(len(Y0)) == index, Y0, -1e-3)
+            batches = [(other, V0)] + [(Y0[index], V0[index])] * (name == "projection per ball")
+            for start in batches:
+                run = ball.simulate(world, world.start(*start), STEPS)
+                np.testing.assert_array_equal(whole.y[:, index], run.y[:, index % run.balls])
 
 
 def test_control_is_added_and_ends_at_its_last_value():

@@ -23,11 +23,12 @@ from mdnum.verbs import demos
 from mdnum.verbs.demos import Demo
 
 G, H, E = 9.81, 0.01, 0.8
-#: These take seconds each.
+#: These take seconds each; of two the records of tests/goldens have the numbers as well.
 SLOW = {
-    "determinism", "euler-choice", "fork", "hysteresis", "implicit", "per-instance", "saltation",
-    "smoothing-width", "stiffness", "stopping-precision", "tf32-in-solver",
+    "determinism", "euler-choice", "fork", "hysteresis", "implicit", "per-instance", "smoothing-width",
+    "stiffness", "tf32-in-solver",
 }  # fmt: skip
+NIGHTLY = {"saltation", "stopping-precision"}
 
 
 @cache
@@ -502,7 +503,13 @@ ORACLES: dict[str, Callable[[Demo], Any]] = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ORACLES]
+    "name",
+    [
+        pytest.param(
+            name, marks=[pytest.mark.slow] * (name in SLOW) + [pytest.mark.nightly] * (name in NIGHTLY)
+        )
+        for name in ORACLES
+    ],
 )
 @pytest.mark.usefixtures("strangers_folder")
 def test_a_demonstration_shows_what_a_plain_loop_shows(name: str):

@@ -25,7 +25,7 @@ def found() -> Fork:
 @pytest.fixture(scope="module")
 def quick() -> Fork:
     """Two crystals 1e-6 apart, whose split hangs on several decisions."""
-    return followed(1e-6, 1500, split=0.03, back=True)
+    return followed(1e-6, 900, split=0.03, repeats=0, counterfactual=False)
 
 
 def test_the_decision_at_the_fork_alone(found):
@@ -155,4 +155,4 @@ def test_within_few_runs_a_set_is_enough_but_not_proven_smallest(quick):
 
 def test_what_did_not_split_has_no_cause():
     with pytest.raises(InputError, match="did not split"):
-        minimal_cause(followed(1e-6, 37, back=True, repeats=0))
+        minimal_cause(followed(1e-7, 37, repeats=0, counterfactual=False))

@@ -65,7 +65,7 @@ def forks() -> dict[str, list[Fork]]:
 
 def worth(found: list[Fork]) -> float:
     """What the flips were worth, e-foldings, in the median over the starts."""
-    return float(np.median([one.verdict.nats for one in found]))
+    return float(np.median([one.verdict.e_foldings for one in found]))
 
 
 def words(found: list[Fork]) -> list[str]:
@@ -93,7 +93,7 @@ def test_switched_off_smoothly_they_only_come_along(forks):
     assert words(forks["switched"]) == ["bystander"] * len(STARTS)
     for found in forks["switched"]:
         assert found.dates.fork < found.dates.split
-        assert abs(found.verdict.nats) < 1
+        assert abs(found.verdict.e_foldings) < 1
 
 
 def test_at_the_usual_cutoff_chaos_would_have_done(forks):

@@ -30,6 +30,11 @@ def relaxation(tol: float, p0=(0.45,), rule=GlobalSum) -> BallProblem:
     return BallProblem(world, -np.array(p0), 0.0, 1, ResidualPenetration(1))
 
 
+def plain(y0=1.0, h: float = 1e-3) -> BallProblem:
+    """2,000 plain steps: one program for all that ask for no other."""
+    return bouncing(SemiImplicitEuler(h), steps=2000, y0=y0)
+
+
 def bouncing(scheme, end: float = 2.0, steps: int | None = None, y0=1.0, **contact) -> BallProblem:
     world = World.create(Impact(**contact), scheme)
     return BallProblem(world, y0, 0.0, steps or round(end / float(scheme.h)))
@@ -73,17 +78,17 @@ def test_the_unrolled_gain_is_an_artefact_of_the_tolerance_and_the_implicit_one_
     assert unrolled.depends == {"k": True, "y0": True}
     assert implicit.depends == {"k": False, "y0": False}
     # taking the stopped iterate for the fixed point lets the tolerance back in: p / k
-    near = method("implicit", at_iterate=True)(problem, ["k"])
+    near = method("implicit", at_iterate=True)(problem, ["k", "y0"])
     np.testing.assert_allclose(near.gradient["k"], -unrolled.value / 0.5, rtol=1e-11)
 
 
 def test_a_gain_that_no_iteration_used_is_said_not_to_matter() -> None:
     for rule in (GlobalSum, PerInstance):
-        found = method("unrolled")(relaxation(1.0, (0.25, 0.2), rule), ["k", "y0"])
+        found = method("unrolled")(relaxation(1.0, (0.25,), rule), ["k", "y0"])
         assert found.gradient["k"] == 0.0
         assert found.depends == {"k": False, "y0": True}
         assert found.notes["k"] == "the loop ended before k was used: the loss does not depend on k"
-    flying = method("unrolled")(bouncing(SemiImplicitEuler(1e-2), steps=10), ["restitution"])
+    flying = method("unrolled")(plain(y0=100.0), ["restitution"])
     assert not flying.depends["restitution"]
     assert flying.notes["restitution"].startswith("no ball touched the floor")
 
@@ -109,8 +114,8 @@ def test_a_fixed_point_too_ill_conditioned_to_differentiate_is_refused() -> None
     world = World.create(Projection(1e-13, 0.5, GlobalSum(1e-2, 3)), SemiImplicitEuler(1.0), gravity=0.0)
     problem = BallProblem(world, np.array([-0.45]), 0.0, 1, ResidualPenetration(1))
     with pytest.raises(InputError, match="condition number 2e\\+13"):
-        method("implicit")(problem, ["k"])
-    helped = method("implicit", regularization=1e-3)(problem, ["k"])
+        method("implicit")(problem, ["k", "y0"])
+    helped = method("implicit", regularization=1e-3)(problem, ["k", "y0"])
     assert helped.details["condition"] < 1e4
     assert helped.gradient["k"] == 0.0
 
@@ -129,7 +134,7 @@ def test_located_impacts_have_the_derivative_of_the_exact_motion() -> None:
 
 @pytest.mark.slow
 def test_steps_alone_never_learn_of_the_start_and_saltation_does_to_order_h() -> None:
-    # the mean over heights averages out where in its step each impact falls
+    # the mean over heights averages out where in its step each impact falls; an eighth of the step at the end
     starts = np.linspace(0.98, 1.02, 41)
 
     def mean(shift: float, e: float, g: float) -> float:
@@ -137,7 +142,7 @@ def test_steps_alone_never_learn_of_the_start_and_saltation_does_to_order_h() ->
 
     exact = slopes(mean, {"shift": 0.0, "e": 0.8, "g": 9.81}, 1e-4)
     errors = []
-    for h in (2e-3, 1e-3, 5e-4, 2.5e-4):
+    for h in (2e-3, 2.5e-4):
         problem = bouncing(SemiImplicitEuler(h), y0=starts)
         assert problem.value_and_grad(["y0"])[1]["y0"] == 0.0
         aware = method("event-aware")(problem, ["y0", "restitution", "gravity"])
@@ -151,17 +156,20 @@ def test_steps_alone_never_learn_of_the_start_and_saltation_does_to_order_h() ->
     np.testing.assert_allclose(np.log2(relative[0] / relative[-1]) / 3, 1.0, atol=0.2)
 
 
-@pytest.mark.parametrize(("h", "known"), [(1e-2, 0.39), (1e-3, 9.9e-3)])
+@pytest.mark.parametrize(
+    ("h", "known"), [pytest.param(1e-2, 0.39, marks=pytest.mark.nightly), (1e-3, 9.9e-3)]
+)
 def test_the_known_errors_of_saltation_on_plain_steps(h: float, known: float) -> None:
-    problem = bouncing(SemiImplicitEuler(h))
+    problem = plain() if h == 1e-3 else bouncing(SemiImplicitEuler(h))
     assert problem.value_and_grad(["y0"])[1]["y0"] == 0.0
     found = method("event-aware")(problem, ["y0"]).gradient["y0"]
     np.testing.assert_allclose(abs(found - 0.4266108641634107), known, rtol=0.03)
 
 
-def damped(y0, k, damping, g=9.81, end=1.0):
+def damped(y0, k, damping, v0, end, g=9.81):
     """A ball on a damped spring floor: flight, one contact by the roots of the oscillator, flight."""
-    speed, time = np.sqrt(2 * g * y0), np.sqrt(2 * y0 / g)
+    speed = np.sqrt(v0 * v0 + 2 * g * y0)
+    time = (v0 + speed) / g
     rate = np.sqrt(k - damping**2 / 4)
 
     def depth(t):
@@ -183,14 +191,16 @@ def damped(y0, k, damping, g=9.81, end=1.0):
 @pytest.mark.parametrize("scheme", [SemiImplicitEuler, BallVerlet])
 def test_a_damper_that_sets_in_with_a_jump_needs_the_saltation_too(scheme) -> None:
     names = ["y0", "k", "damping"]
-    exact = slopes(lambda **p: damped(**p), {"y0": 1.0, "k": 1e4, "damping": 20.0}, 1e-5)
     naive_error, aware_error = [], []
-    for h in (2e-5, 1e-5):
+    # half the step for half the time is the same program: the ball then starts nearer to its contact
+    for h, y0, v0 in ((2e-5, 1.0, 0.0), (1e-5, 0.3, -3.0)):
+        at, end = {"y0": y0, "k": 1e4, "damping": 20.0}, 50_000 * h
+        exact = slopes(lambda v0=v0, end=end, **p: damped(**p, v0=v0, end=end), at, 1e-5)
         world = World.create(Penalty(1e4, damping=20.0), scheme(h))
-        problem = BallProblem(world, 1.0, 0.0, round(1.0 / h))
-        np.testing.assert_allclose(problem.value(), damped(1.0, 1e4, 20.0), atol=30 * h)
-        naive = method("unrolled")(problem, names).gradient
-        aware = method("event-aware")(problem, names).gradient
+        problem = BallProblem(world, y0, v0, 50_000)
+        plain_steps = method("unrolled")(problem, names)
+        np.testing.assert_allclose(plain_steps.value, damped(**at, v0=v0, end=end), atol=30 * h)
+        naive, aware = plain_steps.gradient, method("event-aware")(problem, names).gradient
         naive_error.append([abs(naive[name] / exact[name] - 1) for name in names])
         aware_error.append([abs(aware[name] / exact[name] - 1) for name in names])
     # by k the steps alone have the wrong sign, at every step size
@@ -261,7 +271,7 @@ def test_loss_scaling_brings_back_what_float16_loses() -> None:
 
 
 def test_a_comparison_runs_what_applies_and_says_why_the_rest_does_not() -> None:
-    made = compare(bouncing(SemiImplicitEuler(1e-2), steps=100), ["y0"])
+    made = compare(plain(), ["y0"])
     assert [one.method for one in made] == ["unrolled", "frozen", "event-aware", "smoothed", "randomized"]
     assert "no iterated projection" in made.refused["implicit"]
     assert len({one.description for one in made}) == 5
@@ -276,11 +286,12 @@ def test_a_comparison_runs_what_applies_and_says_why_the_rest_does_not() -> None
     ("damping", "word"), [(0.0, "derivative of the steps"), (2.0, "derivative of the motion")]
 )
 def test_a_spring_has_no_saltation(damping: float, word: str) -> None:
-    world = World.create(Penalty(900.0, damping), SemiImplicitEuler(0.01))
-    problem = BallProblem(world, 1.0, 0.0, 120)
-    aware, plain = (method(name)(problem, ["y0"]) for name in ("event-aware", "unrolled"))
+    world = World.create(Penalty(900.0, damping), SemiImplicitEuler(2e-5))
+    problem = BallProblem(world, 1.0, 0.0, 50_000)
+    names = ["y0", "k", "damping"]
+    aware, unrolled = (method(name)(problem, names) for name in ("event-aware", "unrolled"))
     assert word in aware.description
-    same = aware.gradient["y0"] == pytest.approx(plain.gradient["y0"], rel=1e-12)
+    same = aware.gradient["y0"] == pytest.approx(unrolled.gradient["y0"], rel=1e-12)
     assert same == (damping == 0.0)
 
 

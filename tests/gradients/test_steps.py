@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
@@ -138,8 +139,8 @@ def test_forces_in_sixteen_bits_are_refused():
 
 
 def test_a_parameter_that_nothing_depends_on_is_said_to_be_one(switched):
-    loss = FinalProjection(direction=jnp.zeros(3))
-    found = Symmetric()(replace(switched, loss=loss), ("sigma",))
+    loss = jax.tree.map(jnp.zeros_like, switched.loss)
+    found = Symmetric()(replace(switched, loss=loss), ("sigma", "timestep", "scale"))
     assert float(found.gradient["potential.sigma"]) == 0.0
     assert "depends" in found.notes["potential.sigma"]
 

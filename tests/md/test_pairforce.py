@@ -73,6 +73,7 @@ def compare(simulation, kind, atoms):
     scale = np.abs(forces).max()
     assert found.energy == pytest.approx(energy, rel=1e-13)
     assert np.max(np.abs(found.forces - forces)) < 1e-12 * scale
+    assert np.max(np.abs(found.forces.sum(axis=0))) < 1e-12 * np.abs(forces).sum()
     assert np.max(np.abs(found.energies - energies)) < 1e-12 * np.abs(energies).max()
     # stress is minus the virial by volume, in ASE's sign
     assert np.allclose(found.stress * atoms.get_volume(), -virial, rtol=0, atol=1e-12 * np.abs(virial).max())
@@ -100,12 +101,11 @@ def tables(kind):
     }
 
 
-QUICK = ("hard", "switched", "quintic")
+#: Their formulas are in test_cutoffs: here a program is compiled for each.
+MARKS = {"quintic": (), "hard": pytest.mark.slow, "switched": pytest.mark.slow}
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.slow) for k in CUTOFFS]
-)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=MARKS.get(k, pytest.mark.nightly)) for k in CUTOFFS])
 def test_a_mixture_in_a_tilted_box(tmp_path, kind):
     atoms = mixture(tilt=True)
     compare(build(load(write_system(tmp_path, atoms, **tables(kind)))), kind, atoms)
@@ -113,7 +113,7 @@ def test_a_mixture_in_a_tilted_box(tmp_path, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.nightly) for k in CUTOFFS]
+    "kind", [pytest.param(k, marks=() if k == "quintic" else pytest.mark.nightly) for k in CUTOFFS]
 )
 @pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
 def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
@@ -154,9 +154,12 @@ def forces_over(simulation, positions, skin=0.2):
     wrapped, _ = wrap_positions(simulation.cell, positions)
     table = simulation.verlet_list(skin).build(wrapped, simulation.cell)
     x = jnp.asarray(wrapped[table.order].T)
-    return jax.jit(lambda f, x, t: f(x, t, decisions=True))(
-        simulation.force, x, simulation.tables(table)
-    ), table
+    return with_decisions(simulation.force, x, simulation.tables(table)), table
+
+
+@jax.jit
+def with_decisions(force, x, tables):
+    return force(x, tables, decisions=True)
 
 
 def counted(simulation, positions):
@@ -218,6 +221,10 @@ def test_listed_pairs_beyond_the_cutoff_add_nothing_not_even_when_the_list_is_pa
     slots, columns = set_bits(np.asarray(wide.decisions.bits))
     # padding is never decided to be inside
     assert np.all(table.index[slots, columns] < len(atoms))
+    # the nearest margin is that of all listed pairs
+    _, _, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
+    nearest = np.abs(4.0 - (d**2).sum(axis=1)).min()
+    assert float(wide.decisions.nearest) == pytest.approx(nearest, rel=1e-9)
 
 
 def test_two_atoms_on_one_spot_are_seen_and_not_hidden_by_padding(tmp_path):
@@ -231,18 +238,3 @@ def test_two_atoms_on_one_spot_are_seen_and_not_hidden_by_padding(tmp_path):
     singular, _ = forces_over(simulation, on_top)
     assert not np.isfinite(float(jnp.sum(singular.energy)))
     assert float(singular.decisions.nearest) == 4.0
-
-
-def test_the_nearest_margin_is_that_of_all_listed_pairs(tmp_path):
-    atoms = liquid(rattle=0.08)
-    simulation = build(load(write_system(tmp_path, atoms)))
-    result, _ = forces_over(simulation, simulation.positions)
-    _, _, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
-    assert float(result.decisions.nearest) == pytest.approx(np.abs(4.0 - (d**2).sum(axis=1)).min(), rel=1e-9)
-
-
-def test_forces_add_up_to_nothing(tmp_path):
-    simulation = build(load(write_system(tmp_path, mixture(tilt=True), **tables("hard"))))
-    result, _ = forces_over(simulation, simulation.positions)
-    force = np.asarray(result.force)
-    assert np.max(np.abs(force.sum(axis=1))) < 1e-12 * np.abs(force).sum()

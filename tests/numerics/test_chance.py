@@ -56,19 +56,19 @@ def test_the_fewest_repeats_are_those_that_leave_less_than_a_twentieth():
     st.integers(0, 300),
     st.floats(0, 100),
 )
-def test_what_is_said_of_a_part_holds_of_the_whole(free, handed, free_until, handed_until, steps):
+def test_what_is_said_of_a_part_holds_of_the_whole(free, imposed, free_until, imposed_until, steps):
     """A split beyond what was followed is not seen; what is said all the same is true of it."""
     seen = Delay(
         free if free <= free_until else None,
-        handed if handed <= handed_until else None,
+        imposed if imposed <= imposed_until else None,
         free_until,
-        handed_until,
+        imposed_until,
     )
     said = seen.beyond(steps)
-    assert said is None or said == (handed - free > steps)
-    assert said is not None or seen.free is None or seen.handed is None
+    assert said is None or said == (imposed - free > steps)
+    assert said is not None or seen.free is None or seen.imposed is None
 
 
 def test_splits_are_read_from_separations():
-    free, handed = np.array([0.0, 0.05, 0.2, 0.3]), np.array([0.0, 0.05, np.nan, np.nan])
-    assert Delay.of(free, handed, 0.1) == Delay(2, None, 3, 1)
+    free, imposed = np.array([0.0, 0.05, 0.2, 0.3]), np.array([0.0, 0.05, np.nan, np.nan])
+    assert Delay.of(free, imposed, 0.1) == Delay(2, None, 3, 1)

@@ -70,13 +70,13 @@ def test_the_fence_keeps_special_numbers_and_its_derivative_is_one(dtype):
     out = np.asarray(jax.jit(fence)(x, zero))
     assert np.array_equal(out, np.asarray(x))
     assert np.signbit(out[2].astype(np.float64))
-    slope = jax.grad(lambda v: fence(v * v, zero).astype(jnp.float32))(jnp.asarray(1.5, dtype))
+    slope = jax.jit(jax.grad(lambda v: fence(v * v, zero).astype(jnp.float32)))(jnp.asarray(1.5, dtype))
     assert float(slope) == 3.0
 
 
 def test_the_fence_lets_second_derivatives_through():
     x = jnp.asarray([1.0, -2.5, 0.0])
-    curvature = jax.hessian(lambda v: squared_norm(v[0], v[1], v[2], ZERO))(x)
+    curvature = jax.jit(jax.hessian(lambda v: squared_norm(v[0], v[1], v[2], ZERO)))(x)
     assert np.array_equal(curvature, 2 * np.eye(3))
 
 
@@ -124,9 +124,9 @@ def test_errors_are_as_documented(name):
 
 def test_limits():
     x = jnp.asarray([-800.0, 800.0, np.inf, -np.inf, np.nan])
-    seen = np.asarray(elementary.exp(x, ZERO))
+    seen = np.asarray(jax.jit(elementary.exp)(x, ZERO))
     assert np.array_equal(seen, np.array([0, np.inf, np.inf, 0, np.nan]), equal_nan=True)
-    assert np.isnan(np.asarray(elementary.log(jnp.asarray([0.0, -1.0]), ZERO))).all()
+    assert np.isnan(np.asarray(jax.jit(elementary.log)(jnp.asarray([0.0, -1.0]), ZERO))).all()
 
 
 def formula(x, y):

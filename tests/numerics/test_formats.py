@@ -44,6 +44,9 @@ def test_the_table_says_what_the_dtypes_say():
 
 FINITE = st.floats(-1e5, 1e5) | st.floats(-1e-4, 1e-4) | st.floats(-1e-7, 1e-7)
 ROUND = {name: jax.jit(lambda x, name=name: round_to(x, name)) for name in FORMATS}
+CAST = jax.jit(cast, static_argnums=1)
+PRODUCT = jax.jit(matmul, static_argnums=2)
+SCALED = jax.jit(scaled_gradient, static_argnums=0)
 
 
 @pytest.mark.parametrize("name", ["float16", "bfloat16"])
@@ -72,17 +75,18 @@ def test_rounding_is_to_the_nearest_number_ties_to_even(name, value):
 def test_double_rounding_does_not_happen():
     # just above the middle of two bfloat16 numbers, by less than float32 can say
     x = 1 + 2.0**-8 + 2.0**-40
-    assert float(round_to(jnp.asarray(x), "bfloat16")) == 1 + 2.0**-7
+    assert float(ROUND["bfloat16"](jnp.asarray(x))) == 1 + 2.0**-7
     assert float(np.float64(x).astype(np.float32).astype(ml_dtypes.bfloat16)) == 1.0
-    assert float(cast(jnp.asarray(x), "bfloat16")) == 1 + 2.0**-7
+    assert float(CAST(jnp.asarray(x), "bfloat16")) == 1 + 2.0**-7
 
 
 def test_the_ends_of_a_format():
-    x = jnp.asarray([65504.0, 65519.9, 65520.0, -1e9, math.inf, 2.0**-24, 2.0**-25, 1.5 * 2.0**-25, -0.0])
-    seen = np.asarray(round_to(x, "float16"))
-    assert np.array_equal(seen, [65504, 65504, math.inf, -math.inf, math.inf, 2.0**-24, 0, 2.0**-24, 0])
-    assert np.isnan(float(round_to(jnp.asarray(math.nan), "float16")))
-    assert np.array_equal(np.asarray(round_to(x, "float64")), np.asarray(x))
+    x = jnp.asarray([65504.0, 65519.9, 65520.0, -1e9, math.inf, 2.0**-24, 2.0**-25, 1.5 * 2.0**-25, math.nan])
+    seen = np.asarray(ROUND["float16"](x))
+    ends = [65504, 65504, math.inf, -math.inf, math.inf, 2.0**-24, 0, 2.0**-24, math.nan]
+    assert np.array_equal(seen, ends, equal_nan=True)
+    assert np.array_equal(np.asarray(ROUND["float64"](x)), np.asarray(x), equal_nan=True)
+    assert np.signbit(float(ROUND["bfloat16"](jnp.asarray(-0.0))))
 
 
 def test_a_tf32_product_is_rounded_inputs_and_float32_sums():
@@ -95,20 +99,24 @@ def test_a_tf32_product_is_rounded_inputs_and_float32_sums():
 
     exact = by_bits(a).astype(np.float64) @ by_bits(b).astype(np.float64)
     size = np.abs(a).astype(np.float64) @ np.abs(b)
-    seen = np.asarray(jax.jit(lambda a, b: matmul(a, b, "tf32"))(a, b))
+    seen = np.asarray(PRODUCT(a, b, "tf32"))
     assert seen.dtype == np.float32
     assert np.all(np.abs(seen - exact) <= 45 * 2.0**-24 * size)
     # and it is not the product in float32
     assert np.abs(seen - a.astype(np.float64) @ b).max() > 1e-4
     for name, u in [("float32", 0.0), ("tf32", 2.0**-11), ("bfloat16", 2.0**-8), ("float64", 0.0)]:
-        error = np.abs(np.asarray(matmul(jnp.asarray(a), jnp.asarray(b), name)) - a.astype(np.float64) @ b)
+        error = np.abs(np.asarray(PRODUCT(a, b, name)) - a.astype(np.float64) @ b)
         assert np.all(error <= (2.1 * u + 45 * 2.0**-24) * size)
 
 
 def test_stochastic_rounding_has_the_right_mean():
     x = jnp.asarray([1.0003, -0.7777, 3e-6, 1234.5678, 0.5])
-    keys = jax.random.split(jax.random.key(3), 40_000)
-    draws = np.asarray(jax.vmap(lambda key: stochastic_round(x, "float16", key))(keys))
+
+    @jax.jit
+    def drawn(key):
+        return jax.vmap(lambda key: stochastic_round(x, "float16", key))(jax.random.split(key, 40_000))
+
+    draws = np.asarray(drawn(jax.random.key(3)))
     below = np.asarray(x).astype(np.float16)
     for k in range(5):
         values = np.unique(draws[:, k])
@@ -132,27 +140,32 @@ def test_a_sum_that_stands_still_moves_on_with_stochastic_rounding():
 
     ends = [float(walk(jax.random.key(seed))) for seed in range(20)]
     still = jnp.asarray(0.5, jnp.float16)
-    assert float(cast(still.astype(jnp.float64) + step, "float16")) == 0.5
+    assert float(CAST(jnp.asarray(0.5 + step), "float16")) == 0.5
     assert abs(np.mean(ends) - (0.5 + 1000 * step)) < 0.01
     with pytest.raises(InputError, match="needs a key"):
         cast(still, "bfloat16", "stochastic")
 
 
 def test_derivatives_go_straight_through():
-    x = jnp.asarray([0.3, -2.7])
-    for function in (
+    functions = (
         lambda x: round_to(x, "bfloat16"),
         lambda x: stochastic_round(x, "float16", jax.random.key(0)),
         lambda x: cast(x, "float16").astype(jnp.float64),
-    ):
-        assert np.array_equal(np.asarray(jax.grad(lambda x, f=function: jnp.sum(f(x) * 3))(x)), [3, 3])
+    )
+    slopes = jax.jit(lambda x: [jax.grad(lambda x, f=f: jnp.sum(f(x) * 3))(x) for f in functions])
+    assert np.array_equal(np.asarray(slopes(jnp.asarray([0.3, -2.7]))), [[3, 3]] * 3)
 
 
 def test_a_value_is_quantized_to_the_nearest_of_a_few():
     values = jnp.asarray([0.1, 1.7, -1.9, 2.1, -3.0, 0.124, 0.126])
-    few = lambda x: quantize(x, *map(jnp.asarray, (0.25, -8.0, 7.0)))  # noqa: E731
-    assert np.array_equal(np.asarray(few(values)), [0, 1.75, -2, 1.75, -2, 0, 0.25])
-    slope = jax.grad(lambda x: jnp.sum(few(x)))(values)
+
+    @jax.jit
+    def few(x):
+        quantized, pullback = jax.vjp(lambda x: quantize(x, *map(jnp.asarray, (0.25, -8.0, 7.0))), x)
+        return quantized, pullback(jnp.ones_like(x))[0]
+
+    quantized, slope = few(values)
+    assert np.array_equal(np.asarray(quantized), [0, 1.75, -2, 1.75, -2, 0, 0.25])
     # clamped where the nearest is beyond the ends
     assert np.array_equal(np.asarray(slope), [1, 1, 1, 0, 0, 1, 1])
 
@@ -172,7 +185,7 @@ TRUE = 2 * X.astype(np.float16).astype(float) / 3 * float(np.float16(3e-7))
 
 
 def test_without_scaling_the_gradient_is_quantized_and_with_it_restored():
-    bare, scaled = (scaled_gradient(loss, scale, jnp.asarray(X)) for scale in (1.0, 2.0**12))
+    bare, scaled = (SCALED(loss, scale, jnp.asarray(X)) for scale in (1.0, 2.0**12))
     assert np.abs(np.asarray(bare.gradient) / TRUE - 1).max() > 0.1
     assert np.abs(np.asarray(scaled.gradient) / TRUE - 1).max() < 2e-3
     assert scaled.gradient.dtype == jnp.float64
@@ -183,10 +196,8 @@ def test_scaling_by_a_power_of_two_changes_no_bit_of_a_wide_gradient():
     def wide(x):
         return jnp.sum(jnp.sin(x) ** 3)
 
-    plain = jax.grad(wide)(jnp.asarray(X))
-    assert np.array_equal(
-        np.asarray(scaled_gradient(wide, 2.0**15, jnp.asarray(X)).gradient), np.asarray(plain)
-    )
+    plain = jax.jit(jax.grad(wide))(jnp.asarray(X))
+    assert np.array_equal(np.asarray(SCALED(wide, 2.0**15, jnp.asarray(X)).gradient), np.asarray(plain))
 
 
 @pytest.mark.parametrize(("exponent", "finite"), [(9, True), (10, False)])
@@ -195,7 +206,7 @@ def test_a_scale_that_overflows_is_noticed(exponent, finite):
         return jnp.sum(x.astype(jnp.float16) * jnp.asarray(100.0, jnp.float16)).astype(jnp.float16)
 
     # 100 * 2^10 overflows 65504, 100 * 2^9 does not
-    assert bool(scaled_gradient(steep, 2.0**exponent, jnp.asarray(X)).finite) is finite
+    assert bool(SCALED(steep, 2.0**exponent, jnp.asarray(X)).finite) is finite
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.0, -2.0, math.inf, math.nan])

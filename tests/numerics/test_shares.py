@@ -45,14 +45,14 @@ def test_each_cell_is_what_its_name_says():
         ("decisions", "A"): (400, False), ("decisions", "B"): (1500, True),
         ("arithmetic", "A"): (-50, False), ("arithmetic", "B"): (100, False),
     }  # fmt: skip
-    assert [share.nats for share in found] == pytest.approx([8.0, 30.0, -1.0, 2.0])
+    assert [share.e_foldings for share in found] == pytest.approx([8.0, 30.0, -1.0, 2.0])
 
 
 def test_a_run_that_ended_before_the_split_says_nothing():
     series = {"B": splits_at(1000), "B|A": ended(splits_at(9000), 700), "B|A from B": splits_at(1001)}
     found = shares(table(series, TOLERANCE), float("nan"))
     assert of(found) == {("arithmetic", "B"): (1, False)}
-    assert found[0].nats is None
+    assert found[0].e_foldings is None
 
 
 def test_without_a_split_nothing_is_shared():

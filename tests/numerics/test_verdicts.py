@@ -62,7 +62,7 @@ def test_a_horizon_too_short_says_how_long_it_would_take(free):
 
 def test_a_cause_is_a_split_that_does_not_come(free):
     verdict = judge(dates(free), free, np.full(3000, 1e-9), 0.1)
-    assert verdict.word == "cause" and verdict.nats == float("inf")
+    assert verdict.word == "cause" and verdict.e_foldings == float("inf")
 
 
 def test_a_cause_needs_steps_after_the_split(free):
@@ -78,25 +78,25 @@ def later(free, *gains):
 
 def test_two_repeats_tell_nothing(free):
     """However little they scatter."""
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, handed, 0.1, later(free, 300, 301))
+    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, imposed, 0.1, later(free, 300, 301))
     assert verdict.word == "undecided" and verdict.wanted == 3
-    assert judge(dates(free), free, handed, 0.1, later(free, 300, 301), most=2).wanted == 0
+    assert judge(dates(free), free, imposed, 0.1, later(free, 300, 301), most=2).wanted == 0
 
 
 def test_accelerated_is_later_in_most_repeats(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, handed, 0.1, later(free, *5 * [60]))
+    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, imposed, 0.1, later(free, *5 * [60]))
     assert verdict.word == "accelerated" and verdict.wanted == 0
-    assert verdict.nats == pytest.approx(300 * 0.02, rel=1e-6)
+    assert verdict.e_foldings == pytest.approx(300 * 0.02, rel=1e-6)
     assert verdict.threshold == pytest.approx(50)
     # one of six not: it is looked at again after eleven, and after sixteen
     gains = [60, 60, 60, 60, 40]
-    assert judge(dates(free), free, handed, 0.1, later(free, *gains)).wanted == 5
-    assert judge(dates(free), free, handed, 0.1, later(free, *gains, *5 * [60])).word == "accelerated"
-    verdict = judge(dates(free), free, handed, 0.1, later(free, *gains, 40, *4 * [60]))
+    assert judge(dates(free), free, imposed, 0.1, later(free, *gains)).wanted == 5
+    assert judge(dates(free), free, imposed, 0.1, later(free, *gains, *5 * [60])).word == "accelerated"
+    verdict = judge(dates(free), free, imposed, 0.1, later(free, *gains, 40, *4 * [60]))
     assert verdict.word == "undecided" and verdict.wanted == 5
-    verdict = judge(dates(free), free, handed, 0.1, later(free, *gains, 40, *4 * [60], *5 * [40]))
+    verdict = judge(dates(free), free, imposed, 0.1, later(free, *gains, 40, *4 * [60], *5 * [40]))
     assert verdict.word == "undecided" and verdict.wanted == 0
     assert (verdict.count.later, verdict.count.not_later) == (9, 7)
 
@@ -105,25 +105,25 @@ def test_a_bystander_is_not_later_in_most_repeats(free):
     for gain in (0, -40, 40):
         assert judge(dates(free), free, free, 0.1, later(free, *5 * [gain])).word == "bystander"
     # less than one e-folding, which is 50 steps here, beyond any scatter
-    handed = np.concatenate([np.full(40, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, handed, 0.1, later(free, *5 * [40]))
-    assert verdict.word == "bystander" and verdict.nats == pytest.approx(0.8)
+    imposed = np.concatenate([np.full(40, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, imposed, 0.1, later(free, *5 * [40]))
+    assert verdict.word == "bystander" and verdict.e_foldings == pytest.approx(0.8)
 
 
 def test_without_repeats_nothing_is_said_of_a_delay(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    for run in (handed, free):
+    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    for run in (imposed, free):
         verdict = judge(dates(free), free, run, 0.1, most=0)
         assert verdict.word == "undecided" and verdict.wanted == 0
 
 
 def test_what_was_not_seen_counts_for_neither(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
     unseen = [Delay(1600, None, 2999, 1640)] * 5
-    verdict = judge(dates(free), free, handed, 0.1, unseen)
+    verdict = judge(dates(free), free, imposed, 0.1, unseen)
     assert verdict.word == "undecided" and (verdict.count.later, verdict.count.not_later) == (1, 0)
     seen_to_be_later = [Delay(1600, None, 2999, 1700)] * 5
-    assert judge(dates(free), free, handed, 0.1, seen_to_be_later).word == "accelerated"
+    assert judge(dates(free), free, imposed, 0.1, seen_to_be_later).word == "accelerated"
 
 
 def test_close_to_the_tolerance_is_no_cause(free):
@@ -154,5 +154,5 @@ def test_an_end_of_one_run_is_a_fork_by_itself():
 
 def test_a_split_under_the_others_decisions_alone_is_told(free):
     verdict = judge(Dates(0, 400, None), free[:900], free[-900:], 0.1)
-    assert verdict.word == "open" and verdict.handed == 0
+    assert verdict.word == "open" and verdict.imposed == 0
     assert dict(verdict.reasons)["together"] == {"step": 0}

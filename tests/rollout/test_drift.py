@@ -63,7 +63,7 @@ def test_decisions_that_exact_arithmetic_makes_otherwise_are_counted_as_ambiguou
 
 
 def test_a_resumed_run_has_the_same_bounds(path, whole, tmp_path):
-    result, _ = go(tmp_path, path, 333, NARROW, save_every=1)
+    result, _ = go(tmp_path, path, 600, NARROW, save_every=1)
     folder = RunFolder.open(run(None, resume=result.folder, steps=STEPS).folder)
     for table in ("series", "flips"):
         ours, theirs = folder.read(table), whole.read(table)
@@ -90,7 +90,7 @@ def test_horizons_end_before_the_first_decision_that_rounding_made(path, whole):
     assert needed[-1] > 10 * needed[0] > 0 and (np.diff(needed) >= 0).all()
 
 
-@pytest.mark.parametrize("state", ["float32", "lattice"])
+@pytest.mark.parametrize("state", [pytest.param("float32", marks=pytest.mark.slow), "lattice"])
 def test_a_state_that_is_not_narrowed_decides_exactly(path, tmp_path, state):
     _, folder = go(tmp_path, path, 200, {"precision.state": state}, save_every=1)
     series = folder.read("series")

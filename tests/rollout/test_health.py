@@ -117,7 +117,8 @@ def test_dangerous_builds_are_counted_as_lammps_counts_them(path, tmp_path, ever
 
 
 def test_the_epoch_table_accounts_for_every_step(path, tmp_path):
-    result, folder = go(tmp_path, path, 120, {"neighbors.skin": 0.2}, save_every=1)
+    result, folder = go(tmp_path, path, 120, save_every=1)
+    skin = 0.3
     epochs, series = folder.read("epochs"), folder.read("series")
     assert epochs["epoch"].tolist() == list(range(len(epochs["epoch"])))
     assert epochs["start"][0] == 0
@@ -131,18 +132,18 @@ def test_the_epoch_table_accounts_for_every_step(path, tmp_path):
         moved = np.linalg.norm(unwrapped[steps] - unwrapped[start], axis=2).max(axis=1)
         assert np.allclose(series["displacement"][steps], moved, rtol=0, atol=1e-12)
         assert (
-            epochs["skin_consumed"][row] == pytest.approx(2 * moved.max() / 0.2, abs=1e-11)
-            and moved.max() <= 0.1
+            epochs["skin_consumed"][row] == pytest.approx(2 * moved.max() / skin, abs=1e-11)
+            and moved.max() <= skin / 2
         )
         if row + 1 < len(epochs["start"]):
             # the next list begins at the first step that would have overdrawn this one's skin
             then = np.linalg.norm(unwrapped[steps.stop] - unwrapped[start], axis=1).max()
-            assert epochs["start"][row + 1] == steps.stop and then > 0.1
-            assert epochs["margin"][row] == pytest.approx(0.1 - then, abs=1e-12)
+            assert epochs["start"][row + 1] == steps.stop and then > skin / 2
+            assert epochs["margin"][row] == pytest.approx(skin / 2 - then, abs=1e-12)
         _, _, d = all_pairs(wrapped[start], cell, (True,) * 3)
-        assert epochs["pairs_listed"][row] == np.sum(np.linalg.norm(d, axis=1) <= R_CUT + 0.2)
+        assert epochs["pairs_listed"][row] == np.sum(np.linalg.norm(d, axis=1) <= R_CUT + skin)
         assert epochs["occupancy"][row] <= epochs["capacity"][row]
-    assert np.all(series["displacement"] <= 0.1)
+    assert np.all(series["displacement"] <= skin / 2)
     assert np.all(epochs["build_ms"] > 0)
 
 

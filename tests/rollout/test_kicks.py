@@ -57,7 +57,7 @@ def kicks(simulation, timestep):
     "kind, order",
     [
         ("hard", 1),
-        ("switched", 2),
+        pytest.param("switched", 2, marks=pytest.mark.slow),
         ("quintic", 3),
         pytest.param("shifted", 1, marks=pytest.mark.slow),
         pytest.param("force-shifted", 2, marks=pytest.mark.slow),

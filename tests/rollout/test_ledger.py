@@ -42,7 +42,7 @@ def lennard_jones(r2):
     return 4 * (r2**-6 - r2**-3)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10**9), temperature=st.floats(0.01, 4.0), rattle=st.floats(0, 0.05))
 def test_random_configurations(fluid, tmp_path_factory, seed, temperature, rattle):
     system = shaken(fluid, seed, temperature, rattle)
@@ -150,18 +150,16 @@ def test_a_budget_notices_a_flip_that_was_not_told(fluid, tmp_path):
 
 
 def test_the_ledger_does_not_depend_on_the_skin(tmp_path):
-    rows = {}
-    for skin in (0.1, 0.6):
-        result, folder = go(
-            tmp_path / str(skin), "argon/crystal-108", 200, {"neighbors.skin": skin}, save_every=1
-        )
+    path, rows = write_system(tmp_path, liquid()), {}
+    for skin in (0.1, 0.3):
+        result, folder = go(tmp_path / str(skin), path, 70, {"neighbors.skin": skin}, save_every=1)
         rows[skin] = folder.read("flips")
         if skin == 0.1:
             assert assert_ledger_is_complete(result, folder) > 100
             assert result.summary["rebuilds"] > 3
     for name in ("step", "i", "j", "entered"):
-        assert np.array_equal(rows[0.1][name], rows[0.6][name])
-    assert np.allclose(rows[0.1]["margin"], rows[0.6]["margin"], rtol=0, atol=1e-10)
+        assert np.array_equal(rows[0.1][name], rows[0.3][name])
+    assert np.allclose(rows[0.1]["margin"], rows[0.3]["margin"], rtol=0, atol=1e-10)
 
 
 def test_a_capacity_that_grows_loses_no_step(fluid, tmp_path, monkeypatch):
@@ -177,7 +175,8 @@ def test_a_capacity_that_grows_loses_no_step(fluid, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("skin", [0.0, 0.001])
 def test_pairs_that_leave_beyond_the_skin_in_one_step_are_told(tmp_path, skin):
-    result, folder = go(tmp_path, "argon/crystal-108", 40, {"neighbors.skin": skin}, save_every=1)
+    path = write_system(tmp_path, liquid())
+    result, folder = go(tmp_path, path, 70, {"neighbors.skin": skin}, save_every=1)
     assert assert_ledger_is_complete(result, folder) > 50
 
 

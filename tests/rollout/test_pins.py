@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,9 @@ from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.lockstep import lockstep
 from mdnum.systems.build import build
+
+#: Of every run here: the rows of a record are part of the program.
+STEPS = 120
 
 
 def positions(simulation, last, pins=None):
@@ -21,7 +26,7 @@ def positions(simulation, last, pins=None):
 
 def test_no_pin_changes_no_bit():
     simulation = build("argon/crystal-108")
-    np.testing.assert_array_equal(positions(simulation, 120), positions(simulation, 120, Pins([])))
+    np.testing.assert_array_equal(positions(simulation, STEPS), positions(simulation, STEPS, Pins([])))
 
 
 def test_what_it_is_told_turns_at_its_changes():
@@ -31,11 +36,14 @@ def test_what_it_is_told_turns_at_its_changes():
     assert list(Pin(0, 1, 0, 9, (), True).at(np.arange(3))) == [True] * 3
 
 
-@pytest.mark.parametrize("name", ["argon/crystal-108", "binary/kob-andersen-1000"])
+@pytest.mark.parametrize(
+    "name",
+    ["argon/crystal-108", pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly)],
+)
 def test_pinned_to_its_own_decisions_a_run_is_bit_identical(name):
     simulation = build(name)
     recorder, ledgers, first = PairRecorder(simulation), [], None
-    for segment in Engine(simulation, 120).segments():
+    for segment in Engine(simulation, STEPS).segments():
         first = set(decided_pairs(simulation, segment, 0).tolist()) if first is None else first
         ledgers.append(recorder.flips(segment))
     subject = np.concatenate([ledger.subject for ledger in ledgers])
@@ -54,16 +62,16 @@ def test_pinned_to_its_own_decisions_a_run_is_bit_identical(name):
         for key in chosen
     ]
     assert len(pins) > 10
-    np.testing.assert_array_equal(positions(simulation, 120), positions(simulation, 120, Pins(pins)))
+    np.testing.assert_array_equal(positions(simulation, STEPS), positions(simulation, STEPS, Pins(pins)))
 
 
 def test_one_inverted_decision_is_the_only_thing_that_differs_and_is_found():
     """The planted fault: a pair inside is told to be outside for one step."""
     simulation = build("argon/crystal-108")
-    segment = next(Engine(simulation, 60).segments())
+    segment = next(Engine(simulation, STEPS).segments())
     i, j = divmod(int(decided_pairs(simulation, segment, 40)[17]), simulation.atoms)
-    planted = positions(simulation, 60, Pins([Pin(i, j, 40, 40, (), False)]))
-    plain = positions(simulation, 60)
+    planted = positions(simulation, STEPS, Pins([Pin(i, j, 40, 40, (), False)]))
+    plain = positions(simulation, STEPS)
     # forces of step 40 make the positions of step 41
     np.testing.assert_array_equal(planted[:41], plain[:41])
     moved = np.flatnonzero(np.any(planted[41] != plain[41], axis=1))
@@ -72,23 +80,23 @@ def test_one_inverted_decision_is_the_only_thing_that_differs_and_is_found():
 
 def test_pinning_the_pair_at_the_fork_takes_the_fork_away():
     a = build("argon/crystal-108")
-    from dataclasses import replace
-
     noise = np.random.default_rng(0).standard_normal(a.positions.shape)
     b = replace(a, positions=a.positions + 1e-6 * noise)
-    first = next(flip for stretch in lockstep(a, b, 60, handed=False) for flip in stretch.flips)
+    first = next(flip for stretch in lockstep(a, b, STEPS, handed=False) for flip in stretch.flips)
     around = range(max(0, first.step - 3), first.step + 6)
     inside = not first.entered if first.run == "B" else first.entered
     # A's own decisions of this pair around the fork, from A's run
     told = []
-    for segment in Engine(a, around[-1]).segments():
+    for segment in Engine(a, STEPS).segments():
         for row in range(segment.rows):
             if segment.first + row in around:
                 told.append(first.i * a.atoms + first.j in decided_pairs(a, segment, row))
     changes = tuple(around[k] for k in range(1, len(told)) if told[k] != told[k - 1])
     pin = Pin(first.i, first.j, around[0], around[-1], changes, told[0])
-    free = np.abs(positions(b, around[-1]) - positions(a, around[-1])).max()
-    pinned = np.abs(positions(b, around[-1], Pins([pin])) - positions(a, around[-1])).max()
+    until = slice(around[-1] + 1)
+    alone = positions(a, STEPS)[until]
+    free = np.abs(positions(b, STEPS)[until] - alone).max()
+    pinned = np.abs(positions(b, STEPS, Pins([pin]))[until] - alone).max()
     assert told[around.index(first.step)] == inside
     assert free > 10 * pinned
     assert pinned < 1e-5

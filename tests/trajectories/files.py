@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+import functools
+import tracemalloc
 from pathlib import Path
 
 import ase.io
+import MDAnalysis
 import numpy as np
 from ase import Atoms
+from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import FrameCheck
+from mdnum.trajectories.source import open_trajectory
 
 SIDE = 9.0
+
+#: Universes of files, each parsed once; whoever takes one changes none of its atoms.
+universe_of = functools.cache(MDAnalysis.Universe)
+
+
+@functools.cache
+def water():
+    """AdK in water, 47,681 atoms, as mdnum reads it."""
+    return open_trajectory(datafiles.XTC, datafiles.GRO)
+
+
+def arrays_held() -> int:
+    """Bytes of the arrays made since tracemalloc was started: not what else a process begins to remember."""
+    arrays = tracemalloc.DomainFilter(True, np.lib.tracemalloc_domain)
+    return sum(trace.size for trace in tracemalloc.take_snapshot().filter_traces([arrays]).traces)
 
 
 def images(frames: int = 5, names: str = "Ar9") -> list[Atoms]:

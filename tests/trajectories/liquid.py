@@ -20,7 +20,7 @@ def _forces(x, length):
 
 
 @functools.cache
-def liquid(frames: int, timestep: float = 0.005, stride: int = 1, cells: int = 4, warm: int = 250):
+def liquid(frames: int, timestep: float = 0.005, stride: int = 1, cells: int = 3, warm: int = 250):
     """(positions (frames, atoms, 3), length of the box): density 0.8442 near the triple point, from fcc."""
     atoms = 4 * cells**3
     length = (atoms / 0.8442) ** (1 / 3)

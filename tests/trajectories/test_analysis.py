@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from MDAnalysis.transformations import set_dimensions, wrap
 from MDAnalysisTests import datafiles
+from trajectories.files import universe_of
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
@@ -19,10 +20,10 @@ from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 warnings.filterwarnings("ignore", module="MDAnalysis")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def water():
     """AdK in water: xtc, rhombic dodecahedron."""
-    return MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
+    return universe_of(datafiles.GRO, datafiles.XTC)
 
 
 def images(matrix):
@@ -75,10 +76,10 @@ CASES = {
 @pytest.mark.parametrize("kind", CASES)
 def test_every_flip_is_one_and_every_one_is_a_flip(kind):
     topology, path, words, most, radius = CASES[kind]
-    universe = MDAnalysis.Universe(topology, path)
+    universe = universe_of(topology, path)
     group = universe.select_atoms(words)[:most]
-    frames = range(0, min(len(universe.trajectory), 30), 3)
-    found = NeighborFlips(group, r_cut=radius).run(stop=30, step=3)
+    frames = range(0, min(len(universe.trajectory), 15), 3)
+    found = NeighborFlips(group, r_cut=radius).run(stop=15, step=3)
     rows, last = brute(universe, group.indices, group.indices, radius, frames, triclinic)
     assert len(rows) > 10
     same_rows(found.results.flips, rows)
@@ -103,10 +104,10 @@ def test_a_charmm_box_is_not_turned_away_from_its_atoms():
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     # far enough for pairs across the boundary, some of them by two ways
-    found = NeighborFlips(group, r_cut=12.0).run(stop=6)
-    rows, _ = brute(universe, group.indices, group.indices, 12.0, range(6), symmetric)
+    found = NeighborFlips(group, r_cut=12.0).run(stop=3)
+    rows, _ = brute(universe, group.indices, group.indices, 12.0, range(3), symmetric)
     same_rows(found.results.flips, rows)
-    other, _ = brute(universe, group.indices, group.indices, 12.0, range(6), triclinic)
+    other, _ = brute(universe, group.indices, group.indices, 12.0, range(3), triclinic)
     assert [row[:5] for row in rows] != [row[:5] for row in other]
 
 
@@ -143,7 +144,7 @@ def equal(one, other):
 
 @pytest.mark.parametrize("parts", [3, 10])
 def test_a_split_between_two_frames_loses_nothing(water, parts):
-    group = water.select_atoms("name OW")[:1500]
+    group = water.select_atoms("name OW")[:600]
     whole = NeighborFlips(group, [4.0], rule=Nearest(3)).run()
     split = NeighborFlips(group, [4.0], rule=Nearest(3)).run(n_parts=parts)
     for one, other in zip(whole.results.rules, split.results.rules, strict=True):
@@ -155,7 +156,7 @@ def test_a_split_between_two_frames_loses_nothing(water, parts):
 
 @pytest.mark.parametrize("backend", ["multiprocessing", pytest.param("dask", marks=pytest.mark.slow)])
 def test_other_processes_find_the_same_to_the_last_bit(water, backend):
-    group = water.select_atoms("name OW")[:3000]
+    group = water.select_atoms("name OW")[:1000]
     assert backend in NeighborFlips.get_supported_backends()
     asked = {"start": 1, "stop": 10, "step": 2}
     serial = NeighborFlips(group, 3.5).run(**asked)
@@ -315,11 +316,11 @@ def test_transformations_are_made_in_other_processes_too(backend):
         made.trajectory.add_transformations(set_dimensions([28, 30, 32, 90, 90, 90]), wrap(made.atoms))
         return made.select_atoms("name CA")
 
-    serial = NeighborFlips(universe(), 6.0).run(stop=8)
-    spread = NeighborFlips(universe(), 6.0).run(stop=8, backend=backend, n_workers=2)
+    serial = NeighborFlips(universe(), 6.0).run(stop=4)
+    spread = NeighborFlips(universe(), 6.0).run(stop=4, backend=backend, n_workers=2)
     equal(serial.results.rules[0], spread.results.rules[0])
     plain = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD).select_atoms("name CA")
-    assert (serial.results.pairs > NeighborFlips(plain, 6.0).run(stop=8).results.pairs).all()
+    assert (serial.results.pairs > NeighborFlips(plain, 6.0).run(stop=4).results.pairs).all()
 
 
 def test_a_transformation_that_no_other_process_can_have_is_refused():

@@ -14,6 +14,7 @@ import pytest
 from MDAnalysis.lib.formats.libdcd import DCDFile
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from MDAnalysisTests import datafiles
+from trajectories.files import water
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
@@ -77,8 +78,8 @@ def test_the_vectors_of_an_h5md_box_point_where_they_do(tmp_path):
     frames = list(trajectory.frames())
     np.testing.assert_allclose(frames[1].box.matrix, matrix, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(frames[0].box.matrix, axis=1), [2.0, 2.1, 2.2], rtol=1e-6)
-    with pytest.raises(InputError, match=r"47,681 atoms and the trajectory 6"):
-        open_trajectory(tmp_path / "run.h5md", datafiles.GRO)
+    with pytest.raises(InputError, match=r"3,341 atoms and the trajectory 6"):
+        open_trajectory(tmp_path / "run.h5md", datafiles.PSF)
 
 
 def test_boxes_of_dl_poly_are_turned_as_its_atoms_are():
@@ -119,7 +120,7 @@ def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pair
     assert counts[0] != counts[1]
     assert f"puts {counts[0]} pairs" in said and f"the file's {counts[1]}." in said
     # where both are one, there is nothing to say
-    assert not any("box" in note for note in open_trajectory(datafiles.XTC, datafiles.GRO).notes)
+    assert not any("box" in note for note in water().notes)
 
 
 def box(side):

@@ -90,13 +90,13 @@ def test_the_nearest_few(data, most, capped):
 @pytest.mark.parametrize("periodic", [True, False])
 def test_the_nearest_without_a_radius(periodic):
     rng = np.random.default_rng(1)
-    positions = rng.uniform(0, 12, (60, 3))
+    positions = rng.uniform(0, 12, (40, 3))
     # far from all others: the first radius tried holds nobody
     positions[5] += 3.0 if periodic else 400.0
     box = Box(np.eye(3) * 12.0, np.full(3, periodic))
     tracker = Tracker(Nearest(4))
     tracker.step(Frame(0, 0.0, positions, box))
-    everyone = range(60)
+    everyone = range(40)
     reach = 11.0 if periodic else 2000.0
     right, limits, _ = brute_force.nearest(
         positions, box.matrix, box.pbc, everyone, everyone, 4, np.inf, reach

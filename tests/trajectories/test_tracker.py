@@ -12,6 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trajectories import brute_force
 from trajectories.brute_force import atoms, boxes
+from trajectories.files import arrays_held
 
 from mdnum.errors import InputError
 from mdnum.trajectories import superset
@@ -170,7 +171,7 @@ def test_a_list_in_use_misses_nothing(mover, bound):
     x, matrix, radius = rng.uniform(0, 1, (150, 3)) @ MATRIX, MATRIX, 2.2
     x[1] = x[0] + [3.4, 0.01, 0.0]
     tracker, oracle, used, flipped = Tracker(CutoffRule(radius), bound=bound), Oracle(radius), 0, 0
-    for k in range(40):
+    for k in range(30):
         held = tracker._list
         flips = tracker.step(Frame(k, 0.0, x, Box(matrix, PERIODIC)))
         right, inside, doubts, smallest = oracle.look(x, matrix, bound)
@@ -181,7 +182,7 @@ def test_a_list_in_use_misses_nothing(mover, bound):
         flipped += len(flips)
         x, matrix = mover(x, matrix, k, rng)
     # it was the list that answered, most of the time
-    assert used > 25 and (flipped > 0 or mover is drift or mover is resting)
+    assert used > 18 and (flipped > 0 or mover is drift or mover is resting)
 
 
 def test_a_box_that_becomes_too_narrow_for_a_list():
@@ -264,17 +265,20 @@ def test_a_tracker_can_be_sent_to_another_process(rule):
 
 def test_memory_does_not_grow_with_frames():
     rng = np.random.default_rng(1)
-    x, box = rng.uniform(0, 12, (400, 3)), Box(np.eye(3) * 12.0, PERIODIC)
-    tracker, seen = Tracker(CutoffRule(2.5)), []
+    x, box = rng.uniform(0, 12, (200, 3)), Box(np.eye(3) * 12.0, PERIODIC)
+    tracker, arrays, whole = Tracker(CutoffRule(2.0)), [], []
     tracemalloc.start()
-    for k in range(240):
+    for k in range(80):
         tracker.step(Frame(k, 0.0, x, box))
         x = (x + rng.normal(size=x.shape) * (0.01 if k % 20 else 0.3)) % 12.0
-        if k % 80 == 79:
+        if k % 40 == 39:
             gc.collect()
-            seen.append(tracemalloc.get_traced_memory()[0])
+            arrays.append(arrays_held())
+            whole.append(len(pickle.dumps(tracker)))
     tracemalloc.stop()
-    assert seen[2] < 1.15 * seen[0] + 50_000
+    # far less than the 40 frames between
+    for first, last in (arrays, whole):
+        assert last < first + 10 * x.nbytes
 
 
 def test_a_box_may_come_and_go_and_a_bound_may_change():

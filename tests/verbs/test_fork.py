@@ -187,7 +187,7 @@ def test_a_ball_has_the_same_summary(crystal, balls):
     made, summary = balls.result, balls.summary
     assert (summary["system"], summary["balls"], summary["choice"]) == ("three", 3, "contact=earlier")
     assert summary["steps"] == 120 and summary["timestep"] == 0.01 and summary["tolerance"] == 0.002
-    assert (summary["first_bit"], summary["fork"]) == (made.dates.seed, made.dates.fork)
+    assert (summary["first_bit"], summary["fork"]) == (made.dates.first_bit, made.dates.fork)
     assert summary["effect"] == "cause" and summary["status"] == "complete"
     decision = summary["decision"]
     assert (decision["channel"], decision["step"]) == ("contact", summary["fork"])

@@ -273,8 +273,7 @@ def detective(
         return _blamed(tape.steps, "loss", made)
     for stretch in tape.backward():
         before = back.carry
-        _, trace = back.through(stretch, traced=True)
-        assert trace is not None
+        _, trace = back.through(stretch)
         row = _last_bad(trace, stretch.rows)
         if row is None and _bad(back.carry):
             # what a crossing before the first row of a stretch adds is seen in the carry alone
@@ -309,7 +308,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
     """The step of a row, operation by operation."""
-    whole = back.arguments(stretch, traced=True)
+    whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
     zero = jnp.zeros_like(origin.potential)

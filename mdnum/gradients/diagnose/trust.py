@@ -67,18 +67,24 @@ class Shorter(Loss):
     Attributes:
         inner: the loss.
         table: whether the loss of a run of each horizon looks at each step.
+        per: steps that are made for each of these; it looks at the last of them.
     """
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)
     table: Bool[Array, "rows horizons"] = eqx.field(kw_only=True)
+    per: Int[Array, ""] = eqx.field(kw_only=True)
 
     def looks_at(self, steps, last):
-        return np.asarray(self.table).max(axis=1)[np.minimum(steps, len(self.table) - 1)]
+        per = int(self.per)
+        seen = np.asarray(self.table).max(axis=1)[np.minimum(steps // per, len(self.table) - 1)]
+        return seen & (steps % per == 0)
 
     def observe(self, frame, origin, around):
-        seen = self.inner.observe(frame, origin, around)
-        wanted = jnp.asarray(self.table)[frame.step]
+        step = frame.step // self.per
+        whole = around._replace(timestep=self.per.astype(jnp.float64) * around.timestep)
+        seen = self.inner.observe(frame._replace(step=step), origin, whole)
+        wanted = jnp.asarray(self.table)[step]
 
         def spread(leaf):
             leaf = jnp.asarray(leaf)
@@ -97,32 +103,20 @@ class Shorter(Loss):
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
 
-class Halved(Loss):
-    """A loss of a run at half the time step: it looks at the same times, every other step."""
+def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
+    """The loss of every shorter run over the same times, from `per` steps where the run makes one.
 
-    name = "halved"
-    inner: Loss = eqx.field(kw_only=True)
-
-    def looks_at(self, steps, last):
-        return (steps % 2 == 0) & self.inner.looks_at(steps // 2, last // 2)
-
-    def observe(self, frame, origin, around):
-        return self.inner.observe(
-            frame._replace(step=frame.step // 2), origin, around._replace(timestep=2 * around.timestep)
-        )
-
-    def value(self, total, frames):
-        return self.inner.value(total, frames)
-
-    def reason_unavailable(self, around):
-        return self.inner.reason_unavailable(around)
-
-
-def halved(problem: Problem) -> Problem:
-    """The same loss over the same time, in twice the steps of half the length."""
-    timestep = parameters.value(problem.simulation, TIMESTEP) / 2
-    simulation = parameters.with_values(problem.simulation, {TIMESTEP: timestep})
-    return Problem(simulation, Halved(inner=problem.loss), 2 * problem.steps)
+    Args:
+        at: horizons, rising; the last one is how far it is run.
+    """
+    rows = np.arange(int(at[-1]) + 1)
+    table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
+    simulation = problem.simulation
+    if per > 1:
+        timestep = parameters.value(simulation, TIMESTEP) / per
+        simulation = parameters.with_values(simulation, {TIMESTEP: timestep})
+    loss = Shorter(inner=problem.loss, table=jnp.asarray(table), per=jnp.asarray(per))
+    return Problem(simulation, loss, per * int(at[-1]))
 
 
 @dataclass(frozen=True)
@@ -169,6 +163,7 @@ def horizons(
     names: Sequence[str],
     at: Int[np.ndarray, "points"],
     *,
+    per: int = 1,
     saltation: bool = True,
     each: Callable[[TapeStretch], None] | None = None,
     watch: Callable[[StretchTangents], None] | None = None,
@@ -179,6 +174,8 @@ def horizons(
     Args:
         problem: of a pair potential. names: full names of the parameters; each entry is a tangent.
         at: horizons, rising; the last one is how far it is run. saltation: whether flips count.
+        per: steps that are made where the run makes one. By the time step the gradient is that of all of
+            them together.
         each: called with every stretch when it has been made.
         watch: called with the tangents of every stretch, those of each step among them.
 
@@ -187,11 +184,10 @@ def horizons(
 
     Error: that of tangents: a rounding error times their growth.
     """
-    simulation, last = problem.simulation, int(at[-1])
-    rows = np.arange(last + 1)
-    table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
-    loss = Shorter(inner=problem.loss, table=jnp.asarray(table))
-    tape = RunTape(simulation, loss, last, flips=True, each=each, progress=in_phase(progress, "run"))
+    made = shorter(problem, at, per)
+    simulation, loss = made.simulation, made.loss
+    assert isinstance(loss, Shorter)
+    tape = RunTape(simulation, loss, made.steps, flips=True, each=each, progress=in_phase(progress, "run"))
     total: Any = None
     flips = []
     for part in tangents(
@@ -210,7 +206,8 @@ def horizons(
         values.append(float(value))
         slopes.append(np.asarray(jax.vmap(push)(total), np.float64))
     columns = columns_of(simulation, names)
-    return Horizons(at, columns, np.array(values), np.stack(slopes), np.concatenate(flips))
+    factor = np.array([1 / per if column.name == TIMESTEP else 1.0 for column in columns])
+    return Horizons(at, columns, np.array(values), np.stack(slopes) * factor, np.concatenate(flips))
 
 
 def first_difference(a: Horizons, b: Horizons) -> int | None:
@@ -342,12 +339,15 @@ def trust(
     if needed > _MEMORY:
         near = None
 
-    def follow(one: Problem, word: str, at=at, each=None, watch=None) -> Horizons:
+    def follow(one: Problem, word: str, per: int = 1, each=None, watch=None) -> Horizons:
         def report(done: int, steps: int, phase: str) -> None:
             if progress is not None:
                 progress(done, steps, f"{word}: {phase}")
 
-        return horizons(one, kept, at, saltation=saltation, each=each, watch=watch, progress=report)
+        if near is not None and watch is None:
+            # one program for all of them
+            watch = _unseen
+        return horizons(one, kept, at, per=per, saltation=saltation, each=each, watch=watch, progress=report)
 
     def beside(per: int):
         return None if near is None else partial(near.compared, per=per)
@@ -357,16 +357,16 @@ def trust(
     other = follow(replace(problem, simulation=shadow), "its shadow", each=beside(1))
     differing = relative(own, other)
     noisy = no_half_step(simulation)
-    shorter = None
+    finer = None
     if half_step and not noisy:
-        shorter = _per_step(follow(halved(problem), "half the time step", 2 * at, beside(2)))
-    steps = {} if shorter is None else relative(own, shorter)
-    turns = None if near is None or shorter is None else near.turns(columns)
+        finer = follow(problem, "half the time step", 2, beside(2))
+    steps = {} if finer is None else relative(own, finer)
+    turns = None if near is None or finer is None else near.turns(columns)
     first = first_difference(own, other)
-    unseen = ("half-step", {}) if shorter is None else ("memory", {"bytes": needed})
+    unseen = ("half-step", {}) if finer is None else ("memory", {"bytes": needed})
     roundings = {"narrow": " and ".join(narrow) or "float64", "first": first}
     halving = Limit(STEP, None, False, "noise" if noisy else "not asked")
-    if shorter is not None:
+    if finer is not None:
         halving = _compared(STEP, last_agreeing(at, steps, tolerance), steps, tolerance, {})
     limits = [
         _compared(ROUNDING, last_below(at, differing, tolerance), differing, tolerance, roundings), halving,
@@ -384,7 +384,7 @@ def trust(
     verdict, horizon, limited, unknown = verdict_of(limits, problem.steps, chaotic, len(kept) < len(full))
     # the last two horizons, so that none agrees by chance
     digits = {name: _digits(*one[-2:], differing[name][-1]) for name, one in steps.items()}
-    half = {} if shorter is None else {name: part[-1] for name, part in shorter.by_name().items()}
+    half = {} if finer is None else {name: part[-1] for name, part in finer.by_name().items()}
     table = {"horizon": at}
     for key, values in (("relative", differing), ("step", steps), ("error", scatter)):
         table |= {f"{key}.{name}": column for name, column in values.items()}
@@ -416,10 +416,8 @@ def verdict_of(
     return verdict, horizon if met else steps, met[0] if met else "", tuple(unknown)
 
 
-def _per_step(found: Horizons) -> Horizons:
-    """Of a run at half the time step: horizons and derivatives in steps of the whole one."""
-    factor = np.array([0.5 if column.name == TIMESTEP else 1.0 for column in found.columns])
-    return replace(found, at=found.at // 2, gradient=found.gradient * factor)
+def _unseen(part: StretchTangents) -> None:
+    """What is done with tangents of steps that nobody asks for."""
 
 
 def _digits(*relative: float) -> int:

@@ -108,12 +108,18 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
     key = np.concatenate([np.asarray(rows[0], np.int64) * count + rows[1] for rows in sets])
     if shift is not None:
-        for axis in range(3):
-            column = np.concatenate([np.asarray(rows[2])[:, axis] for rows in sets])
-            # by rank: shifts of atoms far outside the box are large, but few of them differ
-            _, rank = np.unique(column, return_inverse=True)
-            _, key = np.unique(key, return_inverse=True)
-            key = key * (int(rank.max(initial=0)) + 1) + rank
+        columns = np.concatenate([np.asarray(rows[2]) for rows in sets]).astype(np.int64).T
+        largest = count * count
+        for column in columns:
+            low, high = int(column.min(initial=0)), int(column.max(initial=0))
+            largest *= high - low + 1
+            if largest >= 2**62:
+                # by rank: shifts of atoms far outside the box are large, but few of them differ
+                _, column = np.unique(column, return_inverse=True)
+                _, key = np.unique(key, return_inverse=True)
+                low, high = 0, len(column)
+                largest = len(key) * (high + 1)
+            key = key * (high - low + 1) + (column - low)
     return [key[first:last] for first, last in pairwise(lengths)]
 
 

@@ -118,10 +118,9 @@ def test_narrow_balls_leave_and_wide_ones_stay():
         "contact.k": 512.0, "integrator.timestep": 2.0**-6, "start.height": 0.40625, "flight.gravity": 9.75
     }  # fmt: skip
     system = load("ball/drop", given, world="ball")
-    found = certify(system, 300, {name: BALL_POLICIES[name] for name in ("float16", "float64", "bfloat16")})
+    found = certify(system, 300, {name: BALL_POLICIES[name] for name in ("float16", "float64")})
     horizons = {row.name: row.horizon for row in found.ranking}
-    assert horizons == {"float64": None, "float16": 170, "bfloat16": 66}
-    assert list(horizons) == ["float64", "float16", "bfloat16"]
+    assert list(horizons.items()) == [("float64", None), ("float16", 170)]
     row = found.ranking[1]
     assert (row.decision.channel, row.decision.subject) == ("contact", (0,)) and abs(row.margin) < 0.05
     assert row.separation[0] == 0 and row.separation[-1] > 0 and found.exact.contact.sum() > 30

@@ -14,7 +14,7 @@ from small_systems import LENNARD_JONES, make
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
 from mdnum.gradients.diagnose.near import Near
-from mdnum.gradients.diagnose.trust import halved, spread
+from mdnum.gradients.diagnose.trust import shorter, spread
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.recorded import EventAware, passed
 from mdnum.gradients.tape import pace_of
@@ -102,12 +102,12 @@ def test_the_weight_of_a_near_miss_is_what_its_flips_add_when_it_flips(loss):
     gap, depth, timestep = 5e-4, 2e-3, 0.002
     missed = problem(gap, timestep, loss=loss)
     near = Near(missed.simulation, pace_of(missed.loss, missed.steps))
-    passed(missed, ("cutoff.radius",), watches=[near.reverse])
+    passed(missed, ("cutoff.radius", "dynamics.timestep"), watches=[near.reverse])
     turns = near.turns(0).table
     (k,) = np.flatnonzero((turns["i"] == 1) & (turns["j"] == 2) & (turns["gap"] > 0) & (turns["gap"] < 1e-3))
     assert turns["gap"][k] == pytest.approx(gap, rel=0.02)
     inside = problem(gap, timestep, radius=R_CUT + gap + depth, loss=loss)
-    true = EventAware()(inside, ("r_cut",))
+    true = EventAware()(inside, ("r_cut", "dt"))
     assert true.details["crossings"] == 2
     told = 2 * turns["weight"][k] / np.sqrt(2 * turns["bend"][k] * depth)
     assert told == pytest.approx(float(true.gradient["cutoff.radius"]), rel=0.1)
@@ -116,16 +116,17 @@ def test_the_weight_of_a_near_miss_is_what_its_flips_add_when_it_flips(loss):
 def test_a_pair_that_is_inside_between_two_steps_alone_is_seen():
     """Two free atoms that pass each other: no time step and no rounding moves them."""
     closest, speed, timestep = R_CUT - 1e-3, 1.0, 0.2
-    x = np.array([[3.0, 7.0, 7.0], [3.0 + speed * 1.5 * timestep, 7.0 + closest, 7.0]])
-    atoms = Atoms("Ar2", positions=x, cell=[14.0] * 3, pbc=True)
-    atoms.set_masses(np.ones(2))
-    atoms.set_momenta([[speed, 0, 0], [0, 0, 0]])
+    # a third one far from both
+    x = np.array([[3.0, 7.0, 7.0], [3.0 + speed * 1.5 * timestep, 7.0 + closest, 7.0], [10.0, 12.0, 13.0]])
+    atoms = Atoms("Ar3", positions=x, cell=[14.0] * 3, pbc=True)
+    atoms.set_masses(np.ones(3))
+    atoms.set_momenta([[speed, 0, 0], [0, 0, 0], [0, 0, 0]])
     dynamics = {"kind": "nve", "timestep": timestep}
     cutoff = {"kind": "hard", "radius": R_CUT}
     simulation = build(make(atoms, LENNARD_JONES, cutoff, dynamics=dynamics))
     passing = Problem(simulation, MeanSquaredDisplacement(), 4)
     near = Near(simulation, pace_of(passing.loss, passing.steps))
-    made = passed(passing, ("cutoff.radius",), watches=[near.reverse])
+    made = passed(passing, ("cutoff.radius", "dynamics.timestep"), watches=[near.reverse])
     assert sum(map(len, made.crossings)) == 0
     found = near.turns(1)
     turns = found.table
@@ -154,7 +155,7 @@ def test_nothing_is_trusted_that_was_not_looked_at(monkeypatch):
 @pytest.mark.parametrize("loss", [MeanPotential(every=7, first=5), EinsteinDiffusion(every=10)])
 def test_half_the_time_step_looks_at_the_same_times(loss):
     whole = problem(0.01, 0.002, loss=loss)
-    half = halved(whole)
+    half = shorter(whole, np.array([whole.steps]), per=2)
     assert half.steps == 2 * whole.steps
     assert half.value() == pytest.approx(whole.value(), rel=1e-3)
     assert len(spread(whole, 10)) > 3
