@@ -296,14 +296,6 @@ def test_answers_are_listed_as_soon_as_they_are_written(tmp_path):
             folder.check(name)
 
 
-def _listed_anew(path: Path, name: str) -> None:
-    """Lists a file as it is: what the digests do not see."""
-    made = manifest.load(path)
-    assert made is not None
-    made.files[name] = [manifest.digest(path / name)]
-    manifest.save(path, made)
-
-
 def _put(told, where: str, value) -> None:
     *way, last = where.split("/")
     for key in way:
@@ -332,35 +324,6 @@ _ANSWERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("where", "value"),
-    [
-        ("tested", None), ("word", 5), ("options/cases", "x"), ("options/cases", 10**9),
-        ("options/limits", 5), ("options/full", "maybe"), ("options", {}), ("seconds", "x"),
-        ("cases/0", [1]), ("cases/0", "x"),
-        ("cases/0/failures", [[1, 2]]), ("cases/0/failures", "abc"), ("cases/0/ties", [1]), ("cases", []),
-        ("shrunk/k", {}), ("shrunk/k/case/stills", [{}]), ("shrunk/k/case/pbc", [1]),
-        ("shrunk/k/failures/0/step", 7), ("shrunk/k/failures", []),
-        ("shrunk/k/case/stills/0/positions", [[1e999, 0, 0]]),
-        ("shrunk/k/case/stills/0/cell", [[1.0, 0, 0]]), ("", "[" * 100_000),
-    ],
-)  # fmt: skip
-def test_answers_of_another_shape_are_told_in_a_line(tmp_path, where, value):
-    from mdnum.verbs.conform import conform
-
-    folder = RunFolder.create(tmp_path / "run", world="conform")
-    folder.close()
-    told = json.loads(json.dumps(_ANSWERS))
-    if where:
-        _put(told, where, value)
-    file = folder.path / "answers.json"
-    file.write_text(json.dumps(told) if where else value)
-    _listed_anew(folder.path, "answers.json")
-    with pytest.raises(FolderError, match=r"answers\.json: ") as seen:
-        conform(resume=folder.path, report=False)
-    assert "\n" not in str(seen.value)
-
-
 def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
     from mdnum.verbs.conform import conform
 
@@ -387,30 +350,51 @@ def _audit_state() -> dict:
     return json.loads(to_json(state))
 
 
+_WRONG_ANSWERS = [
+    ("tested", None), ("word", 5), ("options/cases", "x"), ("options/cases", 10**9),
+    ("options/limits", 5), ("options/full", "maybe"), ("options", {}), ("seconds", "x"),
+    ("cases/0", [1]), ("cases/0", "x"),
+    ("cases/0/failures", [[1, 2]]), ("cases/0/failures", "abc"), ("cases/0/ties", [1]), ("cases", []),
+    ("shrunk/k", {}), ("shrunk/k/case/stills", [{}]), ("shrunk/k/case/pbc", [1]),
+    ("shrunk/k/failures/0/step", 7), ("shrunk/k/failures", []),
+    ("shrunk/k/case/stills/0/positions", [[1e999, 0, 0]]),
+    ("shrunk/k/case/stills/0/cell", [[1.0, 0, 0]]), ("", "[" * 100_000),
+]  # fmt: skip
+_WRONG_AUDITS = [
+    ("structure", "x"), ("structure", '{"__ase_objtype__": "nosuch"}'), ("name", 5), ("units", "x"),
+    ("checks", 5), ("checks", []), ("temperature", "x"), ("results", [{}]), ("results", None),
+    ("results/0/says", 5), ("results/0/tables", [5]), ("results/0/skipped", [1]),
+    ("results/0/findings", [{"code": 1}]), ("results/0/charts", [{"x": "q"}]),
+    ("results/0/charts/0/x", [1.0, 2.0]), ("cut", {}), ("failed", 5), ("failed", ["../x"]),
+    ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("where", "value"),
-    [
-        ("structure", "x"), ("structure", '{"__ase_objtype__": "nosuch"}'), ("name", 5), ("units", "x"),
-        ("checks", 5), ("checks", []), ("temperature", "x"), ("results", [{}]), ("results", None),
-        ("results/0/says", 5), ("results/0/tables", [5]), ("results/0/skipped", [1]),
-        ("results/0/findings", [{"code": 1}]), ("results/0/charts", [{"x": "q"}]),
-        ("results/0/charts/0/x", [1.0, 2.0]), ("cut", {}), ("failed", 5), ("failed", ["../x"]),
-        ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"), ("", None),
-    ],
-)  # fmt: skip
-def test_answers_of_an_audit_of_another_shape_are_named_in_a_line(tmp_path, where, value):
+    ("world", "where", "value"),
+    [("conform", *one) for one in _WRONG_ANSWERS] + [("audit", *one) for one in _WRONG_AUDITS],
+)
+def test_answers_of_another_shape_are_told_in_a_line(tmp_path, world, where, value):
+    from mdnum.audit.record import kept
+    from mdnum.verbs.conform import conform
+
+    folder = RunFolder.create(tmp_path / "run", world=world)
+    told = _audit_state() if world == "audit" else json.loads(json.dumps(_ANSWERS))
+    if where:
+        _put(told, where, value)
+    atomic.write_text(folder.path / "answers.json", json.dumps(told) if where else value)
+    folder.close()
+    with pytest.raises(FolderError, match=r"answers\.json: ") as seen:
+        kept(folder) if world == "audit" else conform(resume=folder.path, report=False)
+    assert "\n" not in str(seen.value) and "its bytes" not in str(seen.value)
+
+
+def test_answers_of_an_audit_are_gone_on_with(tmp_path):
     from mdnum.audit.record import kept
 
     folder = RunFolder.create(tmp_path / "run", world="audit")
-    state = _audit_state()
-    if where:
-        _put(state, where, value)
-    atomic.write_text(folder.path / "answers.json", json.dumps(state))
-    if not where:
-        assert kept(folder).left == ["curl"]
-        return
-    with pytest.raises(FolderError, match=r"answers\.json: "):
-        kept(folder)
+    atomic.write_text(folder.path / "answers.json", json.dumps(_audit_state()))
+    assert kept(folder).left == ["curl"]
 
 
 def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):
