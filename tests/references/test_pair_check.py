@@ -32,7 +32,7 @@ LIBRARIES = (
     "numpy-r2", "numpy", "ase", "ase-primitive", "vesin", "vesin-half", "mdanalysis", "mdanalysis-brute",
     "scipy",
 )  # fmt: skip
-#: compiled for each box; in the box of a system it is asked below
+#: compiled for each box; in the box of a system it is asked in the slow call
 AT_NIGHT = (pytest.mark.nightly, pytest.mark.jax_md)
 BOXES = {
     "orthorhombic": (np.diag([13.0, 14.0, 15.0]), (True, True, True)),
@@ -132,6 +132,7 @@ def test_compare_counts_missing_extra_and_borderline():
         assert compare_pairs(np.array(i, int), np.array(j, int), truth, 1.5, 1e-12) == counts
 
 
+@pytest.mark.slow  # most of its time is for the programs of jax-md
 @pytest.mark.jax_md
 def test_all_agree_on_a_rattled_crystal():
     system = make(crystal(), LENNARD_JONES, HARD)
