@@ -24,7 +24,6 @@ from mdnum.numerics import Ledger
 from mdnum.numerics.saltation import saltation_flagged
 from mdnum.systems.build import Simulation
 
-
 #: Crossings of one step that there is room for at least, as a power of two.
 _ROOM_BITS = 6
 
