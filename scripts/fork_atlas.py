@@ -163,7 +163,9 @@ def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, re
     failed = ", ".join(f"{name}: {why}" for name, why in found.failed.items())
     return replace(
         ended(found.verdict.word, failed),
-        **asdict(found.dates),
+        seed=found.dates.first_bit,
+        fork=found.dates.fork,
+        split=found.dates.split,
         told=found.splits.get("B|A"),
         nats=found.verdict.e_foldings,
         steps=found.steps,

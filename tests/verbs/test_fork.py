@@ -29,7 +29,7 @@ from mdnum.verbs import fork_pair, frame
 
 #: `mdnum.verbs.fork` is the function.
 MODULE = importlib.import_module("mdnum.verbs.fork")
-STEPS = 680
+STEPS = 400
 #: Of the pair, everywhere: one program.
 PAIR_STEPS = 400
 #: Free runs only.
@@ -76,7 +76,8 @@ def codes(outcome) -> list[str]:
 def crystal(tmp_path_factory):
     """float32 against float64 on the crystal, up to a little after the fork."""
     out = tmp_path_factory.mktemp("forks") / "crystal"
-    return mdnum.fork("argon/crystal-108", steps=STEPS, out=out, minimal=True, pin="fork")
+    seed = {"dynamics.seed": 4}
+    return mdnum.fork("argon/crystal-108", steps=STEPS, out=out, overrides=seed, minimal=True, pin="fork")
 
 
 @pytest.fixture(scope="module")
