@@ -252,8 +252,7 @@ class Number:
         key: as system files have it where they do.
         value: what the system says, in the units of its file; None where a batch has several.
         unit: of it; empty for a pure number and where it is not known.
-        at: the program at another value, without compiling again.
-        proper: the program at another value, as a user runs it.
+        at: the program at another value, which is not compiled again.
         positive: whether only values above 0 make sense.
         zero: whether 0 does too.
         dtype: of the floats that the number can have.
@@ -263,15 +262,9 @@ class Number:
     value: float | None
     unit: str
     at: Callable[[float], Any]
-    proper: Callable[[float], Any]
     positive: bool
     zero: bool = False
     dtype: Any = np.float64
-
-    @property
-    def compiles(self) -> bool:
-        """Whether the program that a user runs is compiled for each value."""
-        return self.at is not self.proper
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
     """Findings, scripts that reproduce them in another process, a page, and the same page again."""
     assert call("conform", "mine.py:made(scale=2)", "--cases", "4", "--no-large", "-o", "run") == 1

@@ -37,6 +37,7 @@ def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_water_around_a_protein(capsys, tmp_path, monkeypatch):
     """AdK in water, ten frames 100 ps apart on xtc's grid: what the file cannot tell is said."""
     monkeypatch.chdir(tmp_path)
@@ -92,6 +93,7 @@ def test_two_files_of_one_system(capsys, tmp_path):
     assert any("a flip that came first is no cause" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_a_file_that_breaks_off_is_kept_as_far_as_it_goes(capsys, tmp_path):
     whole = Path(XTC).read_bytes()
     (tmp_path / "cut.xtc").write_bytes(whole[: len(whole) // 2])

@@ -70,7 +70,13 @@ def test_flips_are_those_of_a_longer_trajectory_over_several_lists(tmp_path, nam
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 @pytest.mark.parametrize(
-    "name", ["argon/crystal-108", "argon/tilted-500", "pair/at-cutoff", "binary/kob-andersen-1000"]
+    "name",
+    [
+        "argon/crystal-108",
+        "argon/tilted-500",
+        "pair/at-cutoff",
+        pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly),
+    ],
 )
 def test_flips_found_over_the_lists_of_jax_md(tmp_path, name):
     check(tmp_path, name, STEPS.get(name, 40), **{"neighbors.builder": "jax-md", "neighbors.skin": 0.15})

@@ -251,7 +251,6 @@ class BallProgram:
             value=float(values[0]) if len(values) == 1 else None,
             unit="" if is_gain else _UNITS.get(word, ""),
             at=at,
-            proper=at,
             positive=word not in ("y0", "v0", "gravity"),
             zero=True,
             dtype=world.policy.dtype(role),

@@ -324,8 +324,6 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
         line.steps,
         [side.at for side in sides],
         lambda done: note(done, len(sides), {"phase": "confirming in a fresh process", "unit": "runs"}),
-        # each side is another compiled program then, and compiling is what takes the time
-        processes=2 if line.number.compiles else 1,
     )
     same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
     return [replace(edge, confirmed=all(same[2 * k : 2 * k + 2])) for k, edge in enumerate(found)]

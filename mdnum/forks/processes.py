@@ -362,9 +362,9 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def digests(system: System | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Digests of the histories at some values of a number, by the program that a user runs."""
+    """Digests of the histories at some values of a number, one after the other."""
     number = program_of(system, steps).number(key)
-    return [number.proper(value).history(steps).digest for value in values]
+    return [number.at(value).history(steps).digest for value in values]
 
 
 def digests_elsewhere(
@@ -373,8 +373,6 @@ def digests_elsewhere(
     steps: int,
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
-    *,
-    processes: int = 1,
 ) -> list[str]:
     """The same from a fresh process: what a boundary must survive before it is believed.
 
@@ -383,44 +381,30 @@ def digests_elsewhere(
 
     Args:
         progress: called with how many are known, at the start and after each.
-        processes: that share the values; worth it where each value is another compiled program.
 
     Raises:
         MdnumError: a process failed.
     """
-    done, lock = 0, Lock()
+    found: list[str] = []
 
-    def count(more: int) -> None:
-        nonlocal done
-        with lock:
-            done += more
-            if progress is not None:
-                progress(done)
+    def heard(digest: str) -> None:
+        found.append(digest)
+        if progress is not None:
+            progress(len(found))
 
-    count(0)
-    size = -(-len(values) // processes)
+    if progress is not None:
+        progress(0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         question = {"path": str(system.write(folder / "system")), "key": key, "steps": steps}
-
-        def answered(first: int) -> list[str]:
-            found: list[str] = []
-            part = [value.hex() for value in values[first : first + size]]
-
-            def heard(line: str) -> None:
-                found.append(line)
-                count(1)
-
-            failed = _ask({**question, "values": part}, folder / f"{first}.json", heard)
-            if failed or len(found) != len(part):
-                raise MdnumError(
-                    f"the process that was to confirm boundaries failed: {failed or 'no message'}",
-                    remedy="Run `mdnum doctor`",
-                )
-            return found
-
-        with ThreadPoolExecutor(max(1, processes)) as pool:
-            return [digest for part in pool.map(answered, range(0, len(values), size)) for digest in part]
+        asked = [value.hex() for value in values]
+        failed = _ask({**question, "values": asked}, folder / "question.json", heard)
+    if failed or len(found) != len(asked):
+        raise MdnumError(
+            f"the process that was to confirm boundaries failed: {failed or 'no message'}",
+            remedy="Run `mdnum doctor`",
+        )
+    return found
 
 
 # --- asking and answering -----------------------------------------------------------------------------

@@ -163,10 +163,10 @@ def _padded(chosen, filled, padding, out):
 
 
 @numba.njit(cache=True, nogil=True)
-def _transposed(rows, table, first):
+def _transposed(rows, table, first, atoms):
     """The slots of consecutive atoms, which share cache lines: written together."""
     for k in range(table.shape[0]):
-        for i in range(_TOGETHER):
+        for i in range(atoms):
             table[k, first + i] = rows[i, k]
 
 
@@ -208,10 +208,8 @@ def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
                     most = max(most, filled)
                     _padded(chosen, filled, n, rows[i % _TOGETHER])
                     first = i - i % _TOGETHER
-                    if i - first == _TOGETHER - 1:
-                        _transposed(rows, table, first)
-                    elif i == n - 1:
-                        table[:, first:] = rows[: n - first].T
+                    if i - first == _TOGETHER - 1 or i == n - 1:
+                        _transposed(rows, table, first, i - first + 1)
     return most
 
 

@@ -188,7 +188,7 @@ class MdProgram:
         def at(value: float) -> MdProgram:
             return replace(self, simulation=found.turn(self.simulation, value))
 
-        return Number(found.key, found.value, unit(self.simulation, found.key), at, at, found.positive)
+        return Number(found.key, found.value, unit(self.simulation, found.key), at, found.positive)
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
         """What a run decides (see `Program.history`); the loss is the squared displacement by default."""

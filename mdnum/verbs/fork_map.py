@@ -102,7 +102,6 @@ def fork_map(
             "jump_largest": max(jumps, default=None),
             "separation_largest": max((edge.separation for edge in found.boundaries), default=None),
             "boundaries": edges, "intervals": intervals, "unresolved": found.unresolved,
-            "compiles": found.number.compiles,
         }  # fmt: skip
         said = ("who", "way", "channel")
         answer.tables = {
@@ -221,7 +220,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
     what = [
         *size(view), ("Number", f"{_with_unit(s['key'], unit)} from {s['low']!r} to {s['high']!r}{own}"),
         ("Loss", f"{_with_unit(s['loss'], s['loss_unit'])} of the last step"),
-        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), view.took,
+        ("Program", TEXTS("program")), view.took,
     ]  # fmt: skip
     stretches = table_of(left, {"from": lambda one: repr(one[0]), "to": lambda one: repr(one[1])})
     return view.page(f"{view.name}: along {s['key']}", TEXTS("map_about"), keys, [

@@ -123,12 +123,11 @@ def test_both_sides_differ_in_a_fresh_process():
         assert boundary.confirmed
 
 
-def test_the_radius_is_turned_without_compiling_and_agrees_with_a_fresh_process():
+def test_the_radius_is_a_number_of_the_program_and_agrees_with_a_fresh_process():
     found = boundaries(meeting(), "cutoff.radius", 2.26, 2.30, 12, cells=2)
     # the distance after k steps of 1/20 is 3 - k/16: 2.3125, 2.25 from the pair's own motion alone up to
     # its entry; both atoms then fall faster, so a boundary between is where a later step meets the radius
     number = program_of(meeting()).number("radius")
-    assert not number.compiles
     for value in (2.27, 2.29):
         assert digests(meeting(), "radius", 12, [value]) == [number.at(value).history(12).digest]
     assert all(boundary.confirmed for boundary in found.boundaries)

@@ -404,12 +404,11 @@ def test_what_has_no_exact_image_is_counted():
     "word",
     [
         "translate=lattice",
-        "order@exact",
         *(
             pytest.param(word, marks=pytest.mark.slow)
             for word in (
-                "skin@exact", "unwrapped", "energy-shift", "order@fixed-point", "relabel@exact",
-                "format=ordered-sparse@exact", "rebuild=every:1@exact", "builder@exact",
+                "order@exact", "skin@exact", "unwrapped", "energy-shift", "order@fixed-point",
+                "relabel@exact", "format=ordered-sparse@exact", "rebuild=every:1@exact", "builder@exact",
             )
         ),
     ],

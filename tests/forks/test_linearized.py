@@ -61,6 +61,7 @@ def test_the_exponent_is_the_rate_at_which_two_runs_part():
     assert far - 2000 == pytest.approx((np.log(1e30) - found.furthest[-1]) / found.rate)
 
 
+@pytest.mark.slow
 def test_a_size_is_reached_when_two_runs_reach_it_and_no_tangent_overflows():
     a = crystal(cutoff__kind="force-shifted", dynamics__temperature=3.0, neighbors__skin=0.1)
     found = lyapunov(a, 500)
@@ -104,7 +105,14 @@ def inside(simulation: Simulation, steps: int) -> list[set[int]]:
     ]
 
 
-@pytest.mark.parametrize("name", ["cold", "continuous", pytest.param("hot", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cold",
+        pytest.param("continuous", marks=pytest.mark.slow),
+        pytest.param("hot", marks=pytest.mark.nightly),
+    ],
+)
 def test_no_predicted_flip_is_contradicted_by_the_run(name):
     simulation, steps = crystal(**SYSTEMS[name]), 200
     plain = inside(simulation, steps)

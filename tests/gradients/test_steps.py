@@ -65,6 +65,7 @@ def test_the_start_has_the_derivatives_of_differences(switched, by_hand):
         assert float(np.sum(by_hand.gradient[name] * way)) == pytest.approx(found.value, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_each_pair_type_has_its_own_derivative():
     simulation = build(make(mixture(), KOB_ANDERSEN, {"kind": "shifted", "radius": 2.0}))
     problem = Problem(simulation, everything(simulation.atoms), 12)
@@ -148,7 +149,7 @@ def test_a_parameter_that_nothing_depends_on_is_said_to_be_one(switched):
 # --- JAX's own reverse mode, which shares no derivative code with it --------------------------------
 
 
-@pytest.mark.parametrize("budget", [KEPT, 20_000, 0])
+@pytest.mark.parametrize("budget", [KEPT, pytest.param(20_000, marks=pytest.mark.slow), 0])
 def test_whatever_is_kept_the_gradient_is_one(switched, by_hand, budget):
     found = Unrolled(budget)(switched, tuple(by_hand.gradient))
     assert found.value == by_hand.value
@@ -192,7 +193,7 @@ def silicon():
     return Problem(simulation, everything(simulation.atoms), 12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_silicon_has_the_derivatives_of_differences_and_of_jax(silicon):
     found = Symmetric()(silicon, parameters.names(silicon.simulation))
     scalars = [name for name in found.gradient if not name.startswith("initial.")]

@@ -75,7 +75,13 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.nightly) if "hot" in c else c for c in CASES]
+    "case",
+    [
+        pytest.param(case, marks=getattr(pytest.mark, "nightly" if "hot" in case else "slow"))
+        if "hot" in case or case == "eam"
+        else case
+        for case in CASES
+    ],
 )
 def test_energy_forces_and_stress_agree_with_extended_precision(case):
     make, oracle, kind, repeat, rattle = CASES[case]

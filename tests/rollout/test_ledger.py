@@ -190,7 +190,7 @@ def cloud() -> Atoms:
     return atoms
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_free_cloud_that_collapses_makes_its_list_grow_on_the_way(tmp_path):
     path = write_system(tmp_path, cloud(), dynamics={"timestep": 0.004})
     result, folder = go(tmp_path, path, 127, save_every=1)

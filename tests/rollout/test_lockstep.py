@@ -41,7 +41,7 @@ def alone(simulation: Simulation, last: int):
         ("argon/crystal-108", {}),
         ("argon/crystal-108", {"neighbors.skin": 0.1}),
         # all at once, and every night one by one
-        ("binary/kob-andersen-1000", FLOAT32 | LANGEVIN),
+        pytest.param("binary/kob-andersen-1000", FLOAT32 | LANGEVIN, marks=pytest.mark.slow),
         pytest.param("binary/kob-andersen-1000", {}, marks=pytest.mark.nightly),
         pytest.param("argon/crystal-108", FLOAT32, marks=pytest.mark.nightly),
         pytest.param("argon/langevin-500", {}, marks=pytest.mark.nightly),

@@ -199,7 +199,7 @@ def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
         "steps": 500,
         "evaluations": 65, "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True,
         "confirmed": 0, "loss": "x", "loss_unit": "", "intervals": [], "histories": 1, "jump_largest": None,
-        "separation_largest": None, "seconds": 1.0, "compiles": False, "timestep": 0.1, "atoms": 2,
+        "separation_largest": None, "seconds": 1.0, "timestep": 0.1, "atoms": 2,
     }  # fmt: skip
     verdict = judged(tmp_path / "far", summary)
     assert verdict.tone == "warning" and verdict.evidence == ()

@@ -208,8 +208,7 @@ def edges(
     def at(q: float) -> MdProgram:
         return MdProgram(parameters.with_values(program.simulation, {full: q}))
 
-    # of a radius there is a program that it is an argument of
-    number = program.number(full) if full == "cutoff.radius" else Number(full, value, "", at, at, True)
+    number = Number(full, value, "", at, True)
     line = NumberLine(program, number, problem.steps, lambda *_: 0.0)
     ahead = _forecast(problem, full, progress)
     below, above = (_edge(problem, line, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))

@@ -55,7 +55,7 @@ def flint():
 # --- horizons -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_single_precision_leaves_early_and_double_does_not(flint):
     names = ("float64", "float32", "float32, accumulate float64", "float64, force bfloat16")
     found = certify(liquid(), 400, {name: MD_POLICIES[name] for name in names})
@@ -163,6 +163,7 @@ def test_a_decision_further_away_than_its_bound_is_the_exact_one(seed, offset, c
         assert bool(decider.inside(quantity, value)) == inside
 
 
+@pytest.mark.slow
 def test_horizons_of_a_narrow_run_and_a_wide_one():
     narrow, wide = (certified_horizon(simulation(policy), 400) for policy in (NARROW, None))
     assert wide.horizon is None and wide.wrong is None and wide.total == 0

@@ -151,7 +151,7 @@ def test_bad_input_is_refused(problem):
         trust(problem, ("sigma",), tolerance=2.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rounding_limits_a_narrow_run_where_it_has_grown_to_the_tolerance():
     simulation = build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW))
     problem = Problem(simulation, MeanSquaredDisplacement(), 400)
