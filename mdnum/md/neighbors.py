@@ -187,6 +187,9 @@ def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
     rows = np.empty((_TOGETHER, room), np.int32)
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
+            column = (b0 * bins[1] + b1) * bins[2]
+            if start[column] == start[column + bins[2]]:
+                continue
             columns, middle = _columns(b0, b1, bins, reach, periodic, matrix, row, shift)
             while not _gather(
                 x, start, row, shift, columns, middle, bins, reach, periodic, matrix, near, label, begin, home
@@ -195,7 +198,7 @@ def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
                 near, label = np.empty((3, capacity)), np.empty(capacity, np.int32)
                 mask, chosen = np.empty(capacity, np.uint8), np.empty(max(capacity, room) + 1, np.int32)
             for b2 in range(bins[2]):
-                here = (b0 * bins[1] + b1) * bins[2] + b2
+                here = column + b2
                 low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
                 px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
                 for i in range(start[here], start[here + 1]):
