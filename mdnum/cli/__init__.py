@@ -42,8 +42,8 @@ def _keep_programs() -> None:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
         os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(512 * 2**20)
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
-        # XLA takes its own hints (prefer-no-gather) for what the processor lacks and prints pages of it whenever
-        # it loads a program; what ends a process is logged still
+        # XLA takes its own hints (prefer-no-gather) for what the processor lacks and prints pages of it
+        # whenever it loads a program; what ends a process is logged still
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
