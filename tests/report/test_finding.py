@@ -1,4 +1,4 @@
-"""Findings from text files, verdicts from findings."""
+"""Words and numbers as people read them, findings from text files, verdicts from findings."""
 
 from __future__ import annotations
 
@@ -9,9 +9,54 @@ from pathlib import Path
 import pytest
 
 import mdnum
+from mdnum.report import words
 from mdnum.report.finding import Finding, Texts, conclude, fill, restore
 
 TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        ("at -8.3e-17 m and 1.4e-16 m", "at −8.3\u00a0×\u00a010⁻¹⁷ m and 1.4\u00a0×\u00a010⁻¹⁶ m"),
+        ("below 1e-12", "below 10⁻¹²"),
+        ("1.5E+06.", "1.5\u00a0×\u00a010⁶."),
+        ("2^15 and 10^-3", "2¹⁵ and 10⁻³"),
+        ("from h sqrt(k) = 0.23 on", "from h √k = 0.23 on"),
+        ("(-1, -.5)", "(−1, −.5)"),
+        *(
+            (same, same)
+            for same in ("0x1.03ecfe9b7bf1fp+0", "2-3 steps of tf32-in-solver", "float32e-3, v1.2e3x")
+        ),
+    ],
+)
+def test_typeset(written, read):
+    assert words.typeset(written) == read
+    assert words.typeset(read) == read
+
+
+@pytest.mark.parametrize(
+    ("write", "read"),
+    [
+        (words.number, {
+            0.0: "0", None: "–", float("nan"): "–", float("-inf"): "−∞", 123456.0: "123,456",
+            1234567.0: "1.23\u00a0×\u00a010⁶", -1.681e-4: "−1.68\u00a0×\u00a010⁻⁴", 0.00123: "0.00123",
+            9.999e-4: "0.00100", 999.96: "1,000", 0.5: "0.500",
+        }),
+        # never all or nothing
+        (words.percent, {
+            0.0: "0 %", 1.0: "100 %", 1e-9: "under 0.1 %", 0.99999: "over 99.9 %", 0.021: "2.1 %", 1.08: "108 %",
+        }),
+        # a capital, unless it begins with a name
+        (words.heading, {
+            "the pair": "The pair", "a column": "A column", "k against y": "k against y", "TF32": "TF32", "": "",
+            "jnp.sum hides it": "jnp.sum hides it", "dloss/dk": "dloss/dk",
+        }),
+    ],
+    ids=["number", "percent", "heading"],
+)  # fmt: skip
+def test_words(write, read):
+    assert {value: write(value) for value in read} == read
 
 
 @pytest.mark.parametrize(
@@ -28,31 +73,27 @@ TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
 )
 def test_fields_are_written_as_people_read_them(text, values, written):
     assert fill(text, values) == written
-
-
-def test_a_field_without_a_value_is_named():
     with pytest.raises(KeyError, match="speed"):
-        fill("{speed} now", {"time": 1})
+        fill(text + "{speed}", values)
 
 
-def test_variants_replace_and_add(tmp_path):
+def test_variants_replace_and_add_and_a_finding_comes_back_from_a_summary(tmp_path):
     (tmp_path / "verb.toml").write_text(
         '[LOST]\nseverity = "error"\nseverity_few = "warning"\ntitle = "lost {n:# pair}"\ntext = "Seen."\n'
         'more_first = "First at {step}."\nremedy = "Mend."\nremedy_blind = "Look."\n'
     )
     texts = Texts(tmp_path / "verb.py")
     plain = texts.finding("LOST", n=2)
-    assert (plain.severity, plain.title, plain.text, plain.remedy) == (
-        "error",
-        "lost 2 pairs",
-        "Seen.",
-        "Mend.",
+    assert plain == Finding("LOST", "error", "lost 2 pairs", "Seen.", "Mend.", {"n": 2})
+    other = texts.finding("LOST", "blind", "first", "few", n=1, step=4, section="Lists", cause="X")
+    values = {"n": 1, "step": 4}
+    assert other == Finding(
+        "LOST", "warning", "lost 1 pair", "Seen. First at 4.", "Look.", values, "Lists", "X"
     )
-    other = texts.finding("LOST", "blind", "first", "few", n=1, step=4, section="Lists")
-    assert (other.severity, other.text, other.remedy) == ("warning", "Seen. First at 4.", "Look.")
-    assert other.values == {"n": 1, "step": 4}
     with pytest.raises(KeyError):
         texts.finding("FOUND")
+    assert restore(vars(other)) == other
+    assert restore({"code": "X", "severity": "bad"}).severity == "info"
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.stem)
@@ -66,20 +107,18 @@ def test_every_sentence_can_be_filled(path):
 
 def test_the_headline_names_the_worst_thing():
     error, warning, note = (Finding(code, code, f"the {code}", "") for code in ("error", "warning", "info"))
-    assert conclude([], headline="Fine.", best="good").tone == "good"
-    assert conclude([note], headline="Fine.", best="good").headline == "Fine."
-    judged = conclude([note, warning, warning], headline="Ran.")
-    assert (judged.tone, judged.headline) == (
-        "warning",
-        "Ran. Look first: the warning, and 1 more point below.",
+
+    def judged(found, headline):
+        verdict = conclude(found, headline=headline, best="good")
+        return verdict.tone, verdict.headline, [each.code for each in verdict.findings]
+
+    assert judged([], "Fine.") == ("good", "Fine.", [])
+    assert judged([note], "Fine.") == ("good", "Fine.", ["info"])
+    several = "Ran. Look first: the warning, and 1 more point below."
+    assert judged([note, warning, warning], "Ran.") == ("warning", several, ["warning"] * 2 + ["info"])
+    assert judged([note, warning, error], "Ran.") == (
+        "error",
+        "The error. Ran.",
+        ["error", "warning", "info"],
     )
-    worst = conclude([note, warning, error], headline="Ran.")
-    assert (worst.tone, worst.headline) == ("error", "The error. Ran.")
-    assert [each.code for each in worst.findings] == ["error", "warning", "info"]
-    assert conclude([error], headline="It is the error.").headline == "It is the error."
-
-
-def test_a_finding_comes_back_from_a_summary():
-    finding = Finding("X", "warning", "t", "u", "v", {"n": 1.5}, "S", "Y")
-    assert restore(vars(finding)) == finding
-    assert restore({"code": "X", "severity": "bad"}).severity == "info"
+    assert judged([error], "It is the error.") == ("error", "It is the error.", ["error"])
