@@ -45,12 +45,13 @@ def test_typeset(written, read):
         }),
         # never all or nothing
         (words.percent, {
-            0.0: "0 %", 1.0: "100 %", 1e-9: "under 0.1 %", 0.99999: "over 99.9 %", 0.021: "2.1 %", 1.08: "108 %",
+            0.0: "0 %", 1.0: "100 %", 1e-9: "under 0.1 %", 0.99999: "over 99.9 %", 0.021: "2.1 %",
+            1.08: "108 %",
         }),
         # a capital, unless it begins with a name
         (words.heading, {
-            "the pair": "The pair", "a column": "A column", "k against y": "k against y", "TF32": "TF32", "": "",
-            "jnp.sum hides it": "jnp.sum hides it", "dloss/dk": "dloss/dk",
+            "the pair": "The pair", "a column": "A column", "k against y": "k against y", "TF32": "TF32",
+            "": "", "jnp.sum hides it": "jnp.sum hides it", "dloss/dk": "dloss/dk",
         }),
     ],
     ids=["number", "percent", "heading"],
