@@ -1,4 +1,4 @@
-"""A comparison into its folder, of either world: what is written agrees with what was followed."""
+"""A comparison into its folder and onto its page, of either world: true to the runs that were followed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ from mdnum.forks.pair import Screened
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.verdicts import Dates, Delay, Growth
 from mdnum.provenance import hashes
+from mdnum.report.section import Plot, Table
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.load import copy
-from mdnum.verbs import fork_pair, frame
+from mdnum.verbs import fork_pair, fork_verdict, frame
+from mdnum.verbs.fork_page import page
+from mdnum.verbs.frame import View
 
 #: `mdnum.verbs.fork` is the function.
 MODULE = importlib.import_module("mdnum.verbs.fork")
@@ -93,54 +96,33 @@ def balls(file, tmp_path_factory):
     return mdnum.fork(file, out=tmp_path_factory.mktemp("forks") / "three")
 
 
-def test_the_summary_says_what_was_followed(crystal):
-    made, summary = crystal.result, crystal.summary
-    assert made.dates.fork is not None and made.dates.split is None
-    assert summary["status"] == "complete"
-    # what is varied unless anything else is asked for
-    assert (summary["system"], summary["choice"]) == ("argon/crystal-108", "precision")
-    assert (summary["first_bit"], summary["fork"], summary["split"]) == (1, made.dates.fork, None)
+def test_the_summary_and_the_tables_agree(crystal):
+    """What the record of a frozen comparison leaves out: times, reasons, ambiguous pairs, sums of flips."""
+    made, summary, folder = crystal.result, crystal.summary, RunFolder.open(crystal.folder)
     assert summary["fork_time"] == pytest.approx(0.004 * made.dates.fork) and summary["split_time"] is None
-    assert summary["effect"] == "open"
     assert [one["code"] for one in summary["reasons"]] == [code for code, _ in made.verdict.reasons]
     assert summary["growth_rate_time"] == pytest.approx(summary["growth_rate"] / 0.004)
     assert summary["changes"]["precision.force"] == ["float64", "float32"]
-    assert summary["cross_flips"] == made.flips_total > 0
-    assert set(summary["splits"]) == {"B", "B|A", "A|B"} and summary["repeated"] == []
-    assert [(cell["arithmetic"], cell["decisions"], cell["reference"]) for cell in summary["table"]] == [
-        ("A", "A", "A"), ("B", "B", "A"), ("B", "A", "A"), ("A", "B", "A"),
-        ("A", "A", "B"), ("B", "B", "B"), ("B", "A", "B"), ("A", "B", "B"),
-    ]  # fmt: skip
     assert summary["shares"] == [] and summary["minimal"]["pairs"] is None
     # float32 decides: its own rounding is what makes it fork, and A is its shadow
     assert summary["certified_horizon"]["A"] == STEPS and summary["ambiguous"]["A"] == 0
-    assert summary["certified_horizon"]["B"] < made.dates.fork and summary["ambiguous"]["B"] > 0
-    assert summary["protected_until"] < made.dates.fork
+    assert (
+        summary["certified_horizon"]["B"] < made.dates.fork and summary["protected_until"] < made.dates.fork
+    )
     assert (summary["shadow"], summary["shadow_horizon"]) == ("A", made.dates.fork - 1)
-    assert summary["pinned"]["pairs"] == [list(made.decision.subject)]
-    assert summary["pinned"]["first"] == made.dates.fork and summary["pinned"]["split"] is None
     exponent = summary["lyapunov"]
     assert exponent["steps"] == 400 and exponent["rate_time"] == pytest.approx(exponent["rate"] / 0.004)
-    assert "HORIZON_SHORT" in codes(crystal)
-    assert json.loads((crystal.folder / "summary.json").read_text()) == summary
-
-
-def test_the_tables_hold_the_series(crystal):
-    folder = RunFolder.open(crystal.folder)
-    table, series = folder.read("separation"), crystal.result.series
+    table, series = folder.read("separation"), made.series
     np.testing.assert_allclose(table["time"], 0.004 * np.arange(STEPS + 1))
-    for column, name in (("step", "step"), ("free", "B"), ("imposed", "B|A"), ("back", "A|B"),
-                         ("energy_b", "energy B"), ("overridden", "overridden"), ("nearest_a", "nearest A"),
-                         ("back_from_a", "A|B from A"), ("ambiguous_b", "ambiguous B")):  # fmt: skip
+    for column, name in (("free", "B"), ("imposed", "B|A"), ("back", "A|B"), ("energy_b", "energy B")):
         np.testing.assert_array_equal(table[column], series[name])
-    doubts, first = folder.read("ambiguous_pairs"), crystal.summary["ambiguous_first"]
+    doubts, first = folder.read("ambiguous_pairs"), summary["ambiguous_first"]
     assert first["A"] is None and first["B"] == {name: doubts[name][0] for name in doubts if name != "run"}
-    assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == crystal.summary["ambiguous"]["B"]
+    assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == summary["ambiguous"]["B"] > 0
     assert (np.abs(doubts["margin"]) <= doubts["bound"]).all()
     np.testing.assert_array_equal(np.bincount(doubts["step"], minlength=STEPS + 1), table["ambiguous_b"])
-    flips = folder.read("cross_flips")
-    assert len(flips["step"]) == crystal.result.flips_total and flips["step"][0] == crystal.summary["fork"]
     # the pairs that differ are the flips that opened a difference less those that closed one
+    flips = folder.read("cross_flips")
     change = np.where(flips["differs"], 1, -1)
     held = np.array([change[flips["step"] <= step].sum() for step in table["step"]])
     np.testing.assert_array_equal(held, table["cross"])
@@ -182,50 +164,6 @@ def test_the_atoms_at_the_fork_are_those_of_the_runs(crystal):
     assert made["margins"]["A"] == pytest.approx(made["cutoffs"]["A"] ** 2 - gap**2, abs=1e-12)
     assert made["margins"]["A"] * made["margins"]["B"] < 0, "the runs decide differently"
     assert made["ambiguous_in"] == ["B"] and not made["ambiguous"]
-
-
-def test_a_ball_has_the_same_summary(crystal, balls):
-    made, summary = balls.result, balls.summary
-    assert (summary["system"], summary["balls"], summary["choice"]) == ("three", 3, "contact=earlier")
-    assert summary["steps"] == 120 and summary["timestep"] == 0.01 and summary["tolerance"] == 0.002
-    assert (summary["first_bit"], summary["fork"]) == (made.dates.first_bit, made.dates.fork)
-    assert summary["effect"] == "cause" and summary["status"] == "complete"
-    decision = summary["decision"]
-    assert (decision["channel"], decision["step"]) == ("contact", summary["fork"])
-    assert (decision["run"], decision["decided"]) == ("B", {"A": 0, "B": 1})
-    # the ball was above the floor in both runs: the margin is minus one height
-    assert decision["margins"]["A"] == decision["margins"]["B"] < 0
-    assert not decision["ambiguous"] and decision["bounds"]["A"] > 0
-    assert summary["splits"] == {"B": made.dates.split, "B|A": None, "A|B": None}
-    assert summary["imposed_largest"] == 0.0 and len(summary["table"]) == 8
-    assert summary["cross_flips"] == summary["cross_contacts"] + summary["cross_stops"] > 0
-    alone = {"atoms", "r_cut", "shadow", "shadow_horizon", "protected_until", "certified_horizon", "pinned",
-             "ambiguous", "ambiguous_steps", "ambiguous_first", "lists_complete", "lyapunov", "minimal",
-             "lyapunov_reason"}  # fmt: skip
-    assert set(crystal.summary) - set(summary) == alone
-    assert set(summary) - set(crystal.summary) == {
-        "balls", "contact_kind", "integrator", "counted", "cross_contacts", "cross_stops",
-    }  # fmt: skip
-
-
-def test_the_tables_of_a_ball_are_those_of_its_runs(balls):
-    folder, made = RunFolder.open(balls.folder), balls.result
-    table = folder.read("separation")
-    for column, name in (("free", "B"), ("imposed", "B|A"), ("back", "A|B"), ("energy_b", "energy B")):
-        np.testing.assert_array_equal(table[column], made.series[name])
-    rows = folder.read("cross_flips")
-    a, b = made.runs["A"], made.runs["B"]
-    contact = rows["channel"].astype(str) == "contact"
-    expected = {(int(row) + 1, int(ball)) for row, ball in np.argwhere(a.contact != b.contact)}
-    found = set(zip(rows["step"][contact].tolist(), rows["ball"][contact].tolist(), strict=True))
-    assert found == expected and len(found) == contact.sum()
-    stops = np.flatnonzero(a.iterations != b.iterations)
-    np.testing.assert_array_equal(rows["step"][~contact], stops + 1)
-    np.testing.assert_array_equal(rows["a"][~contact], a.iterations[stops])
-    around, one = folder.read("around"), balls.summary["decision"]["ball"]
-    mine = around["run"].astype(str) == "B"
-    np.testing.assert_array_equal(around["y"][mine], b.y[around["step"][mine], one])
-    assert bool(around["contact"][mine][around["step"][mine] == made.dates.fork][0])
 
 
 def test_a_folder_is_a_system_that_loads_again_and_a_page_that_is_written_again(crystal, balls):
@@ -305,8 +243,16 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
     assert found.summary["not_applicable"] == [{"choice": "noise", "reason": "no noise"}]
     assert codes(found) == ["MUST_HOLD_FORKED", "CHOICE_FAILED"] and found.verdict.tone == "error"
     assert seen[0] == (0, 4, {"phase": "early (1 of 4)"})
-    page = (found.folder / "report.html").read_text(encoding="utf-8")
-    assert "broken" in page and "holds" in page and "no noise" in page
+    assert {key.label: key.value for key in found.page.keys} == {
+        "Choices": "3", "Fork": "2", "Split": "1", "No bit differs": "1", "Must hold": "1 of 2",
+    }  # fmt: skip
+    table = part(found.page, "Ranking", Table)
+    assert [row[:5] for row in table.rows] == [
+        ("early", 0, 3, 90, ""), ("late", 1, 70, None, "broken"), ("never", None, None, None, "holds"),
+    ]  # fmt: skip
+    assert table.bad == {1} and (found.folder / "figures/ranking.svg").exists()
+    calm = told(found, ranking=[row for row in found.summary["ranking"] if row["choice"] == "never"])
+    assert fork_verdict.judge_screen(calm).tone == "good"
 
 
 @pytest.mark.parametrize(
@@ -341,6 +287,10 @@ def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, fil
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):
         mdnum.fork("pair/at-cutoff", "precision", steps=3, out=tmp_path)
+    unfinished = RunFolder.create(tmp_path / "unfinished", world="fork")
+    unfinished.finalize()
+    with pytest.raises(FolderError, match="holds no answer"):
+        frame.finish(unfinished)
 
 
 def test_a_run_that_stops_leaves_the_folder_free(tmp_path):
@@ -484,3 +434,188 @@ def test_an_ensemble_that_differs_is_a_finding(tmp_path, monkeypatch, passed):
     summary = RunFolder.open(tmp_path / "x").summary
     assert [one["code"] for one in summary["findings"]] == ([] if passed else ["NOT_BENIGN"])
     assert summary["steps"] == 40 and (tmp_path / "x" / "report.html").exists()
+
+
+# -- judged and shown ----------------------------------------------------------------------------------
+
+#: Entries of a pair whose one flip was the cause, two exponentials and what was asked of them.
+FIT = {"rate": 0.02, "r_squared": 0.99, "first": 200, "last": 380, "intercept": float(np.log(1e-9)) - 4.0}
+MINIMAL = {
+    "pairs": [
+        {"i": 3, "j": 4, "differs": [[400, 407], [420, 421], [430, 460], [500, None]]},
+        {"i": 3, "j": 9, "differs": [[410, None]]},
+    ],
+    "proven": True, "fork_alone": False, "candidates": 77, "tests": 23, "horizon": 1652,
+    "code": "proven", "reason": "2 pairs are enough.",
+}  # fmt: skip
+PINNED = {
+    "pin": "fork", "pairs": [[3, 4]], "first": 200, "last": 206, "split": None, "free": 390, "until": 400,
+    "largest": 2e-9, "reason": None,
+}  # fmt: skip
+LYAPUNOV = {
+    "rate": 0.019, "error": 0.0004, "rate_time": 1.9, "error_time": 0.04, "steps": 750, "chaotic": True,
+    "ratio": 1.05, "ulp": 8.9e-16, "ulp_split": 1702,
+}  # fmt: skip
+TABLE = [
+    {"arithmetic": x, "decisions": y, "reference": z, "split": at, "until": 400}
+    for (x, y, z), at in {"AAA": None, "BBA": 390, "BAA": None, "AAB": 390, "BBB": None, "BAB": 389}.items()
+]
+SHARES = [
+    {"what": "decisions", "reference": "A", "steps": 179, "at_least": True, "e_foldings": 3.58},
+    {"what": "arithmetic", "reference": "B", "steps": -1, "at_least": False, "e_foldings": -0.02},
+]
+CAUSE = {
+    "effect": "cause", "split": 390, "split_time": 1.56, "splits": {"B": 390, "B|A": None},
+    "predicted_split": None, "predicted_by": None, "e_foldings": None, "r_squared": 0.99,
+    "growth": {"B": FIT}, "table": TABLE, "shares": SHARES, "minimal": MINIMAL, "pinned": PINNED,
+    "lyapunov": LYAPUNOV, "lyapunov_reason": None, "must_hold": False, "findings": [],
+}  # fmt: skip
+COUNT = {"pairs": 16, "later": 9, "not_later": 7, "most": 16, "threshold": 43.2, "needed": [16, 12]}
+NONE = {"first_bit": None, "fork": None, "split": None, "decision": None}
+
+
+def told(outcome, **entries) -> View:
+    """The folder of an outcome, said to hold something else."""
+    return View(RunFolder.open(outcome.folder), {**outcome.summary, "findings": [], **entries})
+
+
+def cause(crystal, **entries) -> View:
+    """The crystal's folder, its flip the cause, and no matter of rounding."""
+    decision = {**crystal.summary["decision"], "ambiguous_in": []}
+    return told(crystal, **{**CAUSE, "decision": decision, **entries})
+
+
+def part(page, title, kind) -> Any:
+    """The first part of a kind in a section."""
+    (section,) = (one for one in page.sections if one.title == title)
+    return next(one for one in section.parts if isinstance(one, kind))
+
+
+def shown(view):
+    return page(view, fork_verdict.judge(view))
+
+
+def test_the_page_has_a_figure_and_a_table_for_everything_there_is(crystal):
+    view = cause(crystal)
+    s, own = view.summary, shown(view)
+    assert [one.title for one in own.sections] == [
+        "Separation", "The decision at the fork", "Whose decisions, whose arithmetic",
+        "One decision overridden", "Minimal cause", "How far the decisions are certain", "Growth",
+        "After the fork", "Decisions that differ", "What was compared",
+    ]  # fmt: skip
+    figures = {one.name for section in own.sections for one in section.parts if hasattr(one, "alt")}
+    assert figures == {"atoms", "cross", "energy", "furthest", "overridden", "protection", "separation"}
+    keys = {key.label: key.value for key in own.keys}
+    assert (keys["Fork"], keys["Split"], keys["First bit"]) == (f"step {s['fork']}", "step 390", "step 1")
+    assert keys["The flips were worth"] == "> 3.58" and keys["Decisions that differ"] == str(s["cross_flips"])
+    assert part(own, "Whose decisions, whose arithmetic", Table).rows == [
+        ("A", "its own", "is A", "390"), ("B", "its own", "390", "is B"), ("B", "A’s", "> 400", "389"),
+    ]  # fmt: skip
+    pairs = part(own, "Minimal cause", Table)
+    assert pairs.rows == [("3–4", "400 to 406, 420, 430 to 459, and 1 time more"), ("3–9", "from 410 on")]
+    certain = dict(part(own, "How far the decisions are certain", Table).rows)
+    assert f"step {s['certified_horizon']['B']} " in certain["Certified, B"]
+    assert f"{s['ambiguous']['B']} ambiguous decision" in certain["Certified, B"]
+    assert f"step {s['protected_until']}" in certain["Protected"]
+    growth = dict(part(own, "Growth", Table).rows)
+    assert "doubles in 34.7 steps" in growth["A and B, free"]
+    assert "1.05 times as fast" in growth["Lyapunov exponent"] and "1,702" in growth["An ulp of the start"]
+    # repeats are ranges
+    repeated = [{"free": 380, "imposed": 399}, {"free": 370, "imposed": None}]
+    own = shown(cause(crystal, repeated=repeated, count=COUNT))
+    rows = part(own, "Whose decisions, whose arithmetic", Table).rows[-2:]
+    assert [row[2] for row in rows] == ["370 to 380", "399 to 399; 1 of 2 not seen to"]
+    assert "15 repeats" in dict(part(own, "What was compared", Table).rows)["Chance"]
+    # of nothing that was not asked for
+    bare = shown(cause(crystal, decision=None, table=[], minimal=None, pinned=None, imposed_until=None))
+    assert [one.title for one in bare.sections[1:3]] == ["How far the decisions are certain", "Growth"]
+
+
+def test_the_figure_shows_the_separations_and_the_dates(crystal):
+    view, folder = cause(crystal), RunFolder.open(crystal.folder).read("separation")
+    plot = part(shown(view), "Separation", Plot)
+    by_label = {series.label: series for series in plot.series}
+    for label, column in (("A and B, free", "free"), ("A and B under A’s decisions", "imposed")):
+        # zeros before the first differing bit have no logarithm
+        expected = np.where(folder[column] > 0, folder[column], np.nan)
+        np.testing.assert_array_equal(by_label[label].y, expected)
+    assert [round(at) for at, _ in plot.verticals] == [1, view.summary["fork"], 390]
+    assert plot.horizontals[0][0] == view.summary["tolerance"] and plot.y_scale == "log"
+    fit = by_label["growth, fitted"]
+    assert np.diff(np.log(fit.y)).sum() / (fit.x[-1] - fit.x[0]) == pytest.approx(0.02)
+    assert fit.y[0] == pytest.approx(1e-9)
+    # a point below the line is where protection ends
+    plot = part(shown(view), "How far the decisions are certain", Plot)
+    assert plot.verticals[0] == (float(view.summary["protected_until"]), "protected")
+    near, moved = plot.series
+    assert (near.y < np.nan_to_num(moved.y)).argmax() == view.summary["protected_until"] + 1
+    # a poor fit is not drawn, and a split that is expected is
+    poor = shown(cause(crystal, growth={"B": FIT | {"r_squared": 0.3}}))
+    assert "growth, fitted" not in [series.label for series in part(poor, "Separation", Plot).series]
+    plot = part(shown(cause(crystal, split=None, predicted_split=600)), "Separation", Plot)
+    assert (600.0, "split expected") in plot.verticals
+    assert max(series.x.max() for series in plot.series) == 600
+
+
+@pytest.mark.parametrize(
+    ("entries", "tone", "name"),
+    [
+        ({}, "info", "cause"),
+        ({"effect": "accelerated", "splits": {"B|A": 395}, "count": COUNT}, "info", "accelerated"),
+        ({"effect": "bystander", "count": COUNT}, "info", "bystander"),
+        ({"effect": "bystander", "split": 2}, "info", "bystander_before"),
+        ({"effect": "undecided"}, "info", "undecided"),
+        ({"effect": "open", "split": None}, "info", "open"),
+        ({"effect": "open", "split": None, "predicted_split": 9000, "predicted_by": "growth"}, "info",
+         "open_growth"),
+        ({"effect": "open"}, "info", "open_split"),
+        ({"effect": "no fork", "fork": None, "split": None, "decision": None}, "good", "no_fork"),
+        ({"effect": "no fork", "fork": None, "decision": None}, "good", "no_fork_split"),
+        ({"effect": "same", **NONE}, "good", "same"),
+        ({"effect": "same", "first_bit": None, "split": None}, "info", "same_but_decided"),
+        ({"failed": {"B": "blow-up"}, "status": "failed"}, "warning", "ended"),
+        ({"failed": {"A": "runaway"}, "decision": None}, "warning", "ended_fork"),
+        ({"failed": {"A": "runaway", "B": "blow-up"}}, "warning", "ended_both"),
+        ({"must_hold": True}, "error", "cause"),
+    ],
+)  # fmt: skip
+def test_every_verdict_has_its_sentence(crystal, entries, tone, name):
+    view = cause(crystal, **entries)
+    verdict = fork_verdict.judge(view)
+    assert fork_verdict._headline(view)[0] == name and verdict.tone == tone
+    pair = "{i}–{j}".format(**crystal.summary["decision"])
+    assert "–" not in verdict.headline.replace(pair, "") and not verdict.headline.endswith("..")
+
+
+def test_findings_are_those_that_apply(crystal):
+    def findings(**entries):
+        return fork_verdict.judge(cause(crystal, **entries)).findings
+
+    def codes(**entries):
+        return {finding.code: finding.severity for finding in findings(**entries)}
+
+    assert codes() == {}
+    assert codes(decision=crystal.summary["decision"]) == {"AMBIGUOUS_FORK": "info"}
+    assert codes(split=None, effect="open") == {"HORIZON_SHORT": "info"}
+    assert codes(imposed_until=300) == {"GUARD": "info"}
+    assert codes(imposed_until=300, failed_imposed={"B|A": "runaway"}) == {"GUARD": "info"}
+    assert codes(must_hold=True) == {"MUST_HOLD_FORKED": "error"}
+    kept = {"code": "OF_OTHERS", "severity": "warning", "title": "look", "text": "there"}
+    stale = {"code": "GUARD", "severity": "info", "title": "no longer", "text": "so"}
+    assert codes(findings=[kept, stale]) == {"OF_OTHERS": "warning"}
+    # what the repeats leave open names what would do
+    (more,) = findings(effect="undecided", count=COUNT)
+    assert (more.code, more.values["more"], more.values["need"]) == ("UNDECIDED", 30, 12)
+    one = COUNT | {"pairs": 1, "later": 1, "not_later": 0, "most": 1, "needed": None}
+    (none,) = findings(effect="undecided", count=one)
+    assert none.values["more"] == 15 and none.values["need"] is None
+
+
+def test_a_decision_that_was_overridden_is_said_and_why_another_could_not_be(crystal):
+    for entries, sentence in (
+        ({}, "pinned_kept"), ({"last": 400, "split": 333}, "pinned_splits"),
+        ({"pairs": None, "reason": "the runs do not fork"}, "pinned_none"),
+    ):  # fmt: skip
+        pinned = PINNED | entries
+        said = part(shown(cause(crystal, pinned=pinned)), "One decision overridden", str)
+        assert said == fork_verdict.TEXTS(sentence, **{**pinned, "pairs": "3–4", "unit": "σ"})
