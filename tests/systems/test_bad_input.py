@@ -67,99 +67,92 @@ def test_the_unedited_file_loads(folder: Path):
     assert len(load(folder / "system.toml").atoms) == 256
 
 
+LJ = 'kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235'
+CUTOFF = '[cutoff]\nkind = "hard"\nradius = 8.0\n'
+FILE = 'file = "argon.extxyz"'
+OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
+
+
+# ranges and words of single keys are in the JSON schema, whose shipped copy is compared
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
-        ("radius = 8.0", "radius = 8.0.1", 14, ["not TOML", "radius = 8.0.1"]),
-        ("[cutoff]", "[cutoff", 12, ["not TOML"]),
-        ("radius = 8.0", "radus = 8.0", 14, ["unknown key 'radus'", "[cutoff]", "Did you mean radius?"]),
-        ("skin = 0.5", "skinn = 0.5", 17, ["unknown key 'skinn'", "Did you mean skin?"]),
-        ("[neighbors]", "[neighbours]", 16, ["unknown key 'neighbours'", "Did you mean neighbors?"]),
+        ("radius = 8.0", "radius = 8.0.1", 14, "not TOML … radius = 8.0.1"),
+        ("[cutoff]", "[cutoff", 12, "not TOML"),
+        ("radius = 8.0", "radus = 8.0", 14, "unknown key 'radus' … [cutoff] … Did you mean radius?"),
+        ("[neighbors]", "[neighbours]", 16, "unknown key 'neighbours' … Did you mean neighbors?"),
+        ("radius = 8.0", "radius = 8.0\nonset = 7.0", 12, "onset has no meaning for the kind hard"),
+        ('units = "metal"', 'units = "real"', 2, 'units = "real" … "metal" or "lj"'),
+        ('units = "metal"', "", None, "key 'units' missing … metal: Å"),
+        ("sigma = 3.405", "sigma = -3.405", 9, "potential.sigma = -3.405 … above 0 … Å or σ"),
+        ("skin = 0.5", "skin = -0.5", 17, "neighbors.skin = -0.5 … at least 0"),
+        ("skin = 0.5", 'skin = "0.5"', 17, 'neighbors.skin = "0.5" … expected a number … quotes'),
+        ("steps = 10", "steps = 10.5", 22, "dynamics.steps = 10.5 … a whole number"),
+        ("skin = 0.5", "skin = nan", 17, "neighbors.skin = nan … finite"),
         (
-            "radius = 8.0",
-            "radius = 8.0\nonset = 7.0",
-            12,
-            ["onset has no meaning for the kind hard"],
-        ),
-        ('units = "metal"', 'units = "real"', 2, ['units = "real"', '"metal" or "lj"']),
-        ('units = "metal"', "", None, ["key 'units' missing", "metal: Å"]),
-        ("sigma = 3.405", "sigma = -3.405", 9, ["potential.sigma = -3.405", "above 0", "Å or σ"]),
-        ("radius = 8.0", "radius = 0.0", 14, ["cutoff.radius = 0.0", "above 0"]),
-        ("skin = 0.5", "skin = -0.5", 17, ["neighbors.skin = -0.5", "at least 0"]),
-        ("skin = 0.5", 'skin = "0.5"', 17, ['neighbors.skin = "0.5"', "expected a number", "quotes"]),
-        ("steps = 10", "steps = 10.5", 22, ["dynamics.steps = 10.5", "a whole number"]),
-        ("skin = 0.5", "skin = nan", 17, ["neighbors.skin = nan", "finite"]),
-        (
-            'kind = "lennard-jones"',
-            'kind = "lenard-jones"',
+            '"lennard-jones"',
+            '"lenard-jones"',
             8,
-            ["unknown potential kind 'lenard-jones'", "Did you mean lennard-jones?", "tersoff", "eam"],
+            "unknown potential kind … Did you mean lennard-jones? … eam",
         ),
-        ('kind = "hard"', 'kind = "truncated"', 13, ["unknown cutoff kind 'truncated'", "hard, shifted"]),
-        ('kind = "nve"', "", 19, ["'kind' missing in [dynamics]", "nve, langevin"]),
-        (
-            'kind = "nve"',
-            'kind = "langevin"',
-            19,
-            ["key 'temperature' missing in [dynamics]", "1 more problem follows"],
-        ),
-        ("radius = 8.0", "", 12, ["[cutoff]", "radius missing", "in_sigma"]),
-        ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, ["both given"]),
-        ("radius = 8.0", 'radius = 8.0\ncompare = "<"', 15, ['cutoff.compare = "<"', '"r2 <"']),
-        ("epsilon = 0.0103235", "", 7, ["[potential]", "epsilon missing"]),
-        ('[cutoff]\nkind = "hard"\nradius = 8.0', "", None, ["[cutoff] missing", "lennard-jones needs one"]),
-        ('kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235', 'kind = "tersoff"', 10, ["[cutoff]"]),
-        ('[structure]\nfile = "argon.extxyz"', "", None, ["table [structure] missing"]),
-        ('file = "argon.extxyz"', 'flie = "argon.extxyz"', 5, ["unknown key 'flie'", "Did you mean file?"]),
-        ('file = "argon.extxyz"', 'file = "gone.extxyz"', None, ["gone.extxyz: no such structure file"]),
-        ("[neighbors]", "[neighbors]\nrebuild = 5", 17, ["neighbors.rebuild = 5", "a table"]),
+        ('kind = "nve"', "", 19, "'kind' missing in [dynamics] … nve, langevin"),
+        ('"nve"', '"langevin"', 19, "key 'temperature' missing in [dynamics] … 1 more problem follows"),
+        ("radius = 8.0", "radius = true", 14, "cutoff.radius = true … expected a number"),
+        ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the radius"),
+        ("radius = 8.0", "", 12, "[cutoff] … radius missing … in_sigma"),
+        ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, "both given"),
+        ("epsilon = 0.0103235", "", 7, "[potential] … epsilon missing"),
+        (CUTOFF, "", None, "[cutoff] missing … lennard-jones needs one"),
+        (LJ, 'kind = "tersoff"', 10, "[cutoff]"),
+        (f"[structure]\n{FILE}", "", None, "table [structure] missing"),
+        (FILE, 'file = "gone.extxyz"', None, "gone.extxyz: no such structure file"),
+        ("[neighbors]", "[neighbors]\nrebuild = 5", 17, "neighbors.rebuild = 5 … a table"),
+        (OWN, f"{OWN}\npairs.ArKr = {PAIR}", None, "'ArKr' is not two species joined by a hyphen"),
+        (OWN, f"{OWN}\npairs.Ar-Kr = {PAIR}\npairs.Kr-Ar = {PAIR}", None, "are the same pair"),
+        (OWN, f"{OWN}\npairs.Kr-Kr = {{ sgima = 1.0 }}", None, "unknown key 'sgima' in [potential.pair"),
+        (FILE, FILE + "\nmasses = { Kr = 80.0 }", None, "structure.masses names Kr"),
+        (FILE, 'builder = "fcc"\nsymbol = "Argon"\nlattice_constant = 5.4', None, "no chemical symbol"),
     ],
 )
-def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | None, words: list[str]):
+def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | None, words: str):
     edit(folder, old, new)
     said = refusal(folder)
-    for word in words:
-        assert word in said
-    if line is not None:
-        assert f"system.toml:{line}: " in said
+    assert all(word in said for word in words.split(" … ")), said
+    assert line is None or f"system.toml:{line}: " in said
 
 
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("cutoff.radus", "8", ["--set cutoff.radus", "Did you mean radius?"]),
-        ("cutof.radius", "8", ["--set cutof.radius: ", "Did you mean cutoff?"]),
-        ("cutoff.kind", "swiched", ["--set cutoff.kind", "Did you mean switched?"]),
-        ("neighbors.skin", "wide", ["--set neighbors.skin", '"wide"', "expected a number"]),
-        ("about.me", "x", ["about is a value and not a table"]),
-        ("cutoff..radius", "8", ["--set", "is not a key"]),
-        ("dynamics.kind", "langevin", ["key 'temperature' missing"]),
-        ("potential.kind", "morse", ["depth", "missing"]),
-        ("precision.force", "half", ["--set precision.force", '"float32", "bfloat16" or "float16"']),
-        ("precision.state", "float16", ["--set precision.state", '"float32" or "lattice"', "move no atom"]),
+        ("cutoff.radus", "8", "--set cutoff.radus … Did you mean radius?"),
+        ("cutof.radius", "8", "--set cutof.radius:  … Did you mean cutoff?"),
+        ("cutoff.kind", "swiched", "--set cutoff.kind … Did you mean switched?"),
+        ("neighbors.skin", "wide", '--set neighbors.skin … "wide" … expected a number'),
+        ("about.me", "x", "about is a value and not a table"),
+        ("cutoff..radius", "8", "--set … is not a key"),
+        ("dynamics.kind", "langevin", "key 'temperature' missing"),
+        ("potential.kind", "morse", "depth … missing"),
+        ("precision.state", "float16", '--set precision.state … "float32" or "lattice" … move no atom'),
+        ("neighbors.skin", "3.0", "8 + 3 = 11 Å … 10.8 Å … a skin up to 2.8 Å"),
+        ("cutoff.radius", "12", "a cutoff below 10.8 Å"),
     ],
 )
-def test_a_mistake_on_the_command_line(folder: Path, key: str, value: str, words: list[str]):
+def test_a_mistake_on_the_command_line(folder: Path, key: str, value: str, words: str):
     said = refusal(folder, {key: value})
-    for word in words:
-        assert word in said
+    assert all(word in said for word in words.split(" … ")), said
 
 
-def test_a_missing_system_file_and_an_unknown_name(tmp_path: Path):
-    with pytest.raises(InputError, match=r"gone\.toml: no such system file"):
-        load(tmp_path / "gone.toml")
-    with pytest.raises(
-        InputError, match=r"no system called 'argon/liquid-846'.*Did you mean argon/liquid-864\?"
+def test_a_name_or_a_file_that_is_no_system(tmp_path: Path):
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00units")
+    near = r"Did you mean argon/liquid-864\?"
+    for name, words in (
+        (tmp_path / "gone.toml", r"gone\.toml: no such system file"),
+        (tmp_path / "bytes.toml", "UTF-8"),
+        ("argon/liquid-846", f"no system called 'argon/liquid-846'.*{near}"),
+        ("liquid-864", near),
     ):
-        load("argon/liquid-846")
-    with pytest.raises(InputError, match=r"Did you mean argon/liquid-864\?"):
-        load("liquid-864")
-
-
-def test_a_system_file_that_is_not_text(tmp_path: Path):
-    (tmp_path / "system.toml").write_bytes(b"\xff\xfe\x00units")
-    with pytest.raises(InputError, match="UTF-8"):
-        load(tmp_path / "system.toml")
+        with pytest.raises(InputError, match=words):
+            load(name)
 
 
 @pytest.mark.parametrize("text", ["three\nnot a structure\n", "", None])
@@ -186,25 +179,20 @@ def lean(atoms: Atoms) -> None:
     atoms.set_cell(cell)
 
 
+def flatten(atoms: Atoms) -> None:
+    atoms.set_cell([*atoms.cell[:2], atoms.cell[0] + atoms.cell[1]])
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (lambda atoms: place(atoms, _17=[0, np.nan, 0]), "atom 17 (Ar) has positions"),
         (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), "1 more atoms are like it"),
         (lambda atoms: atoms.set_momenta([[np.nan] * 3] * len(atoms)), "atom 0 (Ar) has momenta"),
-        (
-            lambda atoms: place(atoms, _100=[*(atoms.positions[7] + [0.25, 0, 0])]),
-            "atoms 7 (Ar) and 100 (Ar) are 0.25 Å apart, closer than 1.362 Å",
-        ),
-        (
-            lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[atoms.cell[0, 0] - 0.05, 1, 1]),
-            "atoms 0 (Ar) and 9 (Ar) are 0.1 Å apart",
-        ),
+        (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å apart, closer than 1.362"),
+        (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) are 0.1 Å apart"),
         (lean, "half the smallest perpendicular width of the box (along a) is 8.02"),
-        (
-            lambda atoms: atoms.set_cell([*atoms.cell[:2], atoms.cell[0] + atoms.cell[1]]),
-            "the cell vectors lie in a plane",
-        ),
+        (flatten, "the cell vectors lie in a plane"),
     ],
 )
 def test_a_structure_that_cannot_be_simulated(folder: Path, damage, words: str):
@@ -214,16 +202,8 @@ def test_a_structure_that_cannot_be_simulated(folder: Path, damage, words: str):
     assert words in refusal(folder)
 
 
-def test_a_box_too_small_says_what_would_fit(folder: Path):
-    said = refusal(folder, {"neighbors.skin": "3.0"})
-    assert "8 + 3 = 11 Å" in said
-    assert "10.8 Å" in said
-    assert "a skin up to 2.8 Å" in said
-    assert "a cutoff below 10.8 Å" in refusal(folder, {"cutoff.radius": "12"})
+def test_what_just_fits_and_free_boundaries_have_no_width(folder: Path):
     load(folder / "system.toml", {"neighbors.skin": "2.7999"})
-
-
-def test_free_boundaries_have_no_width(folder: Path):
     system = load(folder / "system.toml", {"structure.pbc": "[false, false, false]", "cutoff.radius": "50"})
     assert not system.atoms.pbc.any()
 
@@ -242,35 +222,18 @@ def test_unknown_species(folder: Path):
     said = refusal(folder)
     assert "the structure holds Ar, Kr" in said
     assert "no constants for Ar-Ar, Ar-Kr, Kr-Kr" in said
-    with_pairs = """[potential]
-kind = "lennard-jones"
+    with_pairs = """kind = "lennard-jones"
 pairs.Ar-Ar = { sigma = 3.4, epsilon = 0.01 }
 pairs.Kr-Ar = { sigma = 3.5, epsilon = 0.01 }
 """
-    edit(folder, '[potential]\nkind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235\n', with_pairs)
+    edit(folder, LJ, with_pairs)
     assert "no constants for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
 
 
 def test_silicon_constants_for_argon(folder: Path):
-    edit(folder, '[cutoff]\nkind = "hard"\nradius = 8.0\n', "")
-    edit(folder, 'kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235', 'kind = "stillinger-weber"')
+    edit(folder, CUTOFF, "")
+    edit(folder, LJ, 'kind = "stillinger-weber"')
     assert "constants for Si, but the structure holds Ar" in refusal(folder)
-
-
-def test_pair_names_that_are_not_pairs(folder: Path):
-    edit(folder, "epsilon = 0.0103235", "epsilon = 0.01\npairs.ArKr = { sigma = 1.0, epsilon = 1.0 }")
-    assert "'ArKr' is not two species joined by a hyphen" in refusal(folder)
-    edit(folder, "pairs.ArKr =", "pairs.Ar-Kr = { sigma = 1.0, epsilon = 1.0 }\npairs.Kr-Ar =")
-    assert "are the same pair" in refusal(folder)
-    edit(folder, "pairs.Kr-Ar = { sigma", "pairs.Kr-Kr = { sgima")
-    said = refusal(folder)
-    assert "unknown key 'sgima' in [potential.pairs.Kr-Kr]" in said
-    assert "Did you mean sigma?" in said
-
-
-def test_masses_of_absent_species(folder: Path):
-    edit(folder, 'file = "argon.extxyz"', 'file = "argon.extxyz"\nmasses = { Kr = 80.0 }')
-    assert "structure.masses names Kr" in refusal(folder)
 
 
 def test_constraints_are_not_silently_dropped(folder: Path):
@@ -281,19 +244,9 @@ def test_constraints_are_not_silently_dropped(folder: Path):
     assert "constraints" in refusal(folder)
 
 
-def test_a_builder_with_a_wrong_symbol(folder: Path):
-    edit(folder, 'file = "argon.extxyz"', 'builder = "fcc"\nsymbol = "Argon"\nlattice_constant = 5.4')
-    said = refusal(folder)
-    assert "'Argon' is no chemical symbol" in said
-
-
 def test_a_table_that_is_not_setfl(folder: Path):
-    edit(folder, '[cutoff]\nkind = "hard"\nradius = 8.0\n', "")
-    edit(
-        folder,
-        'kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235',
-        'kind = "eam"\nfile = "ar.eam.alloy"',
-    )
+    edit(folder, CUTOFF, "")
+    edit(folder, LJ, 'kind = "eam"\nfile = "ar.eam.alloy"')
     assert "ar.eam.alloy: no such potential table" in refusal(folder)
     (folder / "ar.eam.alloy").write_text("one\ntwo\n")
     assert "not a setfl table" in refusal(folder)

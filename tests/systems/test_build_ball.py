@@ -38,10 +38,8 @@ def test_heights_and_velocities():
 @pytest.mark.parametrize("name", ["float16", "bfloat16", "float32", "float64"])
 def test_adjacent_starts_are_adjacent_in_the_dtype_of_the_state(name: str, height: float):
     # heights that are no floats of any of them, or lie next to where the spacing doubles
-    table = spec(
-        SPRING, start={"height": height, "balls": 4, "spread_ulps": 1}, precision={"state": name}
-    )  # fmt: skip
-    y, _ = start(table)
+    rows = {"height": height, "balls": 4, "spread_ulps": 1}
+    y, _ = start(spec(SPRING, start=rows, precision={"state": name}))
     dtype = np.dtype(getattr(ml_dtypes, name)) if name == "bfloat16" else np.dtype(name)
     held = y.astype(dtype)
     assert np.array_equal(held.astype(np.float64), y), "each is a float of the dtype"
@@ -63,50 +61,49 @@ def test_penetrations_on_the_boundary_sum_to_the_tolerance_exactly():
     assert total < low.type(system.spec.stop.tol)
 
 
-def test_controls():
-    still = {"gravity": 0.0}
-    made = problem(spec(SPRING, flight=still))
-    assert made.world.control is None
-    made = problem(spec(SPRING, flight={**still, "control": {"kind": "constant", "value": 2.0}}))
-    assert np.asarray(made.world.control).tolist() == [2.0] * 8
-    wave = {"kind": "sine", "amplitude": 2.0, "period": 0.04, "phase": 0.0}
-    made = problem(spec(SPRING, flight={**still, "control": wave}))
-    assert np.allclose(made.world.control, [0, 2, 0, -2, 0, 2, 0, -2], atol=1e-14)
-    values = tuple(float(n) for n in range(8))
-    made = problem(spec(SPRING, flight={**still, "control": {"kind": "values", "values": values}}))
-    assert np.asarray(made.world.control).tolist() == list(values)
+@pytest.mark.parametrize(
+    ("control", "pushes"),
+    [
+        (None, None),
+        ({"kind": "constant", "value": 2.0}, [2.0] * 8),
+        ({"kind": "sine", "amplitude": 2.0, "period": 0.04, "phase": 0.0}, [0, 2, 0, -2, 0, 2, 0, -2]),
+        ({"kind": "values", "values": (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)}, list(range(8))),
+    ],
+)
+def test_controls(control: dict[str, Any] | None, pushes: list[float] | None):
+    flight = {"gravity": 0.0} | ({} if control is None else {"control": control})
+    made = problem(spec(SPRING, flight=flight)).world.control
+    assert (made is None) if pushes is None else np.allclose(made, pushes, atol=1e-14)
 
 
-def test_contacts_and_integrators():
-    spring = problem(spec({**SPRING, "damping": 2.0})).world
-    assert isinstance(spring.contact, step.Penalty)
-    assert (float(spring.contact.k), float(spring.contact.damping), spring.contact.smooth) == (
-        100.0,
-        2.0,
-        False,
-    )
+def test_contacts():
+    spring = problem(spec({**SPRING, "damping": 2.0, "hysteresis": 0.25})).world
+    assert isinstance(spring.contact, step.Penalty) and float(spring.lift) == 0.25
+    assert (float(spring.contact.k), float(spring.contact.damping)) == (100.0, 2.0)
+    assert not spring.contact.smooth
     soft = problem(spec({**SPRING, "eps": 0.1})).world.contact
-    assert soft.smooth
-    assert float(soft.eps) == 0.1
+    assert soft.smooth and float(soft.eps) == 0.1
     table = spec(SOLVED, stop={"rule": "sum", "tol": 1e-3, "max_iter": 7})
     solved = problem(table).world.contact
     assert isinstance(solved, step.Projection)
     assert (float(solved.k), float(solved.alpha), float(solved.restitution)) == (0.5, 0.25, 0.75)
-    for kind, made in (
-        ("explicit-euler", step.ExplicitEuler),
-        ("semi-implicit-euler", step.SemiImplicitEuler),
-        ("velocity-verlet", step.BallVerlet),
-        ("event-located", step.EventLocated),
-    ):
-        world = problem(spec(IMPACT, integrator={**EULER, "kind": kind})).world
-        assert type(world.integrator) is made
-        assert float(world.integrator.h) == 0.01
-    implicit = spec(
-        SPRING, integrator={**EULER, "kind": "implicit-midpoint"}, stop={"rule": "maximum", "tol": 1e-9}
-    )
-    assert isinstance(problem(implicit).world.integrator.stop, stopping.Maximum)
-    lifted = problem(spec({**SPRING, "hysteresis": 0.25})).world
-    assert float(lifted.lift) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("kind", "contact", "made"),
+    [
+        ("explicit-euler", IMPACT, step.ExplicitEuler),
+        ("semi-implicit-euler", IMPACT, step.SemiImplicitEuler),
+        ("velocity-verlet", IMPACT, step.BallVerlet),
+        ("event-located", IMPACT, step.EventLocated),
+        ("implicit-midpoint", SPRING, step.ImplicitMidpoint),
+    ],
+)
+def test_integrators(kind: str, contact: dict[str, Any], made: type):
+    rule = {"stop": {"rule": "maximum", "tol": 1e-9}} if kind == "implicit-midpoint" else {}
+    integrator = problem(spec(contact, integrator={**EULER, "kind": kind}, **rule)).world.integrator
+    assert type(integrator) is made and float(integrator.h) == 0.01
+    assert not rule or isinstance(integrator.stop, stopping.Maximum)
 
 
 @pytest.mark.parametrize(
@@ -120,20 +117,16 @@ def test_contacts_and_integrators():
 )
 def test_stopping_rules(rule: str, made: type):
     stop = problem(spec(SOLVED, stop={"rule": rule, "tol": 1e-3, "max_iter": 7})).world.contact.stop
-    assert type(stop) is made
-    assert (float(stop.tol), stop.max_iter) == (1e-3, 7)
+    assert type(stop) is made and (float(stop.tol), stop.max_iter) == (1e-3, 7)
     two = problem(spec(SOLVED, stop={"rule": rule, "tol": 1e-3, "enter": 1e-2})).world.contact.stop
-    assert isinstance(two, stopping.HysteresisStop)
-    assert float(two.enter) == 1e-2
+    assert isinstance(two, stopping.HysteresisStop) and float(two.enter) == 1e-2
 
 
-def test_a_reduction_with_its_number():
-    stop = {"rule": "sum", "tol": 1e-3}
+def test_rules_with_a_number():
     for text, made in (("blocked:4", Blocked(4)), ("permuted:3", Permuted(3))):
-        world = problem(spec(SOLVED, stop=stop, precision={"reduction": text})).world
-        assert world.contact.stop.reduction == made
-    fixed = problem(spec(SOLVED, stop={"rule": "fixed", "count": 3})).world.contact.stop
-    assert fixed.count == 3
+        table = spec(SOLVED, stop={"rule": "sum", "tol": 1e-3}, precision={"reduction": text})
+        assert problem(table).world.contact.stop.reduction == made
+    assert problem(spec(SOLVED, stop={"rule": "fixed", "count": 3})).world.contact.stop.count == 3
 
 
 def test_precision_and_loss():

@@ -1,8 +1,9 @@
-"""Loading: names and paths, overrides, species tables, and systems that are written and read again."""
+"""Loading: names and paths, overrides, species tables, systems written and read again, and the schema."""
 
 from __future__ import annotations
 
 import importlib
+import json
 import tomllib
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from ase.io import read
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from pydantic import ValidationError
 
 from mdnum import systems
 from mdnum.errors import InputError
-from mdnum.systems import System, load, pairs, structures
+from mdnum.systems import System, load, pairs, schema, shipped_folder, structures
+from mdnum.systems.load import BALL_SCHEMA, json_schema
 
 ARGON = "argon/liquid-864"
 MIXTURE = "binary/kob-andersen-1000"
@@ -35,12 +38,34 @@ def same_bits(a: System, b: System) -> bool:
     )
 
 
+@pytest.mark.parametrize(("file", "root"), [("schema.json", "SystemSpec"), (BALL_SCHEMA, "BallSpec")])
+def test_the_shipped_json_schema_is_current_and_describes_every_key(file, root):
+    """Kinds, defaults and ranges of every key."""
+    shipped = json.loads((shipped_folder() / file).read_text(encoding="utf-8"))
+    made = json_schema(file)
+    assert shipped == made, "run scripts/make_systems.py --schema"
+    tables = {"structure", "potential", "cutoff", "neighbors", "dynamics", "precision", "record", "rebuild"}
+    tables |= {"start", "flight", "contact", "integrator", "loss", "gradient", "control"}
+    silent = [
+        f"{name}.{key}"
+        for name, table in {**made["$defs"], root: made}.items()
+        for key, value in table.get("properties", {}).items()
+        if "description" not in value and key not in {"kind", "rule", "units", *tables}
+    ]
+    assert silent == []
+
+
+def test_a_skin_of_its_units_and_a_spec_that_is_frozen():
+    argon, crystal = (load(name).spec.model_copy(update={"neighbors": schema.NeighborsTable()})
+                      for name in (ARGON, "argon/crystal-108"))  # fmt: skip
+    assert (argon.skin, crystal.skin) == (1.0, 0.3)
+    with pytest.raises(ValidationError, match="frozen"):
+        argon.units = "lj"  # type: ignore[misc]
+
+
 def test_a_name_and_a_path_mean_the_same():
-    by_name = load(ARGON)
-    by_path = load(systems.shipped_folder() / f"{ARGON}.toml")
-    assert by_name.name == ARGON
-    assert by_path.name == "liquid-864"
-    assert same_bits(by_name, by_path)
+    by_name, by_path = load(ARGON), load(shipped_folder() / f"{ARGON}.toml")
+    assert (by_name.name, by_path.name) == (ARGON, "liquid-864") and same_bits(by_name, by_path)
 
 
 def test_species_and_tables_of_a_mixture():
@@ -92,30 +117,28 @@ def test_another_kind_drops_the_keys_it_does_not_have():
     assert not hasattr(morse.spec.potential, "sigma")
     nve = load("argon/langevin-500", {"dynamics.kind": "nve"})
     assert not hasattr(nve.spec.dynamics, "friction")
-
-
-def test_a_radius_replaces_multiples_of_sigma():
+    # a radius replaces multiples of sigma
     system = load(MIXTURE, {"cutoff.radius": "2.0"})
-    assert system.spec.cutoff.in_sigma is None
-    assert system.r_cut == 2.0
-
-
-def test_a_temperature_asked_for_is_not_ignored():
-    stored = load(ARGON)
-    assert stored.velocities is not None
-    assert load(ARGON, {"dynamics.steps": "10"}).velocities is not None
-    assert load(ARGON, {"dynamics.temperature": "200"}).velocities is None
-    assert load(ARGON, {"dynamics.seed": "8"}).velocities is None
-    kept = load(ARGON, {"dynamics.seed": "8", "structure.velocities": "file"})
-    assert kept.velocities is not None
-    assert load("argon/langevin-500", {"dynamics.seed": "8"}).velocities is not None, (
-        "there it seeds the noise"
-    )
+    assert system.spec.cutoff.in_sigma is None and system.r_cut == 2.0
 
 
 @pytest.mark.parametrize(
-    "name", [ARGON, MIXTURE, "pair/leaving-well", "pair/at-cutoff", "silicon/tersoff-512"]
+    ("name", "changes", "stored"),
+    [
+        (ARGON, {}, True),
+        (ARGON, {"dynamics.steps": "10"}, True),
+        (ARGON, {"dynamics.temperature": "200"}, False),
+        (ARGON, {"dynamics.seed": "8"}, False),
+        (ARGON, {"dynamics.seed": "8", "structure.velocities": "file"}, True),
+        # there it seeds the noise
+        ("argon/langevin-500", {"dynamics.seed": "8"}, True),
+    ],
 )
+def test_a_temperature_asked_for_is_not_ignored(name: str, changes: dict[str, str], stored: bool):
+    assert (load(name, changes).velocities is not None) == stored
+
+
+@pytest.mark.parametrize("name", [ARGON, MIXTURE, "pair/leaving-well", "silicon/tersoff-512"])
 def test_a_written_system_is_the_same_system(name: str, tmp_path: Path):
     system = load(name)
     path = system.write(tmp_path / "run")
@@ -187,12 +210,10 @@ def test_masses(tmp_path: Path):
 def test_a_builder_with_tilt_shears_cell_and_atoms_alike():
     plain = load("silicon/tersoff-512", {"structure.rattle": "0.0"})
     tilted = load("silicon/tersoff-512", {"structure.rattle": "0.0", "structure.tilt": "[0.1, -0.05, 0.2]"})
-    cell = np.asarray(tilted.atoms.cell)
-    edge = plain.atoms.cell[0, 0]
-    assert np.allclose(cell, [[edge, 0, 0], [0.1 * edge, edge, 0], [-0.05 * edge, 0.2 * edge, edge]])
-    assert np.allclose(
-        tilted.atoms.get_scaled_positions(wrap=False), plain.atoms.get_scaled_positions(wrap=False)
-    )
+    sheared = plain.atoms.cell[0, 0] * np.array([[1, 0, 0], [0.1, 1, 0], [-0.05, 0.2, 1]])
+    assert np.allclose(np.asarray(tilted.atoms.cell), sheared)
+    scaled, same = (system.atoms.get_scaled_positions(wrap=False) for system in (tilted, plain))
+    assert np.allclose(scaled, same)
 
 
 def test_perpendicular_widths():
@@ -205,11 +226,8 @@ def test_perpendicular_widths():
 
 def test_copy_gives_a_system_that_loads_and_overwrites_nothing(tmp_path: Path):
     copied = systems.copy(ARGON, tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "liquid-864.extxyz",
-        "liquid-864.toml",
-        "schema.json",
-    ]
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == {"liquid-864.extxyz", "liquid-864.toml", "schema.json"}
     assert same_bits(load(copied), load(ARGON))
     assert copied.read_text(encoding="utf-8").startswith("#:schema schema.json")
     with pytest.raises(InputError, match="is there already"):
@@ -219,13 +237,9 @@ def test_copy_gives_a_system_that_loads_and_overwrites_nothing(tmp_path: Path):
 
 @pytest.mark.nightly
 def test_a_hundred_thousand_atoms_are_checked(tmp_path: Path):
-    text = (systems.shipped_folder() / f"{ARGON}.toml").read_text(encoding="utf-8")
-    structure = (
-        'builder = "fcc"\nsymbol = "Ar"\nlattice_constant = 5.3\nrepeat = [30, 30, 30]\nrattle = 0.1\n'
-    )
-    (tmp_path / "large.toml").write_text(
-        text.replace('file = "liquid-864.extxyz"', structure), encoding="utf-8"
-    )
+    text = (shipped_folder() / f"{ARGON}.toml").read_text(encoding="utf-8")
+    built = 'builder = "fcc"\nsymbol = "Ar"\nlattice_constant = 5.3\nrepeat = [30, 30, 30]\nrattle = 0.1\n'
+    (tmp_path / "large.toml").write_text(text.replace('file = "liquid-864.extxyz"', built), encoding="utf-8")
     assert len(load(tmp_path / "large.toml").atoms) == 108_000
 
 

@@ -31,40 +31,19 @@ def test_none_is_absent():
     assert toml.dump({"a": None, "b": {"c": 1, "d": None}}) == "[b]\nc = 1\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("0.5", 0.5),
-        ("20_000", 20000),
-        ("true", True),
-        ("switched", "switched"),
-        ('"switched"', "switched"),
-        ("[1, 2]", [1, 2]),
-        ("r2 <=", "r2 <="),
-        ("", ""),
-        ("1\nb = 2", "1\nb = 2"),
-    ],
-)
-def test_a_scalar_from_the_command_line(text: str, value: object):
-    assert toml.scalar(text) == value
-
-
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("cutoff.kind", ("cutoff", "kind")),
-        ('potential.pairs."Ni-P".sigma', ("potential", "pairs", "Ni-P", "sigma")),
-        ("about", ("about",)),
-    ],
-)
-def test_a_dotted_key(text: str, parts: tuple[str, ...]):
-    assert toml.dotted(text) == parts
-
-
-@pytest.mark.parametrize("text", ["", ".", "a.", ".a", "a b", "a..b"])
-def test_not_a_dotted_key(text: str):
-    with pytest.raises(InputError, match="is not a key"):
-        toml.dotted(text)
+def test_words_of_the_command_line():
+    read = {"0.5": 0.5, "20_000": 20000, "true": True, "switched": "switched", '"switched"': "switched",
+            "[1, 2]": [1, 2], "r2 <=": "r2 <=", "": "", "1\nb = 2": "1\nb = 2"}  # fmt: skip
+    assert {text: toml.scalar(text) for text in read} == read
+    parts = {
+        "cutoff.kind": ("cutoff", "kind"),
+        'potential.pairs."Ni-P".sigma': ("potential", "pairs", "Ni-P", "sigma"),
+        "about": ("about",),
+    }
+    assert {text: toml.dotted(text) for text in parts} == parts
+    for text in ("", ".", "a.", ".a", "a b", "a..b"):
+        with pytest.raises(InputError, match="is not a key"):
+            toml.dotted(text)
 
 
 TEXT = """\
@@ -82,22 +61,12 @@ radius = 2.5
 """
 
 
-@pytest.mark.parametrize(
-    ("key", "line"),
-    [
-        (("units",), 1),
-        (("potential", "kind"), 4),
-        (("potential", "sigma"), 3),
-        (("potential", "pairs", "Ni-P", "sigma"), 7),
-        (("potential", "pairs", "P-P", "sigma"), 8),
-        (("cutoff", "radius"), 11),
-        (("dynamics", "kind"), None),
-    ],
-)
-def test_the_line_of_a_key(key: tuple[str, ...], line: int | None):
-    assert toml.line_of(TEXT, key) == line
-
-
-def test_an_error_without_a_line_is_at_the_end():
+def test_the_line_of_a_key():
+    lines = {
+        "units": 1, "potential.kind": 4, "potential.sigma": 3, "potential.pairs.Ni-P.sigma": 7,
+        "potential.pairs.P-P.sigma": 8, "cutoff.radius": 11, "dynamics.kind": None,
+    }  # fmt: skip
+    assert {key: toml.line_of(TEXT, tuple(key.split("."))) for key in lines} == lines
+    # an error without a line is at the end
     with pytest.raises(InputError, match=r"^file:2: not TOML"):
         toml.parse('a = 1\nb = """open', "file")
