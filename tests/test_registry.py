@@ -63,6 +63,10 @@ def test_a_name_with_and_without_its_argument(rules):
     assert rules.parse("later=2/3").denominator == 3
     assert list(rules) == ["plain", "strict", "parsed", "fixed", "made", "later"]
     assert "fixed" in rules and "fixt" not in rules
+    told = [rules.description(name) for name in ("plain", "fixed")]
+    assert told == ["A rule of the tests. More of it", "Seven"]
+    with pytest.raises(ValueError, match="two values"):
+        rules.add("plain", Rule)
 
 
 @pytest.mark.parametrize(
@@ -80,15 +84,6 @@ def test_what_is_not_there_is_an_error(rules, text, message):
         rules.parse(text)
 
 
-def test_a_value_is_described_by_its_first_line(rules):
-    assert [rules.description(name) for name in ("plain", "fixed")] == [
-        "A rule of the tests. More of it",
-        "Seven",
-    ]
-    with pytest.raises(ValueError, match="two values"):
-        rules.add("plain", Rule)
-
-
 def test_a_package_adds_a_value_that_is_imported_when_it_is_used(rules, installed):
     source = 'from test_registry import Rule\nclass Wide(Rule):\n    """Wide."""\n'
     installed("wide-rules", {"wide_rules": source}, {GROUP: {"wide": "wide_rules:Wide"}})
@@ -96,11 +91,8 @@ def test_a_package_adds_a_value_that_is_imported_when_it_is_used(rules, installe
     sys.modules["test_registry"] = sys.modules[__name__]
     assert list(rules)[-1] == "wide" and "wide_rules" not in sys.modules
     assert rules.parse("wide=9").width == 9
-    assert (rules.description("wide"), rules.package("wide"), rules.package("plain")) == (
-        "Wide",
-        "wide-rules",
-        "mdnum",
-    )
+    told = rules.description("wide"), rules.package("wide"), rules.package("plain")
+    assert told == ("Wide", "wide-rules", "mdnum")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import ase
 import numpy as np
 import pytest
 from ase.io import iread, write
+from trajectories import brute_force
 
 import mdnum
 from mdnum.errors import InputError
@@ -58,20 +59,11 @@ def codes(result: Outcome) -> set[str]:
     return {one.code for one in result.verdict.findings}
 
 
-def inside(atoms: ase.Atoms, radius: float, reach: int = 2) -> set[tuple[int, int, int]]:
+def inside(atoms: ase.Atoms, radius: float) -> set[tuple[int, int, int]]:
     """(i, j, rank) inside, from all images one by one; the nearest image has rank 0."""
-    cell, found = np.array(atoms.cell), set()
-    shifts = [np.array((a, b, c)) @ cell for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)
-              for c in range(-reach, reach + 1)]  # fmt: skip
-    # wrapped, so that so few images are enough
-    x = atoms.get_positions(wrap=True)
-    for i in range(len(x)):
-        for j in range(i, len(x)):
-            r = sorted(float(np.linalg.norm(x[j] + shift - x[i])) for shift in shifts)
-            # an atom's own images come in pairs, of which one counts, after itself
-            r = r[1::2] if i == j else r
-            found |= {(i, j, rank) for rank, one in enumerate(r) if one < radius}
-    return found
+    every = range(len(atoms))
+    found = brute_force.everything(atoms.positions, np.array(atoms.cell), [True] * 3, every, every, radius)
+    return set(brute_force.members(found, lambda i, j: radius))
 
 
 @pytest.mark.slow
@@ -116,10 +108,8 @@ def test_tables_agree_with_sets_worked_out_one_by_one(examined) -> None:
         assert rows["neighbors"][row] == pytest.approx(count.mean())
     stays = folder.read("contacts")
     # every stay of every pair, as frames in the sets
-    columns = (stays[name] for name in ("i", "j", "rank", "begin", "end"))
-    there = {
-        (*pair, n) for *pair, begin, end in zip(*columns, strict=True) for n in range(begin, end)
-    }  # fmt: skip
+    rows = zip(*(stays[name] for name in ("i", "j", "rank", "begin", "end")), strict=True)
+    there = {(*pair, n) for *pair, begin, end in rows for n in range(begin, end)}
     assert there == {(*pair, n) for n, one in enumerate(sets) for pair in one}
 
 
@@ -269,12 +259,12 @@ def test_velocities_show_what_is_lost_unless_chance_may(examined, crossed, rate,
 def test_one_atom_and_steps(tmp_path: Path, examined) -> None:
     one = examined("one.extxyz", [ase.Atoms("Ar", [[0.12, 0.34, 0.56]], cell=[9.0] * 3, pbc=True)])
     assert one.page.about.startswith("1 atom, 1 frame")
-    rows = []
-    for n in range(3):
-        rows += ["ITEM: TIMESTEP", str(20 * n), "ITEM: NUMBER OF ATOMS", "2", "ITEM: BOX BOUNDS pp pp pp"]
-        rows += ["0 20"] * 3 + ["ITEM: ATOMS id type x y z", "1 1 1.5 1.5 1.5"]
-        rows.append(f"2 1 {4.3 - 0.3 * n} 1.5 1.5")
-    (tmp_path / "l.lammpstrj").write_text("\n".join(rows) + "\n")
+    head = (
+        "ITEM: NUMBER OF ATOMS\n2\nITEM: BOX BOUNDS pp pp pp\n0 20\n0 20\n0 20\nITEM: ATOMS id type x y z\n"
+    )
+    rows = (f"{head}1 1 1.5 1.5 1.5\n2 1 {4.3 - 0.3 * n} 1.5 1.5\n" for n in range(3))
+    text = "".join(f"ITEM: TIMESTEP\n{20 * n}\n{row}" for n, row in enumerate(rows))
+    (tmp_path / "l.lammpstrj").write_text(text)
     steps = examined("l.lammpstrj")
     assert steps.summary["rules"][0]["flips"] == 1 and steps.summary["time"] == "step"
     assert "20 steps apart" in steps.page.about
@@ -299,29 +289,24 @@ def test_a_file_without_a_box_or_with_half_of_one(examined, pbc: Any, row: str) 
 
 @pytest.mark.slow
 def test_two_runs_that_differ_in_one_number(crystal: Path, tmp_path: Path) -> None:
-    other = mdnum.run(
-        "argon/crystal-108", steps=400, save_every=1, out=tmp_path / "b", check=False, report=False,
-        overrides={"precision.force": "float32"},
-    ).folder  # fmt: skip
+    narrow: Any = {"overrides": {"precision.force": "float32"}, "check": False, "report": False}
+    other = mdnum.run("argon/crystal-108", steps=400, save_every=1, out=tmp_path / "b", **narrow).folder
     found = mdnum.flips(crystal, other, out=tmp_path / "cmp")
     rule = found.summary["rules"][0]
-    first, sets = rule["first"], []
-    for path in (crystal, other):
-        flips = RunFolder.open(path).read("flips")
-        sets.append(set(zip(flips["step"], flips["i"], flips["j"], strict=True)))
+    tables = (RunFolder.open(path).read("flips") for path in (crystal, other))
+    a, b = (set(zip(flips["step"], flips["i"], flips["j"], strict=True)) for flips in tables)
     # both start alike: the sets differ first where one of them has a flip that the other has not
-    frame = min(step for step, *_ in sets[0] ^ sets[1])
-    assert first["frame"] == frame and rule["certain"] == frame
+    frame = min(step for step, *_ in a ^ b)
+    assert rule["first"]["frame"] == rule["certain"] == frame
     pairs = {(one["i"], one["j"]) for one in rule["first_pairs"]}
-    assert pairs == {(i, j) for step, i, j in sets[0] ^ sets[1] if step == frame}
+    assert pairs == {(i, j) for step, i, j in a ^ b if step == frame}
     for one in rule["first_pairs"]:
-        assert (one["margin_a"] > 0) == (one["inside"] == "A") and (one["margin_b"] > 0) == (
-            one["inside"] == "B"
-        )
-    assert found.summary["seed"] == 1 and 0 < first["furthest_before"] < 1e-5
+        inside = [name for name in "AB" if one[f"margin_{name.lower()}"] > 0]
+        assert inside == [one["inside"]]
+    assert found.summary["seed"] == 1 and 0 < rule["first"]["furthest_before"] < 1e-5
     assert "NO_CAUSE_FROM_FILES" in codes(found)
     apart = RunFolder.open(found.folder).read("apart")
-    x = [np.array([a.positions for a in iread(p / "trajectory.traj", ":")]) for p in (crystal, other)]
+    x = [np.array([one.positions for one in iread(p / "trajectory.traj", ":")]) for p in (crystal, other)]
     moved = np.linalg.norm(x[0] - x[1], axis=2)
     # one of the two may have been wrapped a step before the other
     np.testing.assert_allclose(apart["furthest"][:390], moved.max(1)[:390], atol=1e-15)

@@ -149,11 +149,8 @@ def test_thresholds_of_a_directed_rule_tell_neighbors_from_others(rule: Rule) ->
 
 def test_nearest_neighbors_that_differ_for_certain(tmp_path: Path) -> None:
     for name, far in (("a", 3.5), ("b", 2.5)):
-        frames = [
-            ase.Atoms("Ar3", [[0, 0, 0], [3.0 + 0.01 * n, 0, 0], [0, 0, 3.2 if n == 0 else far]])
-            for n in range(3)
-        ]
-        write(tmp_path / f"{name}.traj", frames)
+        places = ([[0, 0, 0], [3.0 + 0.01 * n, 0, 0], [0, 0, far if n else 3.2]] for n in range(3))
+        write(tmp_path / f"{name}.traj", [ase.Atoms("Ar3", place) for place in places])
     found = looked(tmp_path / "a.traj", tmp_path / "b.traj", tmp_path / "f", cutoffs=(), nearest=[1])
     rule = found.summary["rules"][0]
     assert rule["first"]["frame"] == 1 and rule["certain"] == 1
@@ -223,14 +220,15 @@ def test_files_that_do_not_say_it_are_of_no_other_species_or_times(tmp_path: Pat
     write(tmp_path / "a.extxyz", frames)
 
     def dump(name: str, row: str) -> Path:
-        lines = []
-        for n, one in enumerate(frames):
-            lines += ["ITEM: TIMESTEP", f"{10 * n}", "ITEM: NUMBER OF ATOMS", "40"]
-            lines += ["ITEM: BOX BOUNDS pp pp pp", *["0 9.0"] * 3, f"ITEM: ATOMS {row}"]
-            for k, x in enumerate(one.positions):
-                words = " ".join(f"{v:.8f}" for v in x)
-                lines.append(f"{k + 1} {1 + (k < 20)} {words}" if "type" in row else f"{k + 1} {words}")
-        (tmp_path / name).write_text("\n".join(lines) + "\n")
+        with (tmp_path / name).open("w") as file:
+            for n, one in enumerate(frames):
+                file.write(
+                    f"ITEM: TIMESTEP\n{10 * n}\nITEM: NUMBER OF ATOMS\n40\nITEM: BOX BOUNDS pp pp pp\n"
+                )
+                file.write("0 9.0\n" * 3 + f"ITEM: ATOMS {row}\n")
+                for k, (x, y, z) in enumerate(one.positions):
+                    kind = f"{1 + (k < 20)} " if "type" in row else ""
+                    file.write(f"{k + 1} {kind}{x:.8f} {y:.8f} {z:.8f}\n")
         return tmp_path / name
 
     for name, row in (("types.lammpstrj", "id type x y z"), ("bare.lammpstrj", "id x y z")):
