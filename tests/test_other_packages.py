@@ -98,9 +98,10 @@ MODULES = {"strange_terms": CUTOFF + POTENTIAL, "strange_choice": CHOICE, "stran
 
 
 @pytest.fixture
-def site(tmp_path, monkeypatch):
-    """A folder on the search path with the package in it."""
-    folder = install(tmp_path / "site", "strange-terms", MODULES, GROUPS)
+def site(request, tmp_path, monkeypatch):
+    """A folder on the search path with the package in it, or with other source of its cutoff."""
+    terms = {"strange_terms": getattr(request, "param", MODULES["strange_terms"])}
+    folder = install(tmp_path / "site", "strange-terms", MODULES | terms, GROUPS)
     monkeypatch.syspath_prepend(folder)
     yield folder
     for name in MODULES:
@@ -176,24 +177,20 @@ def test_a_gradient_method(site):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("site", "message"),
     [
-        ("w - share", "w + share", "its slope is not the derivative of its energy at r = 1, r_cut = 2"),
-        ("u - share * r2", "u - share * r2 + 1", "its energy jumps by -1 at r_cut, and its smoothness is 0"),
-        ("smoothness = 0", "smoothness = 1", "its slope jumps by 0.125 at r_cut, and its smoothness is 1"),
-        ("smoothness = 0", "smoothness = -1", "its smoothness is -1, and its energy does not jump"),
-        ("name = ", "nam = ", "it has no name"),
+        (CUTOFF.replace(old, new), message)
+        for old, new, message in (
+            ("w - share", "w + share", "its slope is not the derivative of its energy at r = 1, r_cut = 2"),
+            ("u - share * r2", "u - share * r2 + 1", "energy jumps by -1 at r_cut, and its smoothness is 0"),
+            ("smoothness = 0", "smoothness = 1", "slope jumps by 0.125 at r_cut, and its smoothness is 1"),
+            ("smoothness = 0", "smoothness = -1", "its smoothness is -1, and its energy does not jump"),
+            ("name = ", "nam = ", "it has no name"),
+        )
     ],
+    indirect=["site"],
 )
-def test_a_cutoff_that_is_not_what_it_says_is_an_error_that_names_its_package(
-    tmp_path, monkeypatch, old, new, message
-):
-    assert old in CUTOFF
-    folder = install(tmp_path, "strange-terms", {"strange_terms": CUTOFF.replace(old, new)}, GROUPS)
-    monkeypatch.syspath_prepend(folder)
-    try:
-        with pytest.raises(InputError, match="cutoff 'tilted' of package strange-terms") as caught:
-            CUTOFFS.parse("tilted")
-        assert message in str(caught.value)
-    finally:
-        sys.modules.pop("strange_terms", None)
+def test_a_cutoff_that_is_not_what_it_says_is_an_error_that_names_its_package(site, message):
+    with pytest.raises(InputError, match="cutoff 'tilted' of package strange-terms") as caught:
+        CUTOFFS.parse("tilted")
+    assert message in str(caught.value)
