@@ -13,26 +13,8 @@ from pathlib import Path
 import pytest
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
-STUDIES = (
-    "ase_comparison",
-    "audit_calculator",
-    "ball_benchmark",
-    "ball_sensitivity",
-    "benchmark",
-    "cutoff_sensitivity",
-    "flips_benchmark",
-    "flips_of_a_trajectory",
-    "fork_atlas",
-    "fork_benchmark",
-    "gradient_benchmark",
-    "gradient_horizon",
-    "hard_cutoff_gradient",
-    "precision_fork",
-    "reduction_order",
-    "scaling",
-    "skin_sensitivity",
-    "termination_precision",
-    "topology_flip_report",
+STUDIES = sorted(
+    path.stem for path in SCRIPTS.glob("[a-z]*.py") if "\nHow to read it." in path.read_text(encoding="utf-8")
 )
 
 # every one compiles; and dtypes are not strict, as a user calls it
@@ -78,9 +60,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 def row(table: str, *first: str) -> list[str]:
     """The cells of the only line whose first cells are these."""
     lines = [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
-    found = [cells for cells in lines if cells[: len(first)] == list(first)]
-    assert len(found) == 1, (first, table)
-    return found[0]
+    (found,) = [cells for cells in lines if cells[: len(first)] == list(first)]
+    return found
+
+
+def rows(table: str, columns: str, *firsts: str | tuple[str, ...]) -> list[dict[str, str]]:
+    """The lines that begin with these cells, by the names of their columns."""
+    found = [row(table, *((first,) if isinstance(first, str) else first)) for first in firsts]
+    return [dict(zip(columns.split(), cells, strict=False)) for cells in found]
 
 
 def is_png(path: Path) -> bool:
@@ -99,15 +86,15 @@ def test_help_says_the_question_and_how_to_read_the_answer(name: str, here) -> N
 def test_hard_and_shifted_cutoffs_flip_alike_and_conserve_differently(tmp_path: Path) -> None:
     words = ["argon/crystal-108", "--steps", "150", "--kinds", "hard", "shifted", "switched"]
     table = study("cutoff_sensitivity", *words, "--scales", "1", "-o", "c.png", cwd=tmp_path)
-    hard, shifted, switched = (row(table, kind) for kind in ("hard", "shifted", "switched"))
-    column = ["cutoff", "r_cut", "E/N", "std", "drift", "flips", "energy_jump", "force_jump", "smooth"].index
-    assert float(hard[column("flips")]) > 0
-    assert hard[column("flips")] == shifted[column("flips")]
-    assert hard[column("force_jump")] == shifted[column("force_jump")]
-    assert float(hard[column("energy_jump")]) < 0 == float(shifted[column("energy_jump")])
-    assert float(hard[column("std")]) > 10 * float(shifted[column("std")]) > 0
-    assert float(switched[column("force_jump")]) == 0
-    assert [int(one[-1]) for one in (hard, shifted, switched)] == [-1, 0, 1]
+    columns = "cutoff r_cut E/N std drift flips energy_jump force_jump smooth"
+    hard, shifted, switched = rows(table, columns, "hard", "shifted", "switched")
+    assert float(hard["flips"]) > 0
+    assert hard["flips"] == shifted["flips"]
+    assert hard["force_jump"] == shifted["force_jump"]
+    assert float(hard["energy_jump"]) < 0 == float(shifted["energy_jump"])
+    assert float(hard["std"]) > 10 * float(shifted["std"]) > 0
+    assert float(switched["force_jump"]) == 0
+    assert [int(one["smooth"]) for one in (hard, shifted, switched)] == [-1, 0, 1]
     assert is_png(tmp_path / "c.png")
 
 
@@ -122,13 +109,13 @@ def test_a_cutoff_study_refuses_a_potential_without_one(here, tmp_path: Path) ->
 def test_blind_rebuilds_lose_pairs_and_checked_ones_do_not(tmp_path: Path) -> None:
     words = ["argon/langevin-500", "--steps", "200", "--skins", "0.3", "--every", "0", "100"]
     table = study("skin_sensitivity", *words, "-o", "s.svg", cwd=tmp_path)
-    column = ["skin", "rule", "rebuilds", "dangerous", "used", "lost", "pair_steps", "first", "rate"].index
-    checked, blind = row(table, "0.3", "check"), row(table, "0.3", "blind, every 100")
-    assert int(checked[column("lost")]) == 0
-    assert float(checked[column("used")]) <= 1.0
-    assert checked[column("first")] == "-"
-    assert int(blind[column("pair_steps")]) >= int(blind[column("lost")]) > 0
-    assert 0 < int(blind[column("first")]) <= 200
+    columns = "skin rule rebuilds dangerous used lost pair_steps first rate"
+    checked, blind = rows(table, columns, ("0.3", "check"), ("0.3", "blind, every 100"))
+    assert int(checked["lost"]) == 0
+    assert float(checked["used"]) <= 1.0
+    assert checked["first"] == "-"
+    assert int(blind["pair_steps"]) >= int(blind["lost"]) > 0
+    assert 0 < int(blind["first"]) <= 200
     assert (tmp_path / "s.svg").read_text().lstrip().startswith("<?xml")
 
 
@@ -191,20 +178,19 @@ def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
 def test_a_ball_answers_to_its_knobs(tmp_path: Path) -> None:
     words = ["--points", "9", "--factors", "0.9", "1", "2"]
     table = study("ball_sensitivity", *words, "-o", "k.png", cwd=tmp_path)
-    column = ["floor", "knob", "value", "contact", "at", "iterations", "most", "loss", "by_k", "by_y0"].index
+    columns = "floor knob value contact at iterations most loss by_k by_y0"
     # twice the step: half as many until the first contact, give or take one
-    one, two = (int(row(table, "spring", "h", h)[column("contact")]) for h in ("0.01", "0.02"))
-    assert abs(one - 2 * two) <= 2
+    one, two = rows(table, columns, ("spring", "h", "0.01"), ("spring", "h", "0.02"))
+    assert abs(int(one["contact"]) - 2 * int(two["contact"])) <= 2
     # a tolerance that changes no number of iterations changes nothing at all; one that does, the loss
-    near, own, far = (row(table, "projection", "tol", tol)[3:] for tol in ("9e-07", "1e-06", "2e-06"))
-    assert near == own
-    assert int(far[2]) < int(own[2])
-    assert float(far[4]) > 2 * float(own[4])
+    tolerances = (("projection", "tol", tol) for tol in ("9e-07", "1e-06", "2e-06"))
+    near, own, far = rows(table, columns, *tolerances)
+    assert near | {"value": "1e-06"} == own
+    assert int(far["iterations"]) < int(own["iterations"])
+    assert float(far["loss"]) > 2 * float(own["loss"])
     # soft floors have derivatives of the size of the motion's, hard ones of the size of a lost step
-    soft, hard = (
-        abs(float(row(table, name, "k", "3000")[column("by_y0")])) for name in ("softplus", "spring")
-    )
-    assert soft < 5 < 50 < hard
+    soft, hard = rows(table, columns, ("softplus", "k", "3000"), ("spring", "k", "3000"))
+    assert abs(float(soft["by_y0"])) < 5 < 50 < abs(float(hard["by_y0"]))
     assert is_png(tmp_path / "k.png")
 
 
@@ -226,27 +212,14 @@ def test_a_projection_that_cannot_converge_is_refused(here, tmp_path: Path) -> N
 def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path) -> None:
     words = ["--sums", "bfloat16", "--orders", "sequential", "pairwise", "--steps", "60", "-o", "p.png"]
     table = study("termination_precision", *words, cwd=tmp_path)
-    column = [
-        "sum",
-        "order",
-        "iterations",
-        "early",
-        "late",
-        "capped",
-        "first",
-        "loss",
-        "slope",
-        "change",
-    ].index
-    wide, narrow, tree = (
-        row(table, *name)
-        for name in (("float64", "sequential"), ("bfloat16", "sequential"), ("bfloat16", "pairwise"))
-    )
-    assert int(narrow[column("early")]) > 0 == int(narrow[column("late")])
-    lost = int(wide[column("iterations")]) - int(narrow[column("iterations")])
-    assert lost == int(narrow[column("early")])
-    assert float(narrow[column("change")]) > 1e-3
-    assert tree[2:] == wide[2:]
+    columns = "sum order iterations early late capped first loss slope change"
+    names = (("float64", "sequential"), ("bfloat16", "sequential"), ("bfloat16", "pairwise"))
+    wide, narrow, tree = rows(table, columns, *names)
+    assert int(narrow["early"]) > 0 == int(narrow["late"])
+    lost = int(wide["iterations"]) - int(narrow["iterations"])
+    assert lost == int(narrow["early"])
+    assert float(narrow["change"]) > 1e-3
+    assert tree == wide | {"sum": "bfloat16", "order": "pairwise"}
     assert is_png(tmp_path / "p.png")
 
 
@@ -254,11 +227,10 @@ def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path)
 def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Path) -> None:
     words = ["--steps", "1300", "--roles", "force", "accumulate", "--repeats", "0", "-o", "f.png"]
     table = study("precision_fork", *words, cwd=tmp_path)
-    column = ["role", "seed", "fork", "split", "told", "growth", "verdict"].index
-    force, sums = row(table, "force"), row(table, "accumulate")
-    assert force[column("seed")] == sums[column("seed")] == "1"
-    assert 1 < int(force[column("fork")]) < 1300
-    assert force[column("told")] == "-"
+    force, sums = rows(table, "role seed fork split told growth verdict", "force", "accumulate")
+    assert force["seed"] == sums["seed"] == "1"
+    assert 1 < int(force["fork"]) < 1300
+    assert force["told"] == "-"
     assert is_png(tmp_path / "f.png")
 
 
@@ -266,12 +238,12 @@ def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Pa
 def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> None:
     words = ["--reductions", "sequential", "reversed", "exact", "--steps", "60", "-o", "r.png"]
     table = study("reduction_order", *words, cwd=tmp_path)
-    column = ["sum", "error", "seed", "fork", "split", "end", "shuffled"].index
-    own, other, exact = (row(table, word) for word in ("sequential", "reversed", "exact"))
-    assert own[column("seed")] == "-" and other[column("seed")] == exact[column("seed")] == "1"
-    assert own[column("shuffled")] == other[column("shuffled")] == "1" and exact[column("shuffled")] == "-"
-    assert float(exact[column("error")]) == 0 < float(own[column("error")]) < 1000
-    assert 0 < float(other[column("end")]) < 1e-10
+    columns = "sum error seed fork split end shuffled"
+    own, other, exact = rows(table, columns, "sequential", "reversed", "exact")
+    assert own["seed"] == "-" and other["seed"] == exact["seed"] == "1"
+    assert own["shuffled"] == other["shuffled"] == "1" and exact["shuffled"] == "-"
+    assert float(exact["error"]) == 0 < float(own["error"]) < 1000
+    assert 0 < float(other["end"]) < 1e-10
     assert is_png(tmp_path / "r.png")
 
 
@@ -285,12 +257,10 @@ def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(here, tmp_path: P
     words = ["--quick", "--steps", "60", "--kinds", "hard"]
     words += ["--choices", "start", "order", "translate=0.25", "noise", "-o", "m.png"]
     table = here("fork_atlas", *words)
-    column = ["system", "cutoff", "choice", "verdict", "seed", "fork", "split", "told", "nats"].index
-    name = ("argon/crystal-108", "hard")
-    start, order = row(table, *name, "start"), row(table, *name, "order")
-    assert start[column("verdict") : column("told")] == ["cause", "0", "7", "11"]
-    assert order[column("verdict") : column("told")] == ["no fork", "1", "-", "-"]
-    assert row(table, *name, "translate=0.25")[column("verdict")] in ("same", "no fork")
+    names = (("argon/crystal-108", "hard", choice) for choice in ("start", "order", "translate=0.25"))
+    start, order, moved = (row(table, *name)[3:7] for name in names)
+    assert (start, order) == (["cause", "0", "7", "11"], ["no fork", "1", "-", "-"])
+    assert moved[0] in ("same", "no fork")
     assert "finding" not in table
     lines = (tmp_path / "m.csv").read_text().splitlines()
     assert lines[:2] == [columns, kept] and torn not in lines
@@ -315,11 +285,10 @@ def test_the_cost_of_a_comparison_is_a_ratio(tmp_path: Path) -> None:
 def test_a_gradient_in_float32_agrees_with_one_in_float64_over_a_short_horizon(tmp_path: Path) -> None:
     words = ["--cutoffs", "quintic", "--steps", "100", "--points", "5", "--replicas", "0", "-o", "g.png"]
     table = study("gradient_horizon", *words, cwd=tmp_path)
-    column = ["cutoff", "growth", "exponent", "float32", "float64", "ratio", "scatter", "flips"].index
-    found = row(table, "quintic")
+    (found,) = rows(table, "cutoff growth exponent float32 float64 ratio scatter flips", "quintic")
     # neither format reaches the tolerance, no other start was asked for
-    assert [found[column(word)] for word in ("float32", "float64", "ratio", "scatter")] == ["-"] * 4
-    assert 0 < float(found[column("growth")]) < 0.1 and 0 < float(found[column("exponent")]) < 0.1
+    assert [found[word] for word in ("float32", "float64", "ratio", "scatter")] == ["-"] * 4
+    assert 0 < float(found["growth"]) < 0.1 and 0 < float(found["exponent"]) < 0.1
     assert is_png(tmp_path / "g.png")
 
 
