@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import stat
 import sys
 
 import numpy as np
 import pytest
-from command_line import call, printed
 
 import mdnum
 from mdnum.forks import processes
@@ -16,7 +14,8 @@ from mdnum.forks.exact.program import installed
 from mdnum.forks.processes import Ran, Variant
 from mdnum.store import RunFolder
 from mdnum.systems import load
-from mdnum.verbs import frame
+from mdnum.verbs.fork_certify import judge_certify
+from mdnum.verbs.frame import View
 
 STEPS = 240
 #: Heights that sums and products of few digits reach: plain rationals follow it.
@@ -81,12 +80,9 @@ def test_a_ball_is_certified(ball, tmp_path):
 
 
 def test_who_leaves_first_is_the_headline(ball):
-    folder = RunFolder.open(ball.folder)
-
     def judged(*horizons, **more):
         rows = [{**row, "horizon": at} for row, at in zip(ball.summary["policies"], horizons, strict=True)]
-        folder.write_summary({**ball.summary, "policies": rows, **more})
-        return frame.finish(folder, report=False).verdict
+        return judge_certify(View(RunFolder.open(ball.folder), {**ball.summary, "policies": rows, **more}))
 
     assert judged(None, None).tone == "good"
     some = judged(None, 40)
@@ -129,34 +125,22 @@ def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
     (finding,) = compared.verdict.findings
     assert finding.code == "VARIANT_FAILED" and finding.values["failed"] == "took longer than 600 s"
     assert (compared.folder / "report.html").exists()
+    (programs,) = (one for one in compared.page.sections if one.title == "Programs")
+    rows = {row[1]: row for row in programs.parts[-1].rows}
+    assert rows["reversed"][4:6] == (2, 6) and rows["SSE4.2"][2] == "took longer than 600 s"
 
 
-def test_programs_from_the_command_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "_ran", stand_in)
-    assert call("fork", "processes", "argon/crystal-108", "--steps", str(FEW_STEPS), "--no-report") == 1
-    lines = printed(capsys)
-    assert any("reversed" in line and " 2 6 " in line for line in lines)
-    assert any("SSE4.2 took longer than 600 s" in line for line in lines)
-
-
-def python_that(does: str, tmp_path, monkeypatch) -> None:
-    """In place of Python, a script."""
+@pytest.mark.parametrize(
+    ("does", "failed"),
+    [('echo spam\necho "  it broke " >&2\nexit 3', "it broke"), ("exec sleep 60", "took longer than 1 s")],
+    ids=["fails", "hangs"],
+)
+def test_a_process_that_fails_or_takes_too_long_is_a_row(does, failed, tmp_path, monkeypatch, capfd):
+    """With a script in place of Python; what it says stays out of the output."""
     script = tmp_path / "python"
     script.write_text(f"#!/bin/sh\n{does}\n")
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
-
-
-def test_what_a_process_says_stays_out_of_the_output(tmp_path, monkeypatch, capfd):
-    python_that('echo spam\necho "  it broke " >&2\nexit 3', tmp_path, monkeypatch)
+    monkeypatch.setattr(processes, "_TIMEOUT", 1.0)
     row, x = processes._ran(processes.REFERENCE, {}, tmp_path / "0")
-    assert x is None and row.failed == "it broke"
-    assert capfd.readouterr().out == ""
-
-
-def test_a_process_that_takes_too_long_is_a_row(tmp_path, monkeypatch):
-    python_that("exec sleep 60", tmp_path, monkeypatch)
-    monkeypatch.setattr(processes, "_TIMEOUT", 0.2)
-    row, x = processes._ran(processes.REFERENCE, {}, tmp_path / "0")
-    assert x is None and row.failed == "took longer than 0.2 s"
+    assert x is None and row.failed == failed and capfd.readouterr().out == ""
