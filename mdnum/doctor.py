@@ -11,7 +11,6 @@ changes last bits legitimately, so two builds may decide a margin within its bou
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import math
 import os
 import platform
@@ -27,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mdnum.numerics  # noqa: F401 (turns on float64)
+from mdnum.provenance import version
 from mdnum.safe_path import environment, python
 
 Status = Literal["ok", "info", "unsafe"]
@@ -121,14 +121,6 @@ def _decided(name: str, right: bool, seen: str, remedy: str, wrong: str = "") ->
 
 
 # --- what is installed ---
-
-
-def version(package: str) -> str | None:
-    """The installed version of a package, None when it is not there."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def jax_version() -> DoctorRow:

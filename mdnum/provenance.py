@@ -124,13 +124,15 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 def package_versions() -> dict[str, str | None]:
     """The versions of the packages that a result can depend on, None where one is not installed."""
-    found: dict[str, str | None] = {}
-    for package in _PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = None
-    return found
+    return {package: version(package) for package in _PACKAGES}
+
+
+def version(package: str) -> str | None:
+    """The installed version of a package, None when it is not there."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:

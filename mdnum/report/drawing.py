@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from mdnum.report.section import Figure, Plot, Region, Series
 from mdnum.report.words import MINUS, many, typeset
@@ -272,11 +272,6 @@ def _engineering() -> ScalarFormatter:
     formatter = ScalarFormatter(useOffset=False, useMathText=False)
     formatter.set_powerlimits((-3, 5))
     return formatter
-
-
-def few_ticks(axes: Axes, n: int = 5) -> None:
-    """At most n ticks on the vertical axis."""
-    axes.yaxis.set_major_locator(MaxNLocator(n))
 
 
 # -- fewer points that look the same: lines keep every peak, points keep every place

@@ -535,13 +535,8 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
         ]
         sections.append(Section(result.title, parts))
     sections.append(Section("What was asked about", [pairs(list(_subject(summary, given)))]))
-    return Page(
-        title=f"Audit of {state.name}",
-        about=f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}",
-        keys=list(_keys(summary, verdict, given)),
-        sections=sections,
-        provenance=view.folder.provenance,
-    )
+    about = f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}"
+    return view.page(f"Audit of {state.name}", about, _keys(summary, verdict, given), sections)
 
 
 def _ways(part: Mapping[str, Any]) -> str:

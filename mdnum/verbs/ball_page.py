@@ -13,7 +13,20 @@ from mdnum.report.analysis import margins_in_bounds
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
+from mdnum.report.section import (
+    ROLES,
+    Figure,
+    Key,
+    Mark,
+    Page,
+    Plot,
+    Role,
+    Section,
+    Series,
+    Table,
+    pairs,
+    table_of,
+)  # fmt: skip
 from mdnum.report.words import count, many, number
 from mdnum.verbs.frame import View
 
@@ -79,19 +92,16 @@ def page(view: BallView, verdict: Verdict) -> Page:
     )  # fmt: skip
     described = [str(view.system["about"])] if view.system.get("about") else []
     sections = [
-        Section("Heights and contacts", [*described, *_plots(view, _heights, _nearest)]),
-        Section("Impacts per step" if view.located else "Iterations per step", _plots(view, _solver_plot)),
-        Section("Margins of decisions", _plots(view, _stops, _flips)),
+        Section("Heights and contacts", [*described, *_heights(view), *_nearest(view)]),
+        Section("Impacts per step" if view.located else "Iterations per step", list(_solver_plot(view))),
+        Section("Margins of decisions", [*_stops(view), *_flips(view)]),
         Section("Gradient", list(_gradient(view)), terminal=True),
         Section("Against the closed form", list(_exact(view)), terminal=True),
         Section("Variants", list(_variants(view)), terminal=True),
         Section("Contacts", list(_contacts(view))),
         Section("Stop decisions", list(_stop_decisions(view))),
     ]
-    return Page(
-        view.name, about, list(_keys(view)), [section for section in sections if section.parts],
-        view.system_toml, view.folder.provenance,
-    )  # fmt: skip
+    return view.page(view.name, about, _keys(view), sections)
 
 
 def _keys(view: BallView) -> Iterator[Key]:
@@ -113,10 +123,6 @@ def _keys(view: BallView) -> Iterator[Key]:
         yield Key("Speed", number(summary["steps_per_second"]), "steps per second")
 
 
-def _plots(view: BallView, *declared: Callable[[BallView], Plot | None]) -> list[Any]:
-    return [plot for plot in (each(view) for each in declared) if plot is not None]
-
-
 def _groups(
     x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role], mark: Mark = "points"
 ) -> tuple[Series, ...]:
@@ -128,7 +134,7 @@ def _groups(
     )
 
 
-def _heights(view: BallView) -> Plot | None:
+def _heights(view: BallView) -> Iterator[Plot]:
     rows, series, contacts = view.table("heights"), view.table("steps"), view.table("contacts")
     balls = np.unique(rows["ball"]).astype(int).tolist()
     roles: tuple[Role, ...] = ("first", "second", "third")
@@ -147,26 +153,26 @@ def _heights(view: BallView) -> Plot | None:
         lines.append(Series("balls", x, y))
     if not balls:
         if not np.isfinite(series["mean_height"]).any():
-            return None
+            return
         lines.append(Series("mean over the balls", series["time"], series["mean_height"]))
     entered = contacts["entered"].astype(bool) & (np.isin(contacts["ball"], balls) | (not balls))
     at = view.time(contacts["step"][entered])
     # on the floor, where they are decided
     marks = [Series("contact begins", at, np.zeros(len(at)), "points", "bad")] if len(at) else []
-    return Plot(
+    yield Plot(
         "heights", "Heights against time", "time (s)", "height (m)", (*lines, *marks),
         caption=f"Heights of {many(len(balls), 'ball')}; a mark on the floor for each contact that begins.",
         horizontals=((0.0, "floor"),),
     )  # fmt: skip
 
 
-def _nearest(view: BallView) -> Plot | None:
+def _nearest(view: BallView) -> Iterator[Plot]:
     series = view.table("steps")
     margin = series["min_margin"]
     if not np.isfinite(margin).any():
-        return None
+        return
     doubtful = (series["ambiguous"] > 0, "a decision within rounding", "bad")
-    return Plot(
+    yield Plot(
         "nearest", "Margin of the nearest contact decision", "time (s)", "|height| decided on (m)",
         (Series("nearest height", series["time"], margin), *_groups(series["time"], margin, doubtful)),
         y_scale="log",
@@ -175,7 +181,7 @@ def _nearest(view: BallView) -> Plot | None:
     )  # fmt: skip
 
 
-def _solver_plot(view: BallView) -> Plot | None:
+def _solver_plot(view: BallView) -> Iterator[Plot]:
     series = view.table("steps")
     reason, iterations = series["reason"].astype(str), series["iterations"].astype(float)
     shown = _groups(
@@ -186,10 +192,10 @@ def _solver_plot(view: BallView) -> Plot | None:
     )  # fmt: skip
     what = "impacts" if view.located else "iterations"
     title = f"{what.capitalize()} per step, by what ended them"
-    return Plot("iterations", title, "time (s)", f"{what} per step", shown) if shown else None
+    yield Plot("iterations", title, "time (s)", f"{what} per step", shown) if shown else None
 
 
-def _stops(view: BallView) -> Plot | None:
+def _stops(view: BallView) -> Iterator[Plot]:
     rows = view.table("solver")
     stopped, capped = rows["stopped"].astype(bool), rows["reason"].astype(str) == "cap"
     shown = _groups(
@@ -197,8 +203,8 @@ def _stops(view: BallView) -> Plot | None:
         (~stopped & ~capped, "continued", "second"), (~stopped & capped, "gave up", "bad"),
     )  # fmt: skip
     if not shown:
-        return None
-    return Plot(
+        return
+    yield Plot(
         "stops", "Margins of stop decisions", "time (s)", "tolerance − residual", shown, y_scale="symlog",
         caption="Above zero the residual was below its tolerance and the solver stopped, below zero it "
         "continued. The scale is logarithmic to both sides of zero.",
@@ -206,7 +212,7 @@ def _stops(view: BallView) -> Plot | None:
     )  # fmt: skip
 
 
-def _flips(view: BallView) -> Plot | None:
+def _flips(view: BallView) -> Iterator[Plot]:
     ratio, contacts = view.ratio, view.table("contacts")
     entered = contacts["entered"].astype(bool)
     shown = _groups(
@@ -214,8 +220,8 @@ def _flips(view: BallView) -> Plot | None:
         (~entered, "contact ends", "second"),
     )  # fmt: skip
     if not shown:
-        return None
-    return Plot(
+        return
+    yield Plot(
         "margins", "Margins of contact flips in units of rounding", "time (s)", "|margin| / rounding bound",
         shown, y_scale="log", horizontals=((1.0, "below: decided by rounding"),),
         caption="How far from the floor the height was when a contact began or ended, over the bound on its "
@@ -305,14 +311,13 @@ def _variants(view: BallView) -> Iterator[Any]:
     variants, rows = view.summary["variants"], view.table("separations")
     if not variants:
         return
-    roles: tuple[Role, ...] = ("first", "second", "third", "bad", "muted")
     if np.any(rows["separation"] > 0):
         names = list(dict.fromkeys(rows["variant"].astype(str).tolist()))
         lines = []
         for n, name in enumerate(names):
             mine = rows["variant"].astype(str) == name
             x, y = view.time(rows["step"][mine]), rows["separation"][mine]
-            lines.append(Series(name, x, y, "line", roles[n % len(roles)], n >= len(roles)))
+            lines.append(Series(name, x, y, "line", ROLES[n % len(ROLES)], n >= len(ROLES)))
         forks = [(float(view.time(np.array(one["fork"]))), f"{one['name']} forks")
                  for one in variants if one["fork"] is not None]  # fmt: skip
         yield Plot(

@@ -441,10 +441,7 @@ def page(view: View, verdict: Verdict) -> Page:
             1, Section("Failures, reproduced", [TEXTS("reproduced"), table, *codes], terminal=True)
         )
     about = ", ".join(filter(None, [summary["about"] or "A neighbor list", package]))
-    return Page(
-        f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections,
-        provenance=view.folder.provenance,
-    )  # fmt: skip
+    return view.page(f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections)
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:

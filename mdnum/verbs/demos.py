@@ -247,7 +247,7 @@ def page(view: View, verdict: Verdict) -> Page:
         # of all of them the command prints no tables: they would hide the answers
         sections.append(Section(TEXTS("more", name=demo["name"]), more, terminal=len(demos) == 1, level=3))
     title = demos[0]["title"] if len(demos) == 1 else TEXTS("title")
-    return Page(title, sections=sections, provenance=view.folder.provenance)
+    return view.page(title, "", [], sections)
 
 
 def _demos(view: View) -> Sequence[Mapping[str, Any]]:

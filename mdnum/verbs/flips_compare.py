@@ -325,10 +325,7 @@ def page(view: ComparisonView, verdict: Verdict) -> Page:
         Section("What two trajectories do not show", [TEXTS(f"cannot_{one}") for one in cannot]),
         Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]),
     ]
-    return Page(
-        f"{view.name} and {summary['other']}", f"{size} compared", list(_keys(view)),
-        [one for one in sections if one.parts], provenance=view.folder.provenance,
-    )  # fmt: skip
+    return view.page(f"{view.name} and {summary['other']}", f"{size} compared", _keys(view), sections)
 
 
 def _keys(view: ComparisonView) -> Iterator[Key]:

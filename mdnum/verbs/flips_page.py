@@ -220,10 +220,8 @@ def page(view: FlipsView, verdict: Verdict) -> Page:
     if (browsed := _busiest(view)) is not None:
         sections.append(Section("The busiest pairs", [browsed]))
     sections.append(Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]))
-    return Page(
-        f"{view.name}: neighbor-set flips", f"{size}; {summary['format']}, read by {summary['reader']}",
-        list(_keys(view, summary["rules"][0])), sections, provenance=view.folder.provenance,
-    )  # fmt: skip
+    about = f"{size}; {summary['format']}, read by {summary['reader']}"
+    return view.page(f"{view.name}: neighbor-set flips", about, _keys(view, summary["rules"][0]), sections)
 
 
 def _keys(view: FlipsView, one: Rule) -> Iterator[Key]:

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mdnum.errors import FolderError
 from mdnum.report import analysis
 from mdnum.report.browse import Browse, Column, flipped
-from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, few_ticks, legend, line
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Table, curves, pairs
@@ -136,10 +136,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
         Section("Flips", list(_nearest(run))),
         Section("Agreement with ASE", list(_ase(run))),
     ]
-    return Page(
-        run.name, ", ".join(about), list(_keys(run)), [each for each in sections if each.parts],
-        run.system_toml, run.folder.provenance,
-    )  # fmt: skip
+    return run.page(run.name, ", ".join(about), _keys(run), sections)
 
 
 def _keys(run: RunView) -> Iterator[Key]:
@@ -214,7 +211,7 @@ def _energy(run: RunView) -> Iterator[Any]:
         above.set_ylabel(f"energy ({units.energy})")
         below.set_ylabel(f"difference ({units.energy})")
         below.set_xlabel(f"time ({units.time})")
-        few_ticks(below, 4)
+        below.yaxis.set_major_locator(MaxNLocator(4))
         legend(above)
 
     change, left = budget["change"], budget["residual"]
