@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
 
 import numpy as np
@@ -127,19 +124,6 @@ def test_a_cutoff_runs_is_compared_and_certified(site, tmp_path):
     )
     (row,) = certified.summary["policies"]
     assert row["horizon"] is None and row["reason_unavailable"] is None
-
-
-def test_a_cutoff_is_found_by_the_command_line(site, tmp_path):
-    chosen = "cutoff.kind=tilted"
-    done = subprocess.run(
-        [sys.executable, "-m", "mdnum", "systems", "check", "pair/at-cutoff", "--json", "--set", chosen],
-        env={**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)
 
 
 def test_a_potential_of_two_constants(site, tmp_path):

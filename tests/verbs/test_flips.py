@@ -86,7 +86,7 @@ def test_a_run_of_mdnum_gives_its_own_ledger_row_for_row(crystal: Path, tmp_path
 
 
 def test_tables_agree_with_sets_worked_out_one_by_one(examined) -> None:
-    frames = gas(side=5.0, atoms=8, frames=12)
+    frames = gas(side=5.0, atoms=8, frames=7)
     result = examined("gas.extxyz", frames, cutoffs=[3.1])
     sets = [inside(one, 3.1) for one in frames]
     folder = RunFolder.open(result.folder)
