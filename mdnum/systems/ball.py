@@ -14,9 +14,9 @@ from pydantic import BeforeValidator, Discriminator, Field, model_serializer, mo
 from pydantic_core import PydanticKnownError
 
 from mdnum.ball.limits import largest, rounded, smallest, smallest_tolerance, spacing
-from mdnum.systems.toml import Key, Named, NonNegative, TomlTable, from_array, unusable
+from mdnum.systems.schema import ForkTable
+from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, from_array, unusable
 
-Positive = Annotated[float, Field(gt=0)]
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
 ParameterName = Literal[
     "k", "damping", "eps", "alpha", "tol", "restitution", "gravity", "h", "y0", "v0"
@@ -268,19 +268,6 @@ class GradientTable(TomlTable):
     )
 
 
-class BallForkTable(TomlTable):
-    """What `mdnum fork` does with this system where the command line does not say."""
-
-    vary: str | None = Field(
-        default=None, description='the choice to vary, such as "precision" or "contact=earlier"'
-    )
-    steps: int | None = Field(default=None, ge=1, description="steps of a run; default integrator.steps")
-    split: Positive | None = Field(
-        default=None,
-        description="separation of heights that counts as split (m); default 1 % of the highest start",
-    )
-
-
 def _flatten(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in table.items():
         here = f"{path}.{key}" if path else str(key)
@@ -316,7 +303,7 @@ class BallSpec(TomlTable):
     precision: BallPrecision = Field(default_factory=lambda: BallPrecision())
     loss: LossTable = Field(default_factory=lambda: LossTable())
     gradient: GradientTable = Field(default_factory=lambda: GradientTable())
-    fork: BallForkTable | None = Field(
+    fork: ForkTable | None = Field(
         default=None, description="a question about this system; not about its runs"
     )
     variants: Variants = Field(

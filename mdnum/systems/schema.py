@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 from pydantic import ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.systems.toml import Key, Named, NonNegative, TomlTable, from_array
+from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, from_array
 
 Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
 Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
@@ -213,14 +213,14 @@ class CutoffTable(TomlTable):
 
     kind: Annotated[str, Named("mdnum.md.cutoffs:CUTOFFS")]
     radius: Length | None = Field(default=None, description="cutoff radius (Å or σ)")
-    in_sigma: Annotated[float, Field(gt=0)] | None = Field(
+    in_sigma: Positive | None = Field(
         default=None, description="cutoff radius as a multiple of each pair's sigma, instead of radius"
     )
     pairs: dict[str, Length] | None = Field(
         default=None, description='cutoff radius of single pairs of species, such as "Ni-P" (Å or σ)'
     )
     compare: Compare = Field(default="r2 <", description="what inside means: the quantity compared, and how")
-    onset: Annotated[float, Field(gt=0)] | None = Field(
+    onset: Positive | None = Field(
         default=None,
         description="for kinds that switch: where switching starts, in the unit of radius (or of in_sigma); "
         "default 0.9 of it; pairs with a radius of their own keep onset/radius",
@@ -274,7 +274,7 @@ class _Structure(TomlTable):
     pbc: Flags | None = Field(
         default=None, description="periodic along each cell vector; overrides what the structure says"
     )
-    masses: dict[str, Annotated[float, Field(gt=0)]] | None = Field(
+    masses: dict[str, Positive] | None = Field(
         default=None,
         description="mass of each species (amu or m); default: the file's, else ASE's for metal and 1 for lj",
     )
@@ -408,11 +408,14 @@ class ForkTable(TomlTable):
     """What `mdnum fork` does with this system where the command line does not say."""
 
     vary: str | None = Field(
-        default=None, description='the choice to vary, such as "precision" or "reduction=exact"'
+        default=None,
+        description='the choice to vary, such as "precision", "reduction=exact" or "contact=earlier"',
     )
-    steps: int | None = Field(default=None, ge=1, description="last step; default dynamics.steps")
-    split: float | None = Field(
-        default=None, gt=0, description="separation that counts as split (Å or σ); default 0.01 of the cutoff"
+    steps: int | None = Field(default=None, ge=1, description="last step; default the steps of a run")
+    split: Positive | None = Field(
+        default=None,
+        description="separation that counts as split (Å or σ, m); default 0.01 of the cutoff, of a ball 0.01 "
+        "of the highest start",
     )
 
 

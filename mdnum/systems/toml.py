@@ -189,7 +189,7 @@ def _value(value: Any) -> str:
 
 # --- tables -------------------------------------------------------------------------------------------
 
-NonNegative = Annotated[float, Field(ge=0)]
+Positive, NonNegative = Annotated[float, Field(gt=0)], Annotated[float, Field(ge=0)]
 #: TOML has arrays only; strict pydantic would refuse a list where a tuple is declared.
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 #: Smallest size of a number but 0; what is computed with it squares it.

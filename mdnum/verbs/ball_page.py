@@ -13,20 +13,7 @@ from mdnum.report.analysis import margins_in_bounds
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import (
-    ROLES,
-    Figure,
-    Key,
-    Mark,
-    Page,
-    Plot,
-    Role,
-    Section,
-    Series,
-    Table,
-    pairs,
-    table_of,
-)  # fmt: skip
+from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs.frame import View
 
@@ -192,7 +179,8 @@ def _solver_plot(view: BallView) -> Iterator[Plot]:
     )  # fmt: skip
     what = "impacts" if view.located else "iterations"
     title = f"{what.capitalize()} per step, by what ended them"
-    yield Plot("iterations", title, "time (s)", f"{what} per step", shown) if shown else None
+    if shown:
+        yield Plot("iterations", title, "time (s)", f"{what} per step", shown)
 
 
 def _stops(view: BallView) -> Iterator[Plot]:
@@ -311,13 +299,14 @@ def _variants(view: BallView) -> Iterator[Any]:
     variants, rows = view.summary["variants"], view.table("separations")
     if not variants:
         return
+    roles: tuple[Role, ...] = ("first", "second", "third", "bad", "muted")
     if np.any(rows["separation"] > 0):
         names = list(dict.fromkeys(rows["variant"].astype(str).tolist()))
         lines = []
         for n, name in enumerate(names):
             mine = rows["variant"].astype(str) == name
             x, y = view.time(rows["step"][mine]), rows["separation"][mine]
-            lines.append(Series(name, x, y, "line", ROLES[n % len(ROLES)], n >= len(ROLES)))
+            lines.append(Series(name, x, y, "line", roles[n % len(roles)], n >= len(roles)))
         forks = [(float(view.time(np.array(one["fork"]))), f"{one['name']} forks")
                  for one in variants if one["fork"] is not None]  # fmt: skip
         yield Plot(

@@ -13,10 +13,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mdnum.errors import FolderError
 from mdnum.report import analysis
 from mdnum.report.browse import Browse, Column, flipped
-from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, legend, line
+from mdnum.report.drawing import FIRST, MUTED, SECOND, THIRD, envelope, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
-from mdnum.report.section import Figure, Key, Page, Plot, Section, Table, curves, pairs
+from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, curves, pairs, positive
 from mdnum.report.words import count, many, number, percent, plain
 from mdnum.store.tables import as_numpy
 from mdnum.verbs.frame import View
@@ -286,31 +286,19 @@ def _margins(run: RunView) -> Iterator[Any]:
     edges = np.arange(-1, top + 0.25, 0.25)
     counts, _ = np.histogram(np.log10(np.maximum(ratio, 0.1001)), edges)
     expected = run.expected_ambiguous
-
-    def draw(figure: Canvas) -> None:
-        axes = figure.subplots()
-        axes.stairs(counts, 10.0**edges, color=FIRST, fill=True, alpha=0.35)
-        axes.stairs(counts, 10.0**edges, color=FIRST, lw=1.1, label="flips")
-        # a density that is even near zero puts counts in proportion to the width of a bin
-        even = expected * np.diff(10.0**edges)
-        shown = (even >= 0.5) & (even <= 2 * counts.max())
-        centers = 10.0 ** ((edges[1:] + edges[:-1]) / 2)
-        axes.plot(centers[shown], even[shown], color=MUTED, lw=1.1, ls="--", label="spread evenly")
-        axes.axvspan(0.1, 1, color=BAD, alpha=0.16, lw=0, label="ambiguous")
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlim(0.1, 10.0**top)
-        axes.set_ylim(0.5, 3 * max(counts.max(initial=1), 1))
-        axes.set_ylabel("flips per quarter decade")
-        axes.set_xlabel("|margin| / rounding bound")
-        legend(axes)
-
+    # a density that is even near zero puts counts in proportion to the width of a bin
+    even = expected * np.diff(10.0**edges)
+    shown = (even >= 0.5) & (even <= 2 * counts.max())
+    centers = 10.0 ** ((edges[1:] + edges[:-1]) / 2)
+    yield Plot(
+        "margins", "Margins of flips in units of rounding", "|margin| / rounding bound",
+        "flips per quarter decade", (
+            Series("flips", 10.0**edges, positive(np.append(counts, counts[-1])), "steps"),
+            Series("spread evenly", centers[shown], even[shown], role="muted", dashed=True),
+        ), x_scale="log", y_scale="log", verticals=((1.0, "below: decided by rounding"),),
+        caption=TEXTS("margins_caption"),
+    )  # fmt: skip
     closest, median = float(ratio.min()), float(np.median(ratio))
-    alt = (
-        f"Histogram of the margins of {many(len(ratio), 'flip')} in units of their rounding bound: closest "
-        f"at {number(closest)}, the median {number(median)}."
-    )
-    yield Figure("margins", TEXTS("margins_caption"), alt, draw, 2.9)
     yield TEXTS("margins", closest=closest, median=median, expected=expected)
 
 
@@ -353,37 +341,22 @@ def _lists(run: RunView) -> Iterator[Any]:
     step = epochs["start"].astype(float)
     # of no skin nothing can be used up
     skin = np.where(np.isfinite(epochs["skin_consumed"]), epochs["skin_consumed"], np.nan).astype(float)
-    length = epochs["length"].astype(float)
     bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
-
-    def draw(figure: Canvas) -> None:
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        above.axhline(1, color=BAD, lw=0.9, ls=(0, (4, 3)), zorder=1.5, label="skin used up")
-        for axes, values in ((above, skin), (below, length)):
-            if len(values) > 600:
-                line(axes, step, values, FIRST)
-            else:
-                axes.plot(step, values, "o", color=FIRST, ms=2.6, mew=0)
-            worst = np.flatnonzero(bad)
-            worst = worst[np.argsort(-values[worst])][:600]
-            label = "dangerous, or pairs lost" if len(worst) else ""
-            axes.plot(step[worst], values[worst], "o", color=BAD, ms=3.5, mew=0, label=label or None)
-        above.set_ylim(0, max(1.18, 1.08 * float(np.nanmax(skin, initial=0))))
-        below.set_ylim(0, 1.15 * float(np.max(length, initial=1)))
-        below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-        above.set_ylabel("skin consumed")
-        below.set_ylabel("steps per list")
-        below.set_xlabel("step at which the list was built")
-        legend(above)
-
+    for name, values, label in (
+        ("lists", skin, "skin consumed"), ("lengths", epochs["length"].astype(float), "steps per list"),
+    ):  # fmt: skip
+        marked = Series("dangerous, or pairs lost", step[bad], values[bad], "points", "bad")
+        yield Plot(
+            name, f"{label.capitalize()}, by neighbor list", "step at which the list was built", label,
+            (Series("lists", step, values, "points"), *[marked] * bool(bad.any())),
+            horizontals=((1.0, "skin used up"),) * (name == "lists"), caption=TEXTS(f"{name}_caption"),
+        )  # fmt: skip
     # the last list was cut off by the end of the run: its length says nothing
     whole = epochs["reason"] != "end"
     lengths = epochs["length"][whole] if whole.any() else epochs["length"]
     reasons, counts = np.unique(epochs["reason"].astype(str), return_counts=True)
     skinned = bool(np.isfinite(skin).all())
     consumed = f"{percent(float(np.median(skin)))} (median), {percent(float(np.max(skin)))} at most"
-    alt = f"Skin consumed by {many(len(skin), 'neighbor list')}: {consumed if skinned else 'there is none'}."
-    yield Figure("lists", TEXTS("lists_caption"), alt, draw, 3.3)
     ended = ", ".join(f"{reason} {count(int(n))}" for reason, n in zip(reasons, counts, strict=True))
     span = f"{count(int(lengths.min()))} to {count(int(lengths.max()))}"
     grown = len(np.unique(epochs["capacity"])) - 1

@@ -72,31 +72,6 @@ def test_liquids_are_liquid(name: str):
     assert largest < 0.1 * len(atoms)
 
 
-def test_the_pair_crosses_its_cutoff_back_and_forth():
-    # between crossings the two atoms feel only one another: integrate the relative coordinate
-    system = load("pair/at-cutoff")
-    spec, r_cut = system.spec, system.r_cut
-    h = spec.dynamics.timestep
-    box = system.atoms.cell[0, 0]
-    x = system.atoms.positions[1, 0] - system.atoms.positions[0, 0]
-    v = system.velocities[1, 0] - system.velocities[0, 0]
-
-    def acceleration(x: float) -> float:
-        d = x - box * np.round(x / box)
-        return 2 * np.sign(d) * 24 * (2 * abs(d) ** -13 - abs(d) ** -7) if abs(d) < r_cut else 0.0
-
-    inside = [abs(x) < r_cut]
-    a = acceleration(x)
-    for _ in range(spec.dynamics.steps):
-        v += 0.5 * h * a
-        x += h * v
-        a = acceleration(x)
-        v += 0.5 * h * a
-        inside.append(abs(x - box * np.round(x / box)) < r_cut)
-    flips = np.flatnonzero(np.diff(np.array(inside, dtype=int)))
-    assert len(flips) >= 6
-
-
 def test_the_particle_leaves_its_well_with_the_slope_of_the_description():
     system = load("pair/leaving-well")
     masses = system.atoms.get_masses()

@@ -190,14 +190,9 @@ def test_what_came_before_an_unreadable_frame_is_kept(tmp_path: Path, examined) 
     # only a file that breaks off is said to break off
     text[7 * 26 + 5] = "O 1.0 nought 2.0\n"
     (tmp_path / "word.extxyz").write_text("".join(text))
-    nan, boxless, fewer = (gas(frames=20) for _ in range(3))
+    nan = gas(frames=20)
     nan[7].positions[5, 1] = np.nan
-    boxless[7].pbc = False
-    fewer[7] = fewer[7][:-1]
-    for name, some, said in (
-        ("word.extxyz", None, "nought"), ("nan.traj", nan, "atom 5"), ("box.traj", boxless, "no box"),
-        ("atoms.traj", fewer, "23 atoms"),
-    ):  # fmt: skip
+    for name, some, said in (("word.extxyz", None, "nought"), ("nan.traj", nan, "atom 5")):
         broken = examined(name, some)
         assert broken.summary["frames"] == 7 and not broken.summary["cut_short"]
         assert "frame 7" in broken.summary["stopped"] and said in broken.summary["stopped"]

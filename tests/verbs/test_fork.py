@@ -251,8 +251,9 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         ("early", 0, 3, 90, ""), ("late", 1, 70, None, "broken"), ("never", None, None, None, "holds"),
     ]  # fmt: skip
     assert table.bad == {1} and (found.folder / "figures/ranking.svg").exists()
-    calm = told(found, ranking=[row for row in found.summary["ranking"] if row["choice"] == "never"])
-    assert fork_verdict.judge_screen(calm).tone == "good"
+    early, _, never = found.summary["ranking"]
+    for ranking, tone in (([never], "good"), ([early, never], "info")):
+        assert fork_verdict.judge_screen(told(found, ranking=ranking)).tone == tone
 
 
 @pytest.mark.parametrize(
@@ -344,22 +345,19 @@ def test_an_exponent_that_is_none_says_why(crystal, monkeypatch, rate, chaotic):
 
 
 def test_a_prediction_says_what_it_comes_from(crystal):
-    steady = 1e-12 * np.exp(0.02 * np.arange(900.0))
-    # a power law is no exponential: the exponent alone can tell
-    power = 1e-9 * np.arange(61.0) ** 2
-
-    def predicted(free, split=None, rate=None):
-        made = SimpleNamespace(
+    steady, power = 1e-12 * np.exp(0.02 * np.arange(900.0)), 1e-9 * np.arange(61.0) ** 2
+    for free, split, rate, by in (
+        (steady, None, 0.5, "growth"),
+        (steady, 9, None, None),
+        # a power law is no exponential: the exponent alone can tell
+        (power, None, None, None),
+        (power, None, 0.0036, "exponent"),
+    ):
+        made: Any = SimpleNamespace(
             dates=Dates(0, 5, split), series={"B": free}, tolerance=0.1, steps=len(free) - 1
         )
-        exponent = {"lyapunov": {"rate": rate, "chaotic": True}} if rate else {}
-        found: Any = fork_pair._predicted(made, exponent)  # type: ignore[arg-type]
-        return found["predicted_split"], found["predicted_by"]
-
-    at, by = predicted(steady, rate=0.5)
-    assert by == "growth" and at == pytest.approx(np.log(0.1 / 1e-12) / 0.02, abs=1)
-    assert predicted(power) == predicted(steady, split=9) == (None, None)
-    assert predicted(power, rate=0.0036) == (round(60 + np.log(0.1 / 3.6e-6) / 0.0036), "exponent")
+        found = fork_pair._predicted(made, {"lyapunov": {"rate": rate, "chaotic": True}} if rate else {})
+        assert found["predicted_by"] == by and (found["predicted_split"] is None) == (by is None)
     # repeats that did not split are kept, and a fit that is none has no line
     delays = (Delay(12, 40, 99, 99), Delay(None, 30, 99, 99))
     made = replace(crystal.result, repeats=delays, growth={"B": Growth(float("nan"), float("nan"), -1, -1)})

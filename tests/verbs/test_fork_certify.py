@@ -110,17 +110,19 @@ def stand_in(variant: Variant, question, file):
 
 def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "_ran", stand_in)
-    which = [processes.REFERENCE, Variant("again"), Variant("AVX"), Variant("reversed"), Variant("SSE4.2")]
+    names = ("again", "eager", "rollout", "AVX", "reversed", "SSE4.2")
+    which = [processes.REFERENCE, *map(Variant, names)]
     compared = mdnum.fork_processes("argon/crystal-108", steps=FEW_STEPS, which=which, out=tmp_path / "x")
     folder, summary = RunFolder.open(compared.folder), compared.summary
     table = folder.read("variants")
-    assert table["variant"].tolist() == ["scan", "again", "AVX", "reversed", "SSE4.2"]
-    assert table["cluster"].tolist() == [0, 0, 1, 2, -1] and table["first_bit"].tolist() == [-1, -1, 3, 2, -1]
-    np.testing.assert_allclose(table["separation"][:4], [0, 0, 64e-15, 256e-15], rtol=0.05)
+    assert table["variant"].tolist() == ["scan", *names]
+    assert table["cluster"].tolist() == [0, 0, 0, 0, 1, 2, -1]
+    assert table["first_bit"].tolist() == [-1, -1, -1, -1, 3, 2, -1]
+    np.testing.assert_allclose(table["separation"][:6], [0, 0, 0, 0, 64e-15, 256e-15], rtol=0.05)
     apart = folder.read("variant_separations")
     mine = apart["separation"][apart["variant"] == "AVX"]
     assert len(mine) == FEW_STEPS and not mine[:2].any() and mine[2] == pytest.approx(8e-15, rel=0.2)
-    assert summary["clusters"] == [["scan", "again"], ["AVX"], ["reversed"]]
+    assert summary["clusters"] == [["scan", "again", "eager", "rollout"], ["AVX"], ["reversed"]]
     # a program that failed is named and does not stop the others
     (finding,) = compared.verdict.findings
     assert finding.code == "VARIANT_FAILED" and finding.values["failed"] == "took longer than 600 s"

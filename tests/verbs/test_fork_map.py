@@ -92,39 +92,40 @@ def test_the_page_says_what_the_folder_holds(mapped):
     assert (mapped.folder / "report.html").read_text(encoding="utf-8") == text
 
 
-def judged(outcome, **changes):
+def judged(folder, summary, **changes):
     """The verdict on a map that is said to be another."""
-    return judge_map(View(RunFolder.open(outcome.folder), {**outcome.summary, **changes}))
+    return judge_map(View(folder, {**summary, **changes}))
 
 
 @pytest.mark.slow
 def test_what_a_person_must_know_is_a_finding(mapped):
-    assert [one.code for one in judged(mapped).findings] == ["NOT_CONFIRMED"]
+    told = RunFolder.open(mapped.folder), mapped.summary
+    assert [one.code for one in judged(*told).findings] == ["NOT_CONFIRMED"]
     edges = [{**edge, "confirmed": "yes"} for edge in mapped.summary["boundaries"]]
     sure = {"confirm": True, "confirmed": 3, "boundaries": edges}
-    fine = judged(mapped, **sure)
+    fine = judged(*told, **sure)
     assert fine.findings == () and fine.tone == "info"
-    moved = judged(
-        mapped, confirm=True, confirmed=2, boundaries=[{**edges[0], "confirmed": "no"}, *edges[1:]]
-    )
+    lost = {**edges[0], "confirmed": "no"}
+    moved = judged(*told, confirm=True, confirmed=2, boundaries=[lost, *edges[1:]])
     assert (moved.findings[0].code, moved.tone) == ("NOT_REPRODUCED", "warning")
     assert moved.findings[0].values == {"n": 1, "places": repr(edges[0]["above"])}
-    left = judged(mapped, **sure, unresolved=[[0.08, 0.09]], failed_runs=3)
+    left = judged(*told, **sure, unresolved=[[0.08, 0.09]], failed_runs=3)
     assert [one.code for one in left.findings] == ["RUNS_FAILED", "MORE_BOUNDARIES"]
-    same = {
-        "boundaries": [],
-        "confirm": True,
-        "confirmed": 0,
-        "jump_largest": None,
-        "separation_largest": None,
-    }
-    assert judged(mapped, **same, intervals=mapped.summary["intervals"][:1]).tone == "good"
-    # runs that all blow up are no single history
-    none = {**same, "intervals": [], "failed_runs": mapped.summary["evaluations"]}
-    far = judged(mapped, **none, low=3.4, high=3.41)
+
+
+def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
+    summary = {
+        "system": "x", "key": "potential.sigma", "low": 3.4, "high": 3.41, "value": 1.0, "steps": 500,
+        "evaluations": 65, "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True,
+        "confirmed": 0, "loss": "x", "intervals": [], "histories": 1, "complete": True,
+    }  # fmt: skip
+    folder = RunFolder.create(tmp_path / "map", world="map")
+    far = judged(folder, summary)
     assert far.tone == "warning" and far.evidence == ()
     assert "far above" in far.findings[0].values["away"]
-    assert judged(mapped, **none).findings[0].values["away"] == ""
+    inside = judged(folder, summary, low=0.9, high=1.1)
+    assert inside.findings[0].values["away"] == ""
+    assert judged(folder, summary, low=0.9, high=1.1, failed_runs=0).tone == "good"
 
 
 @pytest.mark.slow

@@ -306,11 +306,12 @@ def test_one_whole_file_that_loads_nothing(html, folder):
     outside = [link for link in tags.linked if not link.startswith("#")]
     assert "flips.parquet" in outside and all((folder.path / link).exists() for link in outside)
     # what a figure shows, in numbers, for who cannot see it
-    assert len(tags.labels) == tags.seen.count("svg") == 5
+    assert len(tags.labels) == tags.seen.count("svg") == 6
     assert all(re.search(r"\d", label) for label in tags.labels)
     assert len(html) < 3_000_000 and html == report(folder)
     names = sorted(path.name for path in (folder.path / "figures").iterdir())
-    assert names == ["energy.svg", "flips.svg", "lists.svg", "margins.svg", "residence.svg"]
+    stems = ("energy", "flips", "lengths", "lists", "margins", "residence")
+    assert names == [f"{stem}.svg" for stem in stems]
     for name in names:
         text = (folder.path / "figures" / name).read_text(encoding="utf-8")
         ElementTree.fromstring(text)
@@ -349,7 +350,9 @@ def test_numbers_that_are_bad_or_missing_do_not_break_the_page(tmp_path, good):
     none = analysis.scan({name: values[:0] for name, values in good.folder.read("flips").items()}, 151)
     bare = {**good.epochs, "skin_consumed": np.full(len(good.epochs["epoch"]), np.inf)}
     short = {**good.series, "time": good.series["time"] * 1e-300}
-    for changes in ({"series": {**good.series, **still}, "flips": none}, {"epochs": bare}, {"series": short}):
+    unlisted = {name: values[:0] for name, values in good.epochs.items()}
+    quiet = {"series": {**good.series, **still}, "flips": none}
+    for changes in (quiet, {"epochs": bare}, {"epochs": unlisted}, {"series": short}):
         view = changed(good, {"energy_drift_without_jumps": None}, **changes)
         assert page(view, judge(view)).sections
 
