@@ -123,6 +123,8 @@ def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
     mine = apart["separation"][apart["variant"] == "AVX"]
     assert len(mine) == FEW_STEPS and not mine[:2].any() and mine[2] == pytest.approx(8e-15, rel=0.2)
     assert summary["clusters"] == [["scan", "again", "eager", "rollout"], ["AVX"], ["reversed"]]
+    two = mdnum.fork_processes("argon/crystal-108", steps=FEW_STEPS, which=which[:2], out=tmp_path / "y")
+    assert two.summary["clusters"] == [["scan", "again"]] and two.verdict.tone == "good"
     # a program that failed is named and does not stop the others
     (finding,) = compared.verdict.findings
     assert finding.code == "VARIANT_FAILED" and finding.values["failed"] == "took longer than 600 s"

@@ -17,7 +17,7 @@ from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
 from mdnum.verbs import frame
-from mdnum.verbs.fork_map import judge_forecast, judge_map
+from mdnum.verbs.fork_map import judge_forecast, judge_map, page_map
 from mdnum.verbs.frame import View
 
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
@@ -117,10 +117,14 @@ def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
     summary = {
         "system": "x", "key": "potential.sigma", "low": 3.4, "high": 3.41, "value": 1.0, "steps": 500,
         "evaluations": 65, "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True,
-        "confirmed": 0, "loss": "x", "intervals": [], "histories": 1, "complete": True,
+        "confirmed": 0, "loss": "x", "intervals": [], "histories": 1, "complete": True, "key_unit": "",
+        "loss_unit": "", "jump_largest": None, "separation_largest": None, "seconds": 1.0, "timestep": 0.1,
+        "atoms": 2,
     }  # fmt: skip
     folder = RunFolder.create(tmp_path / "map", world="map")
+    folder.finalize()
     far = judged(folder, summary)
+    assert page_map(View(folder, summary), far).sections
     assert far.tone == "warning" and far.evidence == ()
     assert "far above" in far.findings[0].values["away"]
     inside = judged(folder, summary, low=0.9, high=1.1)
