@@ -37,39 +37,28 @@ ROUNDINGS = 5.0
 
 @dataclass(frozen=True)
 class FrameComparison:
-    """One frame, evaluated twice.
+    """One frame, evaluated twice."""
 
-    Attributes:
-        frame: which.
-        energy, energy_reference: total energies (eV or ε).
-        energy_rel: their difference over the energy (or sum |pair energies| / 1000).
-        force_max: largest difference of a force component.
-        force_scale: largest force on an atom or along a pair, which a perfect crystal has too.
-        force_rel: force_max / force_scale.
-        stress_max: largest difference of a stress component (energy / length³); None without a volume.
-        stress_rel: over the largest stress that a single kind of term could have.
-        energy_expected, force_expected: differences that rounding in the system's precision lets expect.
-        energy_third, force_third: relative energy and largest force component of mdnum against a third
-            evaluation, in plain numpy; None where there is none.
-        ambiguous: pairs within rounding of a cutoff, about which the two may rightly differ.
-        ok: within tolerance.
-    """
-
-    frame: str
+    frame: str  # which
+    # energy, energy_reference: total energies (eV or ε)
     energy: float
     energy_reference: float
-    energy_rel: float
-    force_max: float
-    force_scale: float
-    force_rel: float
+    energy_rel: float  # their difference over the energy (or sum |pair energies| / 1000)
+    force_max: float  # largest difference of a force component
+    force_scale: float  # largest force on an atom or along a pair, which a perfect crystal has too
+    force_rel: float  # force_max / force_scale
+    # largest difference of a stress component (energy / length³); None without a volume
     stress_max: float | None
-    stress_rel: float | None
+    stress_rel: float | None  # over the largest stress that a single kind of term could have
+    # energy_expected, force_expected: differences that rounding in the system's precision lets expect
     energy_expected: float
     force_expected: float
+    # energy_third, force_third: relative energy and largest force component of mdnum against a third
+    # evaluation, in plain numpy; None where there is none
     energy_third: float | None
     force_third: float | None
-    ambiguous: int
-    ok: bool
+    ambiguous: int  # pairs within rounding of a cutoff, about which the two may rightly differ
+    ok: bool  # within tolerance
 
     @property
     def energy_roundings(self) -> float:
@@ -84,27 +73,17 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class EnergyReport:
-    """Energies, forces and stresses against a reference.
+    """Energies, forces and stresses against a reference."""
 
-    Attributes:
-        system: name.
-        reference: what it was compared with; says so when it is not ASE.
-        is_ase: whether the reference is a class of ASE.
-        conversion: what was done to make the conventions equal.
-        precision: "float64", or the narrowest type in use.
-        frames: one comparison per frame, or per group of atoms in it where a sample was compared.
-        ok: every frame within tolerance.
-        sampled: atoms that were compared in one of the frames; None for all.
-    """
-
-    system: str
-    reference: str
-    is_ase: bool
-    conversion: str
-    precision: str
+    system: str  # name
+    reference: str  # what it was compared with; says so when it is not ASE
+    is_ase: bool  # whether the reference is a class of ASE
+    conversion: str  # what was done to make the conventions equal
+    precision: str  # "float64", or the narrowest type in use
+    # one comparison per frame, or per group of atoms in it where a sample was compared
     frames: tuple[FrameComparison, ...]
-    ok: bool
-    sampled: int | None = None
+    ok: bool  # every frame within tolerance
+    sampled: int | None = None  # atoms that were compared in one of the frames; None for all
 
     @property
     def worst(self) -> dict[str, Any]:
@@ -389,38 +368,24 @@ _SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
 
 @dataclass(frozen=True)
 class DynamicsReport:
-    """Two trajectories from one start.
+    """Two trajectories from one start."""
 
-    Attributes:
-        system: name.
-        reference: whose forces ASE's VelocityVerlet used.
-        is_ase: whether those were a class of ASE.
-        precision: narrowest float type of mdnum's run.
-        steps: steps taken.
-        position: largest deviation of a coordinate at each step (length), from step 0.
-        velocity: largest deviation of a velocity component at each step (length per internal time).
-        energy: deviation of the potential energy at each step.
-        growth: factor by which the position deviation grew per step over the second half.
-        sudden: first step at which it grew a hundredfold at once, which a decision at a cutoff can do and
-            chaos cannot; None where it did not.
-        r_cut: unit of the tolerance.
-        tolerance: of the position at the last step, length.
-        ok: within tolerance at the last step.
-    """
-
-    system: str
-    reference: str
-    is_ase: bool
-    precision: str
-    steps: int
-    position: tuple[float, ...]
+    system: str  # name
+    reference: str  # whose forces ASE's VelocityVerlet used
+    is_ase: bool  # whether those were a class of ASE
+    precision: str  # narrowest float type of mdnum's run
+    steps: int  # steps taken
+    position: tuple[float, ...]  # largest deviation of a coordinate at each step (length), from step 0
+    # largest deviation of a velocity component at each step (length per internal time)
     velocity: tuple[float, ...]
-    energy: tuple[float, ...]
-    growth: float
+    energy: tuple[float, ...]  # deviation of the potential energy at each step
+    growth: float  # factor by which the position deviation grew per step over the second half
+    # first step at which it grew a hundredfold at once, which a decision at a cutoff can do and chaos cannot;
+    # None where it did not
     sudden: int | None
-    r_cut: float
-    tolerance: float
-    ok: bool
+    r_cut: float  # unit of the tolerance
+    tolerance: float  # of the position at the last step, length
+    ok: bool  # within tolerance at the last step
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for about ten of the steps."""

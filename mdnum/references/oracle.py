@@ -18,22 +18,14 @@ _FEW = 100_000  # pairs and images that are quicker in one go than image by imag
 
 @dataclass(frozen=True)
 class PairSet:
-    """Pairs of atoms and images of atoms, each once.
+    """Pairs of atoms and images of atoms, each once."""
 
-    Attributes:
-        i: first atom; i <= j.
-        j: second atom; i == j for an atom and an image of itself.
-        shift: lattice vectors added to atom j: displacement = x_j - x_i + shift @ cell.
-        distance: length of that displacement as float64 computes it.
-        inside: whether the pair is within the cutoff, by real arithmetic.
-        exact: the pairs so close to the cutoff that `inside` was decided in rational arithmetic.
-    """
-
-    i: Int[ndarray, "pairs"]
-    j: Int[ndarray, "pairs"]
-    shift: Int[ndarray, "pairs 3"]
-    distance: Float[ndarray, "pairs"]
-    inside: Bool[ndarray, "pairs"]
+    i: Int[ndarray, "pairs"]  # first atom; i <= j
+    j: Int[ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
+    shift: Int[ndarray, "pairs 3"]  # lattice vectors added to atom j: displacement = x_j - x_i + shift @ cell
+    distance: Float[ndarray, "pairs"]  # length of that displacement as float64 computes it
+    inside: Bool[ndarray, "pairs"]  # whether the pair is within the cutoff, by real arithmetic
+    # the pairs so close to the cutoff that `inside` was decided in rational arithmetic
     exact: Bool[ndarray, "pairs"]
 
     def __len__(self) -> int:
