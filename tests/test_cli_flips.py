@@ -1,6 +1,8 @@
-"""`mdnum flips`, from the command line: files nobody here made, what is printed, and what is refused."""
+"""`mdnum flips`, from the command line: what is refused, and the ledger that the library gives as well."""
 
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pytest
@@ -39,12 +41,15 @@ def test_the_library_gives_the_ledger_that_the_verb_writes(capsys, tmp_path):
     from mdnum.store import RunFolder
     from mdnum.trajectories import NeighborFlips
 
-    words = ("-s", PSF, "--cutoff", "8", "--between", "name CA", "name CA", "-o", str(tmp_path / "f"))
-    call("flips", DCD, *words, "--no-report")
-    capsys.readouterr()
-    universe = MDAnalysis.Universe(PSF, DCD)
-    found = NeighborFlips(universe.select_atoms("name CA"), r_cut=8.0).run()
+    groups = ("name CA and resname VAL LEU", "name CA and resname GLY ALA")
+    words = ("-s", PSF, "--cutoff", "8", "--between", *groups, "-o", str(tmp_path / "f"))
+    call("flips", DCD, *words, "--no-report", "--json")
+    rows = json.loads(capsys.readouterr().out)["rules"][0]["by_residue_name"]
+    # in the order of the selections, whatever that of the letters
+    assert [{row[name] for row in rows} for name in ("first", "second")] == [{"VAL", "LEU"}, {"GLY", "ALA"}]
+    first, second = map(MDAnalysis.Universe(PSF, DCD).select_atoms, groups)
+    found = NeighborFlips(first, r_cut=8.0, other=second).run()
     written = RunFolder.open(tmp_path / "f").read("flips")
-    assert len(written["frame"]) == len(found.results.flips) > 4_000
+    assert len(written["frame"]) == len(found.results.flips) > 200
     for name in ("frame", "i", "j", "rank", "entered", "distance", "margin", "before"):
         np.testing.assert_array_equal(written[name], getattr(found.results.flips, name))
