@@ -18,7 +18,7 @@ from trajectories.files import water
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.source import open_trajectory
+from mdnum.trajectories.trajectory import open_trajectory
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

@@ -25,8 +25,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.binary import XtcFile, head_of
 from mdnum.trajectories.frame import FrameError, UnreadableFrame
-from mdnum.trajectories.source import open_trajectory, select
-from mdnum.trajectories.trajectory import Trajectory
+from mdnum.trajectories.trajectory import Trajectory, open_trajectory, select
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

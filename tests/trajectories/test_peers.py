@@ -11,8 +11,8 @@ import pytest
 
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.rules import CutoffRule
-from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.trajectory import open_trajectory
 
 pytestmark = pytest.mark.slow
 

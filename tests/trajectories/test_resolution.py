@@ -17,8 +17,8 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.resolution import grid_effect, infer
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
-from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.trajectory import open_trajectory
 
 # a liquid at every step takes longer to run than all the rest
 STRIDES = pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.nightly), 4])

@@ -15,8 +15,7 @@ from MDAnalysisTests import datafiles
 from trajectories.files import arrays_held, universe_of, water
 
 from mdnum.errors import InputError
-from mdnum.trajectories.source import open_trajectory, select
-from mdnum.trajectories.trajectory import chosen, parse_slice, split_path
+from mdnum.trajectories.trajectory import chosen, open_trajectory, parse_slice, select, split_path
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 
