@@ -150,17 +150,8 @@ def check_energy(
             part = _part(mine, cluster, chosen, simulation.r_cut)
             compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
             sampled |= set(chosen.tolist())
-    precision = narrowest(system)
-    return EnergyReport(
-        system.name,
-        judge.label,
-        judge.is_ase,
-        judge.conversion,
-        precision,
-        tuple(compared),
-        all(frame.ok for frame in compared),
-        len(sampled) or None,
-    )
+    of, ok = (judge.label, judge.is_ase, judge.conversion), all(frame.ok for frame in compared)
+    return EnergyReport(system.name, *of, narrowest(system), tuple(compared), ok, len(sampled) or None)
 
 
 def narrowest(system: System) -> str:
@@ -294,14 +285,9 @@ class _Scales:
             stress = force * float(r.sum()) / volume
             # many-body terms are steep: a bond's stiffness is about force scale per tenth of its length
             stiff = 10.0 * force / max(float(r.mean()) if len(r) else 1.0, 1e-300)
-            return cls(
-                energies,
-                force,
-                stress,
-                4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms)),
-                8.0 * unit * force + 4.0 * shift * stiff,
-                0,
-            )
+            energy_expected = 4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms))
+            force_expected = 8.0 * unit * force + 4.0 * shift * stiff
+            return cls(energies, force, stress, energy_expected, force_expected, 0)
         if places < unit:
             # the distance itself is rounded, too
             shift = shift + unit * r
@@ -316,20 +302,12 @@ class _Scales:
         squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
         per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
-        energy_expected = np.sqrt(
-            ((forces * shift) ** 2).sum()
-            + ((12.0 * unit * energies) ** 2).sum()
-            + (unit * energies.sum()) ** 2
-        )
+        terms = ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum()
+        energy_expected = float(np.sqrt(terms + (unit * energies.sum()) ** 2))
         force = max(largest_force, float(forces.max(initial=0.0)))
-        return cls(
-            float(energies.sum()),
-            force,
-            float((forces * r).sum()) / volume,
-            float(energy_expected),
-            float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
-            _ambiguous(model, atoms, places),
-        )
+        force_expected = float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force
+        stress, close = float((forces * r).sum()) / volume, _ambiguous(model, atoms, places)
+        return cls(float(energies.sum()), force, stress, energy_expected, force_expected, close)
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
@@ -428,32 +406,19 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
     atoms.calc = judge.make()
     integrator = VelocityVerlet(atoms, timestep=system.spec.dynamics.timestep * system.units.time_factor)
 
-    position, velocity, energy = [], [], []
+    rows = []
     for step, (x, v, potential) in enumerate(_rollout(simulation, steps)):
         if step:
             integrator.run(1)
-        position.append(float(np.abs(x - atoms.positions).max()))
-        velocity.append(float(np.abs(v - atoms.get_velocities()).max()))
-        energy.append(abs(potential - float(atoms.get_potential_energy())))
-    precision = narrowest(system)
-    tolerance = AGREEMENT[precision] * simulation.r_cut
+        off = np.abs(x - atoms.positions).max(), np.abs(v - atoms.get_velocities()).max()
+        rows.append((*map(float, off), abs(potential - float(atoms.get_potential_energy()))))
+    position, velocity, energy = zip(*rows, strict=True)
+    precision, r_cut = narrowest(system), simulation.r_cut
+    tolerance = AGREEMENT[precision] * r_cut
     ok = len(position) == steps + 1 and position[-1] <= tolerance
-    sudden = _sudden(position, floor=1e-13 * simulation.r_cut if not narrow else 1e-5 * simulation.r_cut)
-    return DynamicsReport(
-        system.name,
-        judge.label,
-        judge.is_ase,
-        precision,
-        steps,
-        tuple(position),
-        tuple(velocity),
-        tuple(energy),
-        _growth(position),
-        sudden,
-        simulation.r_cut,
-        tolerance,
-        ok,
-    )
+    sudden = _sudden(position, floor=(1e-5 if narrow else 1e-13) * r_cut)
+    of = system.name, judge.label, judge.is_ase, precision, steps
+    return DynamicsReport(*of, position, velocity, energy, _growth(position), sudden, r_cut, tolerance, ok)
 
 
 def _without_bath(system: System) -> System:
@@ -472,14 +437,14 @@ def _forces(system: System) -> Reference:
     return independent(system) if slow and system.spec.potential.kind != "eam" else judge
 
 
-def _sudden(position: list[float], floor: float) -> int | None:
+def _sudden(position: Sequence[float], floor: float) -> int | None:
     for step in range(2, len(position)):
         if position[step] > _SUDDEN * max(position[step - 1], floor):
             return step
     return None
 
 
-def _growth(position: list[float]) -> float:
+def _growth(position: Sequence[float]) -> float:
     """Factor per step, from a line through log(deviation) over the second half."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from ase import Atoms
@@ -65,17 +65,17 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     return Edges(np.array(atoms.get_chemical_symbols()), i[order], j[order], d[order], r[order])
 
 
-class Model(Protocol):
+class Model(ABC):
     """What `OnNeighborList` evaluates."""
 
     @property
+    @abstractmethod
     def reach(self) -> float:
         """No edge longer than this matters."""
-        ...
 
+    @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         """(energy of each atom, gradient of the total energy with respect to each displacement)."""
-        ...
 
 
 class ClassicalCalculator(Calculator):
@@ -204,7 +204,7 @@ _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
 
 
 @dataclass(frozen=True)
-class PairModel:
+class PairModel(Model):
     """Any pair potential with any cutoff, species by species."""
 
     forms: Mapping[tuple[str, str], PairForm]  # see `pair_forms`
@@ -260,13 +260,8 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
         target[:, axis] += np.bincount(rows, values[:, axis], len(target))
 
 
-class _OneSpecies(ABC):
+class _OneSpecies(Model):
     """A model of the edges within its reach, of whatever species."""
-
-    @property
-    @abstractmethod
-    def reach(self) -> float:
-        """No edge longer than this matters."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:

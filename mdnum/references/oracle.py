@@ -32,14 +32,8 @@ class PairSet:
 
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
         """The pairs where mask is true."""
-        return PairSet(
-            self.i[mask],
-            self.j[mask],
-            self.shift[mask],
-            self.distance[mask],
-            self.inside[mask],
-            self.exact[mask],
-        )
+        columns = self.i, self.j, self.shift, self.distance, self.inside, self.exact
+        return PairSet(*(column[mask] for column in columns))
 
 
 def widths(cell: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:

@@ -439,51 +439,33 @@ class AreaTally:
 
 @dataclass
 class Report:
-    """What the suite found out about a list.
+    """What the suite found out about a list."""
 
-    Attributes:
-        tested: the list.
-        how: its conventions, as declared or found out.
-        found_out: which of them were found out rather than declared.
-        single: a case that it decides as float32 does and float64 would not, where that was found out.
-        ties: (counted, not counted) pairs at exactly r_cut.
-        keeps_order: whether the same question gives the same rows in the same order.
-        superset: pairs beyond the cutoff are part of what it gives.
-        padding: out to which a list that is kept has all pairs, in units of the skin that it is given; None
-            where it neither states nor shows it.
-        stated: it states it, rather than shows it.
-        shifts: whether it gives the images that pairs are through.
-        areas: tallies by area.
-        aliased: the first case in which a call wrote to the arrays of the answer before it, or None.
-        refusals: kinds of refusals, and what each depends on.
-        failed: the first failure of each kind and area, in the order in which they were met.
-        seconds: in all.
-        large: (atoms, seconds) of its largest question.
-        questions: cases that there are, those that it does not claim to do included.
-        motions: against its rebuild rule, that it was asked; and calls: of it in those.
-        whole: all failures were shrunk as far as they are.
-    """
-
-    tested: PairList
-    how: Conventions = field(default_factory=Conventions)
-    found_out: list[str] = field(default_factory=list)
+    tested: PairList  # the list
+    how: Conventions = field(default_factory=Conventions)  # its conventions, as declared or found out
+    found_out: list[str] = field(default_factory=list)  # which of them were found out rather than declared
+    # a case that it decides as float32 does and float64 would not, where that was found out
     single: Case | None = None
-    ties: tuple[int, int] = (0, 0)
-    keeps_order: bool | None = None
-    superset: bool = False
+    ties: tuple[int, int] = (0, 0)  # (counted, not counted) pairs at exactly r_cut
+    keeps_order: bool | None = None  # whether the same question gives the same rows in the same order
+    superset: bool = False  # pairs beyond the cutoff are part of what it gives
+    # out to which a list that is kept has all pairs, in units of the skin that it is given; None where it
+    # neither states nor shows it
     padding: float | None = None
-    stated: bool = False
-    shifts: bool = False
-    areas: dict[str, AreaTally] = field(default_factory=dict)
+    stated: bool = False  # it states it, rather than shows it
+    shifts: bool = False  # whether it gives the images that pairs are through
+    areas: dict[str, AreaTally] = field(default_factory=dict)  # tallies by area
+    # the first case in which a call wrote to the arrays of the answer before it, or None
     aliased: str | None = None
-    refusals: list[RefusalKind] = field(default_factory=list)
+    refusals: list[RefusalKind] = field(default_factory=list)  # kinds of refusals, and what each depends on
+    # the first failure of each kind and area, in the order in which they were met
     failed: list[Failed] = field(default_factory=list)
-    seconds: float = 0.0
-    large: tuple[int, float] | None = None
-    questions: int = 0
-    motions: int = 0
+    seconds: float = 0.0  # in all
+    large: tuple[int, float] | None = None  # (atoms, seconds) of its largest question
+    questions: int = 0  # cases that there are, those that it does not claim to do included
+    motions: int = 0  # against its rebuild rule, that it was asked; and calls: of it in those
     calls: int = 0
-    whole: bool = True
+    whole: bool = True  # all failures were shrunk as far as they are
 
     def skip(self, case: Case, why: str) -> None:
         """Counts a case that is not asked."""
