@@ -15,6 +15,7 @@ import warnings
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -33,13 +34,6 @@ _SLICE = re.compile(r"(-?\d+)?(:(-?\d+)?(:(-?\d+)?)?)?")
 
 # MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
 _ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
-_OWN = {
-    "lammpsdump": "lammps",
-    "lammpstrj": "lammps",
-    "lammps-dump-text": "lammps",
-    "gro": "gro",
-    "xtc": "xtc",
-}
 # Amber's, of which MDAnalysis reads those that are whole
 _NETCDF = frozenset({"nc", "ncdf", "netcdf"})
 _LANGUAGE = (
@@ -247,20 +241,7 @@ def open_trajectory(
             raise InputError("no such file", remedy="Check the path", where=str(one))
         if one is not None and one.is_file() and not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
-    from mdnum.trajectories import binary, mdanalysis_source, text
-
-    readers = {
-        "lammps": text.LammpsDump, "gro": text.GroTrajectory, "extxyz": text.ExtxyzTrajectory,
-        "xtc": binary.XtcTrajectory, "netcdf": binary.NetcdfTrajectory,
-    }  # fmt: skip
-    kind = _reader_of(file, format)
-    word = format or (text.format_of(file) if kind == "ase" else "")
-    if reader := readers.get("extxyz" if kind == "ase" and word == "extxyz" else kind):
-        opened = reader(file, topology, frames)
-    elif kind == "ase":
-        opened = text.AseTrajectory(file, topology, frames, word)
-    else:
-        opened = mdanalysis_source.MDAnalysisTrajectory(file, topology, frames, format)
+    opened = _reader_of(file, format)(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
     return opened
@@ -280,30 +261,37 @@ def _no_trajectory(folder: Path) -> InputError:
     return InputError(message, remedy=remedy, where=str(folder))
 
 
-def _reader_of(file: Path, format: str | None) -> str:
-    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's: "lammps", "gro", "xtc", "netcdf"."""
+def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
+    """What opens a file, of its path, its topology and the frames asked for."""
     import MDAnalysis
 
-    from mdnum.trajectories.binary import head_of
+    from mdnum.trajectories import binary, mdanalysis_source, text
 
+    own = dict.fromkeys(("lammpsdump", "lammpstrj", "lammps-dump-text"), text.LammpsDump)
+    own |= {"gro": text.GroTrajectory, "xtc": binary.XtcTrajectory}
+    library = partial(mdanalysis_source.MDAnalysisTrajectory, format=format)
     known: set[str] = set(MDAnalysis._READERS)
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
-    if format is not None and format.lower() in _OWN:
-        return _OWN[format.lower()]
-    if (format or suffix[1:]).lower() in _NETCDF and (head := head_of(file)) is not None and head.cut:
-        return "netcdf"
-    if format is not None:
-        return "mdanalysis" if format.upper() in known else "ase"
-    if suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None):
-        return "ase"
-    if suffix in (".gro", ".xtc"):
-        return suffix[1:]
-    head, comment = _first_lines(file)
-    if suffix[1:].upper() not in known and head.startswith("item:"):
-        return "lammps"
-    # the comment line of an extended XYZ file says what its columns are, or its box
-    extended = suffix == ".xyz" and ("lattice=" in comment or "properties=" in comment)
-    return "mdanalysis" if suffix[1:].upper() in known and not extended else "ase"
+    if format is not None and format.lower() in own:
+        return own[format.lower()]
+    word = (format or suffix[1:]).lower()
+    if word in _NETCDF and (head := binary.head_of(file)) is not None and head.cut:
+        return binary.NetcdfTrajectory
+    if format is not None and word.upper() in known:
+        return library
+    by_ase = suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None)
+    if format is None and not by_ase:
+        if suffix in (".gro", ".xtc"):
+            return own[word]
+        head, comment = _first_lines(file)
+        if word.upper() not in known and head.startswith("item:"):
+            return text.LammpsDump
+        # the comment line of an extended XYZ file says what its columns are, or its box
+        extended = suffix == ".xyz" and ("lattice=" in comment or "properties=" in comment)
+        if word.upper() in known and not extended:
+            return library
+    word = format or text.format_of(file)
+    return text.ExtxyzTrajectory if word == "extxyz" else partial(text.AseTrajectory, format=word)
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
