@@ -74,30 +74,6 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
-def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
-    """Findings, scripts that reproduce them in another process, a page, and the same page again."""
-    assert call("conform", "mine.py:made(scale=2)", "--cases", "4", "--no-large", "-o", "run") == 1
-    lines = printed(capsys)
-    assert any(line.startswith("error: pairs inside the cutoff are missing") for line in lines)
-    folder = mine / "run"
-    page = (folder / "report.html").read_text()
-    assert "reproduce-1-missing.py" in page and "<svg" in page and "cells narrower than two cutoffs" in page
-    scripts = sorted(folder.glob("reproduce-*.py"))
-    done = subprocess.run([sys.executable, scripts[0]], capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and "the list is wrong" in done.stdout, done.stderr
-    run = RunFolder.open(folder)
-    assert not run.summary["conforms"] and run.summary["full"] is False and run.summary["superset"] is False
-    assert [finding["code"] for finding in run.summary["findings"]] == ["MISSING"]
-    assert run.world == "conform"
-    areas = run.read("areas")
-    assert dict(zip(areas["area"], areas["failed"], strict=True))["images"] > 5
-    assert list(run.read("failures")["script"]) == [path.name for path in scripts]
-    (folder / "report.html").unlink()
-    assert call("report", str(folder)) == 0
-    assert (folder / "report.html").read_text() == page
-
-
 def test_limits_make_it_conform(mine: Path, capsys: pytest.CaptureFixture[str]):
     limits = "minimum-image,orthorhombic,all-axes"
     arguments = ("conform", "mine.py:nearest_image", "--cases", "4", "--no-large", "--limits", limits)

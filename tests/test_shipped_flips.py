@@ -14,9 +14,27 @@ from mdnum.systems import names
 STEPS = {"pair/at-cutoff": 3000, "pair/leaving-well": 900, "argon/crystal-108": 60}
 # bonds of Tersoff's silicon end at 3.0 Å, where a cold crystal has no atoms
 WITHOUT_FLIPS = {"silicon/tersoff-512"}
+# one of each kind always; compiling all of them takes minutes
+QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
+SHORT = {"neighbors.skin": 0.15}
+JAX_MD = {"neighbors.builder": "jax-md", **SHORT}
+SLOW, NIGHTLY = pytest.mark.slow, pytest.mark.nightly
 
 
-def check(tmp_path, name, steps, **overrides):
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+@pytest.mark.parametrize(
+    ("name", "steps", "overrides"),
+    [
+        *(pytest.param(name, 12, {}, marks=[SLOW] * (name not in QUICK)) for name in names("md")),
+        # over several lists
+        *(pytest.param(name, 100, SHORT, marks=NIGHTLY) for name in names("md")),
+        *(pytest.param(name, 40, JAX_MD, marks=SLOW) for name in sorted(QUICK)),
+        pytest.param("binary/kob-andersen-1000", 40, JAX_MD, marks=NIGHTLY),
+    ],
+)
+def test_flips_are_those_of_the_trajectory(tmp_path, name, steps, overrides):
+    steps = STEPS.get(name, steps)
     result, folder = go(tmp_path, name, steps, overrides or None, save_every=1)
     flips = assert_ledger_is_complete(result, folder)
     assert (flips == 0) == (name in WITHOUT_FLIPS)
@@ -30,53 +48,5 @@ def check(tmp_path, name, steps, **overrides):
     algebra = series["pairs"][0] + np.cumsum(series["entered"].astype(int) - series["left"])
     assert np.array_equal(series["pairs"], algebra)
     subject = np.stack([table["i"], table["j"]], axis=1)
-    columns = (
-        table["step"],
-        subject,
-        table["entered"],
-        table["margin"],
-        table["bound"],
-        table["energy_jump"],
-    )
-    assert broken_alternations(Ledger("pair", *columns)) == 0
-
-
-# one of each kind always; compiling all of them takes minutes
-QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
-
-
-#: Of the longer trajectories, those that every change is held against.
-LONGER = ("argon/crystal-108", "argon/tilted-500")
-
-
-@pytest.mark.jax_md
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in names("md")]
-)
-def test_flips_are_those_of_the_trajectory(tmp_path, name):
-    check(tmp_path, name, STEPS.get(name, 12))
-
-
-@pytest.mark.nightly
-@pytest.mark.jax_md
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n in LONGER else pytest.mark.nightly) for n in names("md")]
-)
-def test_flips_are_those_of_a_longer_trajectory_over_several_lists(tmp_path, name):
-    check(tmp_path, name, STEPS.get(name, 100), **{"neighbors.skin": 0.15})
-
-
-@pytest.mark.slow
-@pytest.mark.jax_md
-@pytest.mark.filterwarnings("ignore:scatter inputs")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "argon/crystal-108",
-        "argon/tilted-500",
-        "pair/at-cutoff",
-        pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly),
-    ],
-)
-def test_flips_found_over_the_lists_of_jax_md(tmp_path, name):
-    check(tmp_path, name, STEPS.get(name, 40), **{"neighbors.builder": "jax-md", "neighbors.skin": 0.15})
+    columns = (table[column] for column in ("entered", "margin", "bound", "energy_jump"))
+    assert broken_alternations(Ledger("pair", table["step"], subject, *columns)) == 0

@@ -143,15 +143,12 @@ def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 po
 
 @dataclass(frozen=True)
 class Jump:
-    """A place where the curve or one of its derivatives jumps.
-
-    Attributes:
-        energy, force, curvature: after minus before, of the energy, the force and the energy's
-            second derivative.
-    """
+    """A place where the curve or one of its derivatives jumps."""
 
     low: float  # the last coordinate before it
     high: float  # the first one after it; the next double after low where `exact`
+    # energy, force, curvature: after minus before, of the energy, the force and the energy's second
+    # derivative
     energy: float
     force: float
     curvature: float

@@ -80,13 +80,10 @@ class NveRun:
 
 @dataclass(frozen=True)
 class RunCrossing:
-    """A pair that crossed a threshold between two steps.
-
-    Attributes:
-        i, j, rank: the pair, and how many of its images inside are nearer.
-    """
+    """A pair that crossed a threshold between two steps."""
 
     step: int  # after it; the step before is one less
+    # i, j, rank: the pair, and how many of its images inside are nearer
     i: int
     j: int
     rank: int

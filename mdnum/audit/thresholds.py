@@ -88,11 +88,7 @@ class PairThreshold:
 
 @dataclass(frozen=True)
 class Beyond:
-    """What was found past the scan.
-
-    Attributes:
-        energies, forces: there, eV and eV/Å.
-    """
+    """What was found past the scan."""
 
     thresholds: tuple[PairThreshold, ...]  # changes and the end, by distance
     # (last distance at which the two feel one another, next one), None without an end
@@ -101,6 +97,7 @@ class Beyond:
     force: float  # there, eV/Å
     left: float  # energy that is lost beyond it, as it decays there, eV; inf where it does not decay
     nodes: Float[np.ndarray, "nodes"]  # distances asked about in all intervals
+    # energies, forces: there, eV and eV/Å
     energies: Float[np.ndarray, "nodes"]
     forces: Float[np.ndarray, "nodes"]
 

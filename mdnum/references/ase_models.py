@@ -51,19 +51,12 @@ from mdnum.systems import System, SystemSpec
 
 @dataclass(frozen=True)
 class Reference:
-    """A calculator to compare with.
+    """A calculator to compare with."""
 
-    Attributes:
-        label: what it is, for people: "ASE LennardJones" or "plain numpy on ASE's neighbor list".
-        is_ase: whether the numbers come from a class of ASE.
-        conversion: what was done to make the conventions equal.
-        make: a fresh calculator.
-    """
-
-    label: str
-    is_ase: bool
-    conversion: str
-    make: Callable[[], Calculator]
+    label: str  # what it is, for people: "ASE LennardJones" or "plain numpy on ASE's neighbor list"
+    is_ase: bool  # whether the numbers come from a class of ASE
+    conversion: str  # what was done to make the conventions equal
+    make: Callable[[], Calculator]  # a fresh calculator
 
 
 def reference(system: System) -> Reference:

@@ -37,39 +37,28 @@ ROUNDINGS = 5.0
 
 @dataclass(frozen=True)
 class FrameComparison:
-    """One frame, evaluated twice.
+    """One frame, evaluated twice."""
 
-    Attributes:
-        frame: which.
-        energy, energy_reference: total energies (eV or ε).
-        energy_rel: their difference over the energy (or sum |pair energies| / 1000).
-        force_max: largest difference of a force component.
-        force_scale: largest force on an atom or along a pair, which a perfect crystal has too.
-        force_rel: force_max / force_scale.
-        stress_max: largest difference of a stress component (energy / length³); None without a volume.
-        stress_rel: over the largest stress that a single kind of term could have.
-        energy_expected, force_expected: differences that rounding in the system's precision lets expect.
-        energy_third, force_third: relative energy and largest force component of mdnum against a third
-            evaluation, in plain numpy; None where there is none.
-        ambiguous: pairs within rounding of a cutoff, about which the two may rightly differ.
-        ok: within tolerance.
-    """
-
-    frame: str
+    frame: str  # which
+    # energy, energy_reference: total energies (eV or ε)
     energy: float
     energy_reference: float
-    energy_rel: float
-    force_max: float
-    force_scale: float
-    force_rel: float
+    energy_rel: float  # their difference over the energy (or sum |pair energies| / 1000)
+    force_max: float  # largest difference of a force component
+    force_scale: float  # largest force on an atom or along a pair, which a perfect crystal has too
+    force_rel: float  # force_max / force_scale
+    # largest difference of a stress component (energy / length³); None without a volume
     stress_max: float | None
-    stress_rel: float | None
+    stress_rel: float | None  # over the largest stress that a single kind of term could have
+    # energy_expected, force_expected: differences that rounding in the system's precision lets expect
     energy_expected: float
     force_expected: float
+    # energy_third, force_third: relative energy and largest force component of mdnum against a third
+    # evaluation, in plain numpy; None where there is none
     energy_third: float | None
     force_third: float | None
-    ambiguous: int
-    ok: bool
+    ambiguous: int  # pairs within rounding of a cutoff, about which the two may rightly differ
+    ok: bool  # within tolerance
 
     @property
     def energy_roundings(self) -> float:
@@ -84,27 +73,17 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class EnergyReport:
-    """Energies, forces and stresses against a reference.
+    """Energies, forces and stresses against a reference."""
 
-    Attributes:
-        system: name.
-        reference: what it was compared with; says so when it is not ASE.
-        is_ase: whether the reference is a class of ASE.
-        conversion: what was done to make the conventions equal.
-        precision: "float64", or the narrowest type in use.
-        frames: one comparison per frame, or per group of atoms in it where a sample was compared.
-        ok: every frame within tolerance.
-        sampled: atoms that were compared in one of the frames; None for all.
-    """
-
-    system: str
-    reference: str
-    is_ase: bool
-    conversion: str
-    precision: str
+    system: str  # name
+    reference: str  # what it was compared with; says so when it is not ASE
+    is_ase: bool  # whether the reference is a class of ASE
+    conversion: str  # what was done to make the conventions equal
+    precision: str  # "float64", or the narrowest type in use
+    # one comparison per frame, or per group of atoms in it where a sample was compared
     frames: tuple[FrameComparison, ...]
-    ok: bool
-    sampled: int | None = None
+    ok: bool  # every frame within tolerance
+    sampled: int | None = None  # atoms that were compared in one of the frames; None for all
 
     @property
     def worst(self) -> dict[str, Any]:
@@ -171,17 +150,8 @@ def check_energy(
             part = _part(mine, cluster, chosen, simulation.r_cut)
             compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
             sampled |= set(chosen.tolist())
-    precision = narrowest(system)
-    return EnergyReport(
-        system.name,
-        judge.label,
-        judge.is_ase,
-        judge.conversion,
-        precision,
-        tuple(compared),
-        all(frame.ok for frame in compared),
-        len(sampled) or None,
-    )
+    of, ok = (judge.label, judge.is_ase, judge.conversion), all(frame.ok for frame in compared)
+    return EnergyReport(system.name, *of, narrowest(system), tuple(compared), ok, len(sampled) or None)
 
 
 def narrowest(system: System) -> str:
@@ -315,14 +285,9 @@ class _Scales:
             stress = force * float(r.sum()) / volume
             # many-body terms are steep: a bond's stiffness is about force scale per tenth of its length
             stiff = 10.0 * force / max(float(r.mean()) if len(r) else 1.0, 1e-300)
-            return cls(
-                energies,
-                force,
-                stress,
-                4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms)),
-                8.0 * unit * force + 4.0 * shift * stiff,
-                0,
-            )
+            energy_expected = 4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms))
+            force_expected = 8.0 * unit * force + 4.0 * shift * stiff
+            return cls(energies, force, stress, energy_expected, force_expected, 0)
         if places < unit:
             # the distance itself is rounded, too
             shift = shift + unit * r
@@ -337,20 +302,12 @@ class _Scales:
         squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
         per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
-        energy_expected = np.sqrt(
-            ((forces * shift) ** 2).sum()
-            + ((12.0 * unit * energies) ** 2).sum()
-            + (unit * energies.sum()) ** 2
-        )
+        terms = ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum()
+        energy_expected = float(np.sqrt(terms + (unit * energies.sum()) ** 2))
         force = max(largest_force, float(forces.max(initial=0.0)))
-        return cls(
-            float(energies.sum()),
-            force,
-            float((forces * r).sum()) / volume,
-            float(energy_expected),
-            float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
-            _ambiguous(model, atoms, places),
-        )
+        force_expected = float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force
+        stress, close = float((forces * r).sum()) / volume, _ambiguous(model, atoms, places)
+        return cls(float(energies.sum()), force, stress, energy_expected, force_expected, close)
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
@@ -389,38 +346,24 @@ _SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
 
 @dataclass(frozen=True)
 class DynamicsReport:
-    """Two trajectories from one start.
+    """Two trajectories from one start."""
 
-    Attributes:
-        system: name.
-        reference: whose forces ASE's VelocityVerlet used.
-        is_ase: whether those were a class of ASE.
-        precision: narrowest float type of mdnum's run.
-        steps: steps taken.
-        position: largest deviation of a coordinate at each step (length), from step 0.
-        velocity: largest deviation of a velocity component at each step (length per internal time).
-        energy: deviation of the potential energy at each step.
-        growth: factor by which the position deviation grew per step over the second half.
-        sudden: first step at which it grew a hundredfold at once, which a decision at a cutoff can do and
-            chaos cannot; None where it did not.
-        r_cut: unit of the tolerance.
-        tolerance: of the position at the last step, length.
-        ok: within tolerance at the last step.
-    """
-
-    system: str
-    reference: str
-    is_ase: bool
-    precision: str
-    steps: int
-    position: tuple[float, ...]
+    system: str  # name
+    reference: str  # whose forces ASE's VelocityVerlet used
+    is_ase: bool  # whether those were a class of ASE
+    precision: str  # narrowest float type of mdnum's run
+    steps: int  # steps taken
+    position: tuple[float, ...]  # largest deviation of a coordinate at each step (length), from step 0
+    # largest deviation of a velocity component at each step (length per internal time)
     velocity: tuple[float, ...]
-    energy: tuple[float, ...]
-    growth: float
+    energy: tuple[float, ...]  # deviation of the potential energy at each step
+    growth: float  # factor by which the position deviation grew per step over the second half
+    # first step at which it grew a hundredfold at once, which a decision at a cutoff can do and chaos cannot;
+    # None where it did not
     sudden: int | None
-    r_cut: float
-    tolerance: float
-    ok: bool
+    r_cut: float  # unit of the tolerance
+    tolerance: float  # of the position at the last step, length
+    ok: bool  # within tolerance at the last step
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for about ten of the steps."""
@@ -463,32 +406,19 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
     atoms.calc = judge.make()
     integrator = VelocityVerlet(atoms, timestep=system.spec.dynamics.timestep * system.units.time_factor)
 
-    position, velocity, energy = [], [], []
+    rows = []
     for step, (x, v, potential) in enumerate(_rollout(simulation, steps)):
         if step:
             integrator.run(1)
-        position.append(float(np.abs(x - atoms.positions).max()))
-        velocity.append(float(np.abs(v - atoms.get_velocities()).max()))
-        energy.append(abs(potential - float(atoms.get_potential_energy())))
-    precision = narrowest(system)
-    tolerance = AGREEMENT[precision] * simulation.r_cut
+        off = np.abs(x - atoms.positions).max(), np.abs(v - atoms.get_velocities()).max()
+        rows.append((*map(float, off), abs(potential - float(atoms.get_potential_energy()))))
+    position, velocity, energy = zip(*rows, strict=True)
+    precision, r_cut = narrowest(system), simulation.r_cut
+    tolerance = AGREEMENT[precision] * r_cut
     ok = len(position) == steps + 1 and position[-1] <= tolerance
-    sudden = _sudden(position, floor=1e-13 * simulation.r_cut if not narrow else 1e-5 * simulation.r_cut)
-    return DynamicsReport(
-        system.name,
-        judge.label,
-        judge.is_ase,
-        precision,
-        steps,
-        tuple(position),
-        tuple(velocity),
-        tuple(energy),
-        _growth(position),
-        sudden,
-        simulation.r_cut,
-        tolerance,
-        ok,
-    )
+    sudden = _sudden(position, floor=(1e-5 if narrow else 1e-13) * r_cut)
+    of = system.name, judge.label, judge.is_ase, precision, steps
+    return DynamicsReport(*of, position, velocity, energy, _growth(position), sudden, r_cut, tolerance, ok)
 
 
 def _without_bath(system: System) -> System:
@@ -507,14 +437,14 @@ def _forces(system: System) -> Reference:
     return independent(system) if slow and system.spec.potential.kind != "eam" else judge
 
 
-def _sudden(position: list[float], floor: float) -> int | None:
+def _sudden(position: Sequence[float], floor: float) -> int | None:
     for step in range(2, len(position)):
         if position[step] > _SUDDEN * max(position[step - 1], floor):
             return step
     return None
 
 
-def _growth(position: list[float]) -> float:
+def _growth(position: Sequence[float]) -> float:
     """Factor per step, from a line through log(deviation) over the second half."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():

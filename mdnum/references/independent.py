@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from ase import Atoms
@@ -33,21 +33,13 @@ from mdnum.systems.schema import SystemSpec
 
 @dataclass(frozen=True)
 class Edges:
-    """A full neighbor list: both directions of every pair.
+    """A full neighbor list: both directions of every pair."""
 
-    Attributes:
-        symbols: chemical symbol of each atom.
-        i: atom an edge starts from, ascending.
-        j: atom it leads to.
-        d: displacement x_j - x_i with the lattice vector added, (edges, 3).
-        r: its length.
-    """
-
-    symbols: ndarray
-    i: ndarray
-    j: ndarray
-    d: ndarray
-    r: ndarray
+    symbols: ndarray  # chemical symbol of each atom
+    i: ndarray  # atom an edge starts from, ascending
+    j: ndarray  # atom it leads to
+    d: ndarray  # displacement x_j - x_i with the lattice vector added, (edges, 3)
+    r: ndarray  # its length
 
 
 def edges_of(atoms: Atoms, reach: float) -> Edges:
@@ -73,17 +65,17 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     return Edges(np.array(atoms.get_chemical_symbols()), i[order], j[order], d[order], r[order])
 
 
-class Model(Protocol):
+class Model(ABC):
     """What `OnNeighborList` evaluates."""
 
     @property
+    @abstractmethod
     def reach(self) -> float:
         """No edge longer than this matters."""
-        ...
 
+    @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         """(energy of each atom, gradient of the total energy with respect to each displacement)."""
-        ...
 
 
 class ClassicalCalculator(Calculator):
@@ -129,25 +121,15 @@ class OnNeighborList(ClassicalCalculator):
 
 @dataclass(frozen=True)
 class PairForm:
-    """The interaction of one pair of species.
+    """The interaction of one pair of species."""
 
-    Attributes:
-        species: the two symbols.
-        kind: potential.
-        constants: its constants by name, in the units of the system file.
-        cutoff: cutoff kind.
-        r_cut: cutoff radius.
-        r_onset: where switching starts; r_cut for cutoffs that do not switch.
-        compare: what inside means: "r2 <", "r2 <=", "r <" or "r <=".
-    """
-
-    species: tuple[str, str]
-    kind: str
-    constants: Mapping[str, float]
-    cutoff: str
-    r_cut: float
-    r_onset: float
-    compare: str
+    species: tuple[str, str]  # the two symbols
+    kind: str  # potential
+    constants: Mapping[str, float]  # its constants by name, in the units of the system file
+    cutoff: str  # cutoff kind
+    r_cut: float  # cutoff radius
+    r_onset: float  # where switching starts; r_cut for cutoffs that do not switch
+    compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
         """Whether distances count as inside, in the space and with the comparison of the system file."""
@@ -222,14 +204,10 @@ _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
 
 
 @dataclass(frozen=True)
-class PairModel:
-    """Any pair potential with any cutoff, species by species.
+class PairModel(Model):
+    """Any pair potential with any cutoff, species by species."""
 
-    Attributes:
-        forms: see `pair_forms`.
-    """
-
-    forms: Mapping[tuple[str, str], PairForm]
+    forms: Mapping[tuple[str, str], PairForm]  # see `pair_forms`
 
     @property
     def reach(self) -> float:
@@ -282,13 +260,8 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
         target[:, axis] += np.bincount(rows, values[:, axis], len(target))
 
 
-class _OneSpecies(ABC):
+class _OneSpecies(Model):
     """A model of the edges within its reach, of whatever species."""
-
-    @property
-    @abstractmethod
-    def reach(self) -> float:
-        """No edge longer than this matters."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:

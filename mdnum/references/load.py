@@ -26,17 +26,11 @@ _counter = itertools.count()
 
 @dataclass(frozen=True)
 class NamedObject:
-    """Where an object is, by the words of a person.
+    """Where an object is, by the words of a person."""
 
-    Attributes:
-        text: the words.
-        home: a module, or the path of a Python file.
-        call: what stands after the colon: a dotted name, with literal arguments or without; may be empty
-            for a file.
-    """
-
-    text: str
-    home: str
+    text: str  # the words
+    home: str  # a module, or the path of a Python file
+    # what stands after the colon: a dotted name, with literal arguments or without; may be empty for a file
     call: str
 
     @property

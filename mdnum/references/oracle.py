@@ -12,28 +12,19 @@ from numpy import ndarray
 
 from mdnum.errors import InputError
 
-_BLOCK = 2_000_000  # pairs looked at in one go: 48 MB of displacements
-_FEW = 100_000  # pairs and images that are quicker in one go than image by image
+_BLOCK = 2_000_000  # pairs and images looked at in one go: 48 MB of displacements
 
 
 @dataclass(frozen=True)
 class PairSet:
-    """Pairs of atoms and images of atoms, each once.
+    """Pairs of atoms and images of atoms, each once."""
 
-    Attributes:
-        i: first atom; i <= j.
-        j: second atom; i == j for an atom and an image of itself.
-        shift: lattice vectors added to atom j: displacement = x_j - x_i + shift @ cell.
-        distance: length of that displacement as float64 computes it.
-        inside: whether the pair is within the cutoff, by real arithmetic.
-        exact: the pairs so close to the cutoff that `inside` was decided in rational arithmetic.
-    """
-
-    i: Int[ndarray, "pairs"]
-    j: Int[ndarray, "pairs"]
-    shift: Int[ndarray, "pairs 3"]
-    distance: Float[ndarray, "pairs"]
-    inside: Bool[ndarray, "pairs"]
+    i: Int[ndarray, "pairs"]  # first atom; i <= j
+    j: Int[ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
+    shift: Int[ndarray, "pairs 3"]  # lattice vectors added to atom j: displacement = x_j - x_i + shift @ cell
+    distance: Float[ndarray, "pairs"]  # length of that displacement as float64 computes it
+    inside: Bool[ndarray, "pairs"]  # whether the pair is within the cutoff, by real arithmetic
+    # the pairs so close to the cutoff that `inside` was decided in rational arithmetic
     exact: Bool[ndarray, "pairs"]
 
     def __len__(self) -> int:
@@ -41,14 +32,8 @@ class PairSet:
 
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
         """The pairs where mask is true."""
-        return PairSet(
-            self.i[mask],
-            self.j[mask],
-            self.shift[mask],
-            self.distance[mask],
-            self.inside[mask],
-            self.exact[mask],
-        )
+        columns = self.i, self.j, self.shift, self.distance, self.inside, self.exact
+        return PairSet(*(column[mask] for column in columns))
 
 
 def widths(cell: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
@@ -151,11 +136,7 @@ def all_pairs(
     bound = rounding_bound(positions, stored, r_cut)
     reach = r_cut + bound if reach is None else max(reach, r_cut + bound)
 
-    parts = [
-        part
-        for shifts in _images(positions, cell, pbc, reach)
-        for part in _within(positions, stored, shifts, reach)
-    ]
+    parts = list(_within(positions, cell, pbc, reach))
     i, j, shift, distance = (np.concatenate([part[k] for part in parts]) for k in range(4))
     order = np.lexsort((shift[:, 2], shift[:, 1], shift[:, 0], j, i))
     i, j, shift, distance = i[order], j[order], shift[order], distance[order]
@@ -190,69 +171,32 @@ def completed(cell: Float[ndarray, "3 3"], pbc: Bool[ndarray, "3"]) -> Float[nda
     return full
 
 
-def _images(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """Functions that give the shift to try for a block of pairs: one where one image can be in reach."""
+def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
+    """(i, j, shift, distance) of the pairs within reach, block by block."""
+    n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
-    home = np.where(pbc, -np.floor(fractional), 0.0)
-    width = widths(cell)
-
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be
     # the one whose fractional difference rounds to zero, in a triclinic cell as well
-    if not pbc.any() or reach < 0.499 * width[pbc].min():
-
-        def nearest(first: ndarray, second: ndarray) -> ndarray:
-            return np.where(pbc, -np.rint(fractional[second] - fractional[first]), 0.0)
-
-        return [(nearest, False)]
-
-    # atoms brought home differ by less than one cell, so one vector beyond reach / width is enough
-    most = np.where(pbc, (reach / width).astype(int) + 1, 0)
-    span = [range(-count, count + 1) for count in most]
-    vectors = np.array(list(product(*span)), dtype=float)
-    if len(vectors) * len(positions) * (len(positions) + 1) <= 2 * _FEW:
-        return [(vectors, home)]
-    tries = []
-    for vector in product(*span):
-
-        def given(first: ndarray, second: ndarray, vector=vector) -> ndarray:
-            return np.asarray(vector, dtype=float) + home[second] - home[first]
-
-        tries.append((given, vector > (0, 0, 0)))
-    return tries
-
-
-def _within(positions: ndarray, cell: ndarray, image, reach: float):
-    """(i, j, shift, distance) of the pairs within reach for one choice of image, block by block."""
-    n = len(positions)
-    if isinstance(image[0], np.ndarray):
-        vectors, home = image
-        yield _at_once(positions, cell, vectors, home, reach)
-        return
-    shift_of, own_image = image
-    rows = max(1, _BLOCK // max(n, 1))
+    nearest = not pbc.any() or bool(reach < 0.499 * width[pbc].min())
+    # else atoms brought home differ by less than one cell, so one vector beyond reach / width is enough
+    home = np.where(pbc, fractional if nearest else -np.floor(fractional), 0.0)
+    most = np.where(nearest | ~pbc, 0, (reach / width).astype(int) + 1)
+    vectors = np.array(list(product(*(range(-count, count + 1) for count in most))), dtype=float)
+    # an atom and its own image: one of the two opposite shifts, never the null shift
+    leading = np.array([tuple(vector) > (0.0, 0.0, 0.0) for vector in vectors.tolist()], dtype=bool)
+    some = max(1, _BLOCK // max(n, 1))
+    rows = max(1, some // len(vectors))
     yield np.empty(0, int), np.empty(0, int), np.empty((0, 3), int), np.empty(0)
     for start in range(0, n, rows):
         first, second = np.meshgrid(np.arange(start, min(start + rows, n)), np.arange(n), indexing="ij")
-        keep = second > first
-        if own_image:  # an atom and its own image: one of the two opposite shifts, never the null shift
-            keep |= second == first
-        first, second = first[keep], second[keep]
-        shift = shift_of(first, second)
-        displacement = positions[second] - positions[first] + shift @ cell
-        dx, dy, dz = displacement.T
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        near = distance <= reach
-        yield first[near], second[near], shift[near].astype(int), distance[near]
-
-
-def _at_once(positions: ndarray, cell: ndarray, vectors: ndarray, home: ndarray, reach: float):
-    """As `_within`, for all vectors at once: few atoms would wait for Python alone."""
-    first, second = np.triu_indices(len(positions))
-    shift = vectors[:, None, :] + (home[second] - home[first])[None]
-    displacement = (positions[second] - positions[first])[None] + shift @ cell
-    dx, dy, dz = np.moveaxis(displacement, -1, 0)
-    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-    leading = np.array([tuple(vector) > (0.0, 0.0, 0.0) for vector in vectors.tolist()], dtype=bool)
-    near = (distance <= reach) & ((first != second)[None] | leading[:, None])
-    which, pair = np.nonzero(near)
-    return first[pair], second[pair], shift[which, pair].astype(int), distance[which, pair]
+        first, second = first[second >= first], second[second >= first]
+        between = home[second] - home[first]
+        between = -np.rint(between) if nearest else between
+        for begin in range(0, len(vectors), some):
+            shift = vectors[begin : begin + some, None] + between
+            displacement = positions[second] - positions[first] + shift @ stored
+            dx, dy, dz = np.moveaxis(displacement, -1, 0)
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            near = (distance <= reach) & ((first != second) | leading[begin : begin + some, None])
+            which, pair = np.nonzero(near)
+            yield first[pair], second[pair], shift[which, pair].astype(int), distance[which, pair]

@@ -185,53 +185,35 @@ def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What one search found.
+    """What one search found."""
 
-    Attributes:
-        name, version: which search.
-        verdict: "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed";
-            "not asked": see note.
-        pairs: pairs found inside the cutoff.
-        missing, extra: pairs that only the oracle has, or only the search, beyond its rounding.
-        borderline: pairs decided otherwise than by real arithmetic, within its rounding.
-        effective: the cutoff it acts on.
-        seconds: time of the first search, compiling included.
-        ours: whether it is mdnum's own, on which a run depends.
-        note: why it was not asked, or how it failed.
-    """
-
+    # name, version: which search
     name: str
     version: str | None
+    # "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed"; "not asked": see
+    # note
     verdict: str
-    pairs: int = 0
+    pairs: int = 0  # pairs found inside the cutoff
+    # missing, extra: pairs that only the oracle has, or only the search, beyond its rounding
     missing: int = 0
     extra: int = 0
-    borderline: int = 0
-    effective: EffectiveCutoff | None = None
-    seconds: float = 0.0
-    ours: bool = False
-    note: str = ""
+    borderline: int = 0  # pairs decided otherwise than by real arithmetic, within its rounding
+    effective: EffectiveCutoff | None = None  # the cutoff it acts on
+    seconds: float = 0.0  # time of the first search, compiling included
+    ours: bool = False  # whether it is mdnum's own, on which a run depends
+    note: str = ""  # why it was not asked, or how it failed
 
 
 @dataclass(frozen=True)
 class PairsReport:
-    """The pair sets of all searches against the oracle.
+    """The pair sets of all searches against the oracle."""
 
-    Attributes:
-        system: name.
-        compare: what inside means in this system.
-        r_cut: longest cutoff radius.
-        pairs: pairs inside, by real arithmetic.
-        decided_exactly: pairs so close to a cutoff that float64 could not decide.
-        results: one per search.
-    """
-
-    system: str
-    compare: str
-    r_cut: float
-    pairs: int
-    decided_exactly: int
-    results: tuple[SearchResult, ...]
+    system: str  # name
+    compare: str  # what inside means in this system
+    r_cut: float  # longest cutoff radius
+    pairs: int  # pairs inside, by real arithmetic
+    decided_exactly: int  # pairs so close to a cutoff that float64 could not decide
+    results: tuple[SearchResult, ...]  # one per search
 
     @property
     def ok(self) -> bool:
@@ -346,23 +328,14 @@ def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: f
 
 @dataclass(frozen=True)
 class EffectiveCutoff:
-    """The cutoff a search acts on, when asked for r_cut.
+    """The cutoff a search acts on, when asked for r_cut."""
 
-    Attributes:
-        r_cut: the cutoff asked for.
-        last_counted: largest distance along x at which the pair is still counted.
-        ulps: last_counted - r_cut in units of r_cut's last place; -1 for an exact "<", 0 for an exact "<=".
-        comparison: "<" or "<=", with "in float32" where the numbers are cast to it; else "rounded".
-        oriented: pairs placed within 3 ulps of r_cut in random directions.
-        disagree: those of them decided otherwise than real arithmetic does with r < r_cut.
-    """
-
-    r_cut: float
-    last_counted: float
-    ulps: int
-    comparison: str
-    oriented: int
-    disagree: int
+    r_cut: float  # the cutoff asked for
+    last_counted: float  # largest distance along x at which the pair is still counted
+    ulps: int  # last_counted - r_cut in units of r_cut's last place; -1 for an exact "<", 0 for an exact "<="
+    comparison: str  # "<" or "<=", with "in float32" where the numbers are cast to it; else "rounded"
+    oriented: int  # pairs placed within 3 ulps of r_cut in random directions
+    disagree: int  # those of them decided otherwise than real arithmetic does with r < r_cut
 
     @property
     def stops(self) -> str:

@@ -195,17 +195,14 @@ def mended(stays: Contacts, gap: int) -> Contacts:
 
 @dataclass(frozen=True)
 class Strides(Sums):
-    """Flips that are left when only every nth frame is examined.
-
-    Attributes:
-        doubtful: of those that are left out, flips that the rounding of the file may have made.
-    """
+    """Flips that are left when only every nth frame is examined."""
 
     _common = ("stride",)
 
     stride: Int[np.ndarray, "strides"]  # 1, 2, 4,
     flips: Int[np.ndarray, "strides"]  # of the frames 0, stride, 2 stride,
     of: Int[np.ndarray, "strides"]  # flips of all frames, as far as these reach
+    # of those that are left out, flips that the rounding of the file may have made
     doubtful: Int[np.ndarray, "strides"]
 
     @classmethod
@@ -234,13 +231,10 @@ class Strides(Sums):
 
 @dataclass(frozen=True)
 class MissingFlips:
-    """An estimate of what is missing between the frames, as shares of all flips that happened.
+    """An estimate of what is missing between the frames, as shares of all flips that happened."""
 
-    Attributes:
-        reason: "none_lost", "few" (too few lost to see a trend), "trend"; or why there is no number:
-            "rounding" (the file's digits may have made them), "brownian" (losses do not die out).
-    """
-
+    # "none_lost", "few" (too few lost to see a trend), "trend"; or why there is no number: "rounding" (the
+    # file's digits may have made them), "brownian" (losses do not die out)
     reason: str
     doubled: float  # share that every second frame alone would lose, and every fourth
     fourth: float

@@ -80,7 +80,7 @@ def flips(
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.resolution import infer
-    from mdnum.trajectories.source import open_trajectory
+    from mdnum.trajectories.trajectory import open_trajectory
 
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")

@@ -25,7 +25,7 @@ TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     """Indices of the atoms on either side."""
-    from mdnum.trajectories.source import select
+    from mdnum.trajectories.trajectory import select
 
     return (
         (None, None) if between is None else (select(trajectory, between[0]), select(trajectory, between[1]))

@@ -27,22 +27,16 @@ def law(r: float) -> tuple[float, float, float]:
     )
 
 
-def endless(r: float) -> tuple[float, float]:
-    return law(r)[:2]
+def cut(inside: Callable[[float], bool]) -> Law:
+    return lambda r: law(r)[:2] if inside(r) else NOTHING
 
 
-def hard(r: float) -> tuple[float, float]:
-    return law(r)[:2] if r < R_CUT else NOTHING
-
-
-def including(r: float) -> tuple[float, float]:
-    """The same with the cutoff itself inside."""
-    return law(r)[:2] if r <= R_CUT else NOTHING
-
-
-def squared(r: float) -> tuple[float, float]:
-    """Decided on squares, as most codes do."""
-    return law(r)[:2] if r * r < R_CUT * R_CUT else NOTHING
+endless = cut(lambda r: True)
+hard = cut(lambda r: r < R_CUT)
+#: The same with the cutoff itself inside.
+including = cut(lambda r: r <= R_CUT)
+#: Decided on squares, as most codes do.
+squared = cut(lambda r: r * r < R_CUT * R_CUT)
 
 
 def shifted(r: float) -> tuple[float, float]:

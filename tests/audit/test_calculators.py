@@ -31,37 +31,28 @@ NAMES = ["invariance", "smoothness", "forces", "curl", "state", "dynamics"]
 
 
 @pytest.mark.parametrize(
-    ("words", "kind", "parameters"),
+    ("words", "stem", "parameters"),
     [
-        ("ase.calculators.emt:EMT", EMT, {}),
-        ("ase.calculators.emt:EMT()", EMT, {}),
-        ("ase.calculators.lj:LennardJones(rc=8.5, smooth=True)", LennardJones, {"rc": 8.5, "smooth": True}),
+        ("ase.calculators.emt:EMT", "EMT", {}),
+        ("ase.calculators.emt:EMT()", "EMT", {}),
+        ("ase.calculators.lj:LennardJones(rc=8.5, smooth=True)", "LennardJones", {"rc": 8.5, "smooth": True}),
+        # a file is run again for each calculator
+        ("calculator = LennardJones(epsilon=WELL)\n", "calculator", {"epsilon": 0.25}),
+        ("calc = LennardJones(epsilon=WELL)\n", "calc", {"epsilon": 0.25}),
+        ("def make():\n    return LennardJones(epsilon=WELL)\n", "make", {"epsilon": 0.25}),
+        ("mine = LennardJones(epsilon=WELL)\n", "other", {"epsilon": 0.25}),
     ],
 )
-def test_a_class_with_its_arguments(words: str, kind: type, parameters: dict[str, object]):
+def test_what_words_name_is_made_anew_each_time(words: str, stem: str, parameters: dict, tmp_path: Path):
+    if words.endswith("\n"):
+        (tmp_path / "neighbor.py").write_text("WELL = 0.25\n")
+        text = "from ase.calculators.lj import LennardJones\nfrom neighbor import WELL\n"
+        (tmp_path / f"{stem}.py").write_text(text + words)
+        words = f"{tmp_path / stem}.py{':mine' if stem == 'other' else ''}"
     loaded = load_calculator(words)
     one, other = loaded.make(), loaded.make()
-    assert isinstance(one, kind) and isinstance(one, Calculator) and one is not other
+    assert isinstance(one, EMT | LennardJones) and one is not other and loaded.stem == stem
     assert {name: one.parameters[name] for name in parameters} == parameters
-    assert loaded.stem == kind.__name__
-
-
-@pytest.mark.parametrize(
-    ("name", "body"),
-    [
-        ("calculator", "calculator = LennardJones(epsilon=WELL)\n"),
-        ("calc", "calc = LennardJones(epsilon=WELL)\n"),
-        ("make", "def make():\n    return LennardJones(epsilon=WELL)\n"),
-        ("other", "mine = LennardJones(epsilon=WELL)\n"),
-    ],
-)
-def test_a_file_is_run_again_for_each_calculator(name: str, body: str, tmp_path: Path):
-    (tmp_path / "neighbor.py").write_text("WELL = 0.25\n")
-    text = "from ase.calculators.lj import LennardJones\nfrom neighbor import WELL\n"
-    (tmp_path / f"{name}.py").write_text(text + body)
-    loaded = load_calculator(f"{tmp_path / name}.py{':mine' if name == 'other' else ''}")
-    one, other = loaded.make(), loaded.make()
-    assert one.parameters["epsilon"] == 0.25 and one is not other and loaded.stem == name
 
 
 def test_a_system_brings_its_structure_and_temperature():

@@ -101,25 +101,25 @@ def test_free_atoms_have_no_stress():
     assert frame.ok and frame.stress_max is None and frame.frame == "frame 0"
 
 
-@pytest.mark.parametrize("precision", [SINGLE, pytest.param({"force": "float32"}, marks=pytest.mark.nightly)])
-def test_float32_is_compared_in_units_of_its_rounding(precision: dict):
+@pytest.mark.parametrize(
+    ("precision", "name", "energy", "force", "most"),
+    [
+        (SINGLE, "float32", (1e-9, 1e-5), 0.01, 5.0),
+        pytest.param({"force": "float32"}, "float32", (1e-9, 1e-5), 0.01, 5.0, marks=pytest.mark.nightly),
+        # rounded terms at places that are not
+        ({"force": "bfloat16"}, "bfloat16", (1e-5, 1e-2), 0.05, 2.0),
+    ],
+)
+def test_narrow_numbers_are_compared_in_units_of_their_rounding(
+    precision: dict, name: str, energy, force, most
+):
     atoms = crystal()
     report = check_energy(make(atoms, LENNARD_JONES, HARD, precision=precision), {"initial": atoms})
     (frame,) = report.frames
-    assert report.ok and report.precision == "float32"
-    assert 1e-9 < frame.energy_rel < 1e-5  # not float64 in disguise
-    assert 0.01 < frame.force_roundings < 5.0 and frame.energy_roundings < 5.0
+    assert report.ok and report.precision == name and frame.ambiguous == 0
+    assert energy[0] < frame.energy_rel < energy[1]  # not float64 in disguise
+    assert force < frame.force_roundings < most and frame.energy_roundings < most
     assert codes(report) == [("NARROW_PRECISION", "info")]
-
-
-def test_a_force_in_sixteen_bits_has_rounded_terms_at_places_that_are_not():
-    atoms = crystal()
-    short = make(atoms, LENNARD_JONES, HARD, precision={"force": "bfloat16"})
-    report = check_energy(short, {"initial": atoms})
-    (frame,) = report.frames
-    assert report.ok and report.precision == "bfloat16" and frame.ambiguous == 0
-    assert 1e-5 < frame.energy_rel < 1e-2
-    assert 0.05 < frame.force_roundings < 2.0 and frame.energy_roundings < 2.0
 
 
 class Faulty:

@@ -9,6 +9,7 @@ import itertools
 from fractions import Fraction
 
 import numpy as np
+import oracles
 import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
@@ -16,6 +17,11 @@ from hypothesis import strategies as st
 from mdnum.trajectories.frame import Box
 
 length = st.floats(1.2, 9.0)
+PERIODIC = np.ones(3, bool)
+
+
+def cube(edge: float) -> Box:
+    return Box(np.eye(3) * edge, PERIODIC)
 
 
 @st.composite
@@ -68,9 +74,18 @@ def as_dict(members) -> dict:
 
 
 def same(ours: dict, theirs: dict) -> None:
-    assert set(ours) == set(theirs)
-    for key, distance in theirs.items():
-        assert ours[key] == pytest.approx(distance, abs=1e-9)
+    assert set(ours) == set(theirs) and ours == pytest.approx(theirs, abs=1e-9)
+
+
+def rows(flips) -> list:
+    columns = (flips.i, flips.j, flips.rank, flips.entered)
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def differences(before: dict | None, now: dict) -> list:
+    """Flips between two sets of pairs, as `rows` has them; none where nothing is known of the first."""
+    entered = [(*key, True) for key in now.keys() - (now if before is None else before).keys()]
+    return sorted(entered + [(*key, False) for key in (before or {}).keys() - now.keys()])
 
 
 def image_list(positions, matrix, pbc, i, j, reach):
@@ -102,26 +117,22 @@ def image_list(positions, matrix, pbc, i, j, reach):
 def everything(positions, matrix, pbc, first, second, reach):
     """{(i, j): squared distances of images} of symmetric pairs between the two sides, i <= j."""
     found = {}
-    for i in range(len(positions)):
-        for j in range(i, len(positions)):
-            if (i in first and j in second) or (i in second and j in first):
-                squares = image_list(positions, matrix, pbc, i, j, reach)
-                if len(squares):
-                    found[i, j] = squares
+    for i, j in itertools.combinations_with_replacement(range(len(positions)), 2):
+        if (i in first and j in second) or (i in second and j in first):
+            squares = image_list(positions, matrix, pbc, i, j, reach)
+            if len(squares):
+                found[i, j] = squares
     return found
 
 
 def members(pairs, radius_of):
     """{(i, j, rank): distance} of the pairs inside."""
-    inside = {}
-    for (i, j), squares in pairs.items():
-        radius = radius_of(i, j)
-        if radius is None:
-            continue
-        for rank, square in enumerate(squares):
-            if square < radius * radius:
-                inside[i, j, rank] = float(np.sqrt(square))
-    return inside
+    return {
+        (i, j, rank): float(np.sqrt(square))
+        for (i, j), squares in pairs.items()
+        for rank, square in enumerate(squares)
+        if square < (radius_of(i, j) or 0.0) ** 2
+    }
 
 
 def clear(pairs, radius_of, by=1e-9):
@@ -161,21 +172,9 @@ def exactly_inside(positions, matrix, pbc, i, j, rank, radius):
     """Whether the image of that rank is inside, in rational arithmetic."""
     rows = np.where(np.asarray(pbc)[:, None], np.asarray(matrix, float), 0.0)
     d = positions[j] - positions[i]
-    inverse = np.linalg.pinv(rows)
-    middle = -np.rint(d @ inverse).astype(int)
-    spans = [range(m - 3, m + 4) if p else [0] for m, p in zip(middle, pbc, strict=True)]
-    squares = []
-    for shift in itertools.product(*spans):
-        if i == j and shift <= (0, 0, 0):
-            continue
-        if np.linalg.norm(d + np.array(shift) @ rows) > 2.0 * radius:
-            # fractions are slow
-            continue
-        total = Fraction(0)
-        for axis in range(3):
-            one = Fraction(float(positions[j][axis])) - Fraction(float(positions[i][axis]))
-            one += sum(int(s) * Fraction(float(row[axis])) for s, row in zip(shift, rows, strict=True))
-            total += one * one
-        squares.append(total)
-    squares.sort()
+    middle = -np.rint(d @ np.linalg.inv(rows)).astype(int)
+    shifts = itertools.product(*(range(m - 3, m + 4) for m in middle))
+    # fractions are slow
+    near = (shift for shift in shifts if np.linalg.norm(d + np.array(shift) @ rows) <= 2.0 * radius)
+    squares = sorted(oracles.exact_r2(positions, rows, i, j, shift) for shift in near)
     return rank < len(squares) and squares[rank] < Fraction(float(radius)) ** 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from oracles import all_pairs
 
 CUTOFF = 2.5
 
@@ -44,13 +45,8 @@ def liquid(frames: int, timestep: float = 0.005, stride: int = 1, cells: int = 3
 
 def memberships(positions, length, radius=CUTOFF):
     """Which of all pairs are inside at each frame, by minimum image: (frames, pairs)."""
-    rows = []
-    first, second = np.triu_indices(positions.shape[1], 1)
-    for x in positions:
-        d = x[first] - x[second]
-        d -= length * np.rint(d / length)
-        rows.append((d * d).sum(axis=1) < radius**2)
-    return np.array(rows)
+    apart = (all_pairs(x, length * np.eye(3), (True,) * 3)[2] for x in positions)
+    return np.array([(d * d).sum(axis=1) < radius**2 for d in apart])
 
 
 def missed_and_invented(truth, seen):

@@ -18,20 +18,24 @@ from trajectories.files import water
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.source import open_trajectory
+from mdnum.trajectories.trajectory import open_trajectory
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 
 DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
 
 
-def test_a_charmm_box_is_turned_as_its_coordinates_are():
-    trajectory = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC, slice="::5")
+def symmetric_cells():
+    """The boxes of CHARMM's file."""
     with DCDFile(datafiles.DCD_TRICLINIC) as file:
-        cells = [frame.unitcell.copy() for frame in file]
-    for frame in trajectory.frames():
-        xx, xy, yy, xz, yz, zz = cells[frame.index]
-        np.testing.assert_array_equal(frame.box.matrix, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        for xx, xy, yy, xz, yz, zz in (frame.unitcell for frame in file):
+            yield np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def test_a_charmm_box_is_turned_as_its_coordinates_are():
+    trajectory = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC)
+    for frame, cell in zip(trajectory.frames(), symmetric_cells(), strict=True):
+        np.testing.assert_array_equal(frame.box.matrix, cell)
     # lengths and cosines stand in the same places of another program's file
     other = next(open_trajectory(datafiles.DCD_NAMD_TRICLINIC, datafiles.PSF_NAMD_TRICLINIC).frames())
     assert other.box.matrix[0, 1] == 0 and abs(other.box.matrix[1, 0]) > 1
@@ -103,13 +107,8 @@ def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pair
     universe = MDAnalysis.Universe(datafiles.PSF_TRICLINIC, datafiles.DCD_TRICLINIC)
     universe.trajectory[-1]
     x, counts = universe.atoms.positions.astype(float), []
-    with DCDFile(datafiles.DCD_TRICLINIC) as file:
-        xx, xy, yy, xz, yz, zz = list(file)[-1].unitcell
     shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    for matrix in (
-        triclinic_vectors(universe.dimensions, dtype=np.float64),
-        np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
-    ):
+    for matrix in (triclinic_vectors(universe.dimensions, dtype=np.float64), list(symmetric_cells())[-1]):
         # wrapped first, so that the nearest images are among those tried
         wrapped = (np.linalg.solve(matrix.T, x.T).T % 1.0) @ matrix
         close = 0

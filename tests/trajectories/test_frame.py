@@ -47,13 +47,19 @@ def test_frame_and_atom_are_named(spoil, said):
     assert seen == [0, 10] and caught.value.frame == 20
 
 
-def test_what_is_fine_is_not_refused():
-    assert len(list(checked(frames()))) == 4
-    # one atom may be at the origin, and what is not looked at may be anywhere
-    assert len(list(checked(frames(put(2, slice(4, 5), 0.0))))) == 4
-    assert len(list(checked(frames(put(2, slice(4, 5), np.nan)), np.array([0, 1, 2])))) == 4
-    # large, but a place
-    assert len(list(checked(frames(put(2, slice(4, 5), 1e5))))) == 4
+@pytest.mark.parametrize(
+    ("rows", "value", "atoms"),
+    [
+        (slice(0), 0.0, None),
+        # one atom may be at the origin, and what is not looked at may be anywhere
+        (slice(4, 5), 0.0, None),
+        (slice(4, 5), np.nan, np.array([0, 1, 2])),
+        # large, but a place
+        (slice(4, 5), 1e5, None),
+    ],
+)
+def test_what_is_fine_is_not_refused(rows, value, atoms):
+    assert len(list(checked(frames(put(2, rows, value)), atoms))) == 4
 
 
 def test_a_box_without_a_vector_is_named_with_its_frame():

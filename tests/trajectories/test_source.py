@@ -15,8 +15,7 @@ from MDAnalysisTests import datafiles
 from trajectories.files import arrays_held, universe_of, water
 
 from mdnum.errors import InputError
-from mdnum.trajectories.source import open_trajectory, select
-from mdnum.trajectories.trajectory import chosen, parse_slice, split_path
+from mdnum.trajectories.trajectory import chosen, open_trajectory, parse_slice, select, split_path
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 
@@ -26,6 +25,8 @@ REAL = {
     "dcd, no box": (datafiles.DCD, datafiles.PSF),
     "netcdf": (datafiles.NCDF, datafiles.PRMncdf),
     "pdb": (datafiles.PDB_multiframe if hasattr(datafiles, "PDB_multiframe") else datafiles.PDB_small, None),
+    "gsd": (datafiles.GSD, None),
+    "h5md": (datafiles.H5MD_xvf, datafiles.TPR_xvf),
     "trz": (datafiles.TRZ, datafiles.TRZ_psf),
     "lammps dcd": (datafiles.LAMMPSdcd2, datafiles.LAMMPSdata2),
     "xyz": (datafiles.XYZ_mini, None),
@@ -262,20 +263,6 @@ def test_selections_are_one_language(tmp_path):
     for words, said in (("element O", "names Cl, Na"), ("nam O", "no selection")):
         with pytest.raises(InputError, match=said):
             select(salt, words)
-
-
-@pytest.mark.parametrize(("kind", "package"), [("GSD", "gsd"), ("H5MD_xvf", "h5py")])
-def test_a_format_whose_package_is_missing_names_it(kind, package):
-    try:
-        __import__(package)
-    except ImportError:
-        with pytest.raises(InputError, match=package):
-            open_trajectory(getattr(datafiles, kind), datafiles.TPR_xvf if kind == "H5MD_xvf" else None)
-    else:
-        topology = datafiles.TPR_xvf if kind == "H5MD_xvf" else None
-        trajectory = open_trajectory(getattr(datafiles, kind), topology)
-        universe = MDAnalysis.Universe(*(one for one in (topology, getattr(datafiles, kind)) if one))
-        np.testing.assert_array_equal(next(trajectory.frames()).positions, universe.trajectory[0].positions)
 
 
 def test_the_libraries_still_lose_what_mdnum_reads_itself(tmp_path):

@@ -53,15 +53,22 @@ def listed(found: Contacts, names: list) -> list[tuple]:
     ]
 
 
-@given(seeds)
+@given(seeds, st.integers(0, 6))
 @settings(max_examples=40)
-def test_every_stay_is_found_with_what_was_not_seen_of_it(seed: int) -> None:
+def test_every_stay_is_found_with_what_was_not_seen_of_it(seed: int, gap: int) -> None:
+    """And stays with short gaps between count as one where that is asked for."""
     inside, names, history = made(seed)
     assert listed(contacts(history), names) == stays(inside)
     assert not len(history.broken())
     kept = [row for row in range(len(names)) if inside[row].any()]
     assert [names.index(name) for name in zip(history.i, history.j, history.rank, strict=True)] == kept
     np.testing.assert_array_equal(history.last, inside[kept, -1])
+    filled = inside.copy()
+    for row in filled:
+        for one, following in itertools.pairwise(np.flatnonzero(row)):
+            if following - one - 1 <= gap:
+                row[one:following] = True
+    assert listed(mended(contacts(history), gap), names) == stays(filled)
 
 
 def test_pairs_too_many_to_pack_into_one_number_are_sorted_all_the_same() -> None:
@@ -74,26 +81,12 @@ def test_pairs_too_many_to_pack_into_one_number_are_sorted_all_the_same() -> Non
 def test_a_missing_flip_is_noticed() -> None:
     inside, names = random_membership(1)
     flips, first = ledger(inside, names)
-    keep = np.arange(len(flips)) != 7
-    history = History.of(flips[keep], first, inside.shape[1])
+    history = History.of(flips[np.arange(len(flips)) != 7], first, inside.shape[1])
     # unless it was the pair's last one, after which nothing contradicts
     gone = (int(flips.i[7]), int(flips.j[7]), int(flips.rank[7]))
     assert [(history.i[p], history.j[p], history.rank[p]) for p in history.broken()] == [gone]
     with pytest.raises(ValueError, match="missing"):
         contacts(history)
-
-
-@given(seeds, st.integers(0, 6))
-@settings(max_examples=30)
-def test_stays_with_short_gaps_between_count_as_one(seed: int, gap: int) -> None:
-    inside, names, history = made(seed)
-    filled = inside.copy()
-    for row in filled:
-        at = np.flatnonzero(row)
-        for one, following in itertools.pairwise(at):
-            if following - one - 1 <= gap:
-                row[one:following] = True
-    assert listed(mended(contacts(history), gap), names) == stays(filled)
 
 
 def test_no_pair_at_all_and_one_frame() -> None:
@@ -102,9 +95,8 @@ def test_no_pair_at_all_and_one_frame() -> None:
     found = Durations.of(contacts(history), 4)
     assert not len(contacts(history)) and mean_by_rate(found)[0] == np.inf
     assert survival(found).longest == 0 and survival(found).mean == 0
-    single = History.of(*ledger(np.ones((2, 1), bool), [(0, 1, 0), (0, 2, 0)]), 1)
-    (begin, end), only = (contacts(single).begin, contacts(single).end), contacts(single)
-    assert begin.tolist() == [0, 0] and end.tolist() == [1, 1]
+    only = contacts(History.of(*ledger(np.ones((2, 1), bool), [(0, 1, 0), (0, 2, 0)]), 1))
+    assert only.begin.tolist() == [0, 0] and only.end.tolist() == [1, 1]
     assert not only.began.any() and not only.ended.any()
 
 
@@ -139,153 +131,79 @@ def test_a_worked_example_of_survival() -> None:
     # Greenwood by hand: S(2)^2 (1/(5*4) + 2/(4*2))
     np.testing.assert_allclose(found.error[:2], [0.8 * (1 / 20) ** 0.5, 0.4 * (1 / 20 + 2 / 8) ** 0.5])
     assert found.mean == pytest.approx(1 + 0.8 + 2 * 0.4)
-
-
-def test_pairs_that_leave_at_a_constant_rate_are_given_that_rate_however_much_is_cut_off() -> None:
-    rng = np.random.default_rng(5)
-    inside = np.empty((4_000, 30), bool)
-    inside[:, 0] = rng.random(4_000) < 0.5
-    for frame in range(1, 30):
-        inside[:, frame] = np.where(inside[:, frame - 1], rng.random(4_000) > 0.05, rng.random(4_000) < 0.05)
-    names = [(i, i + 1, 0) for i in range(4_000)]
-    history = History.of(*ledger(inside, names), 30)
-    found = Durations.of(contacts(history), 30)
-    mean, error = mean_by_rate(found)
-    assert abs(mean - 20) < 4 * error and error < 0.6
-    left = survival(found)
-    assert (np.abs(left.share - 0.95**left.frames) < 4 * left.error).all() and left.error.max() < 0.025
-    # what a mean over finished stays would say is far off: that is why censoring has to be named
-    finished = found.seen @ np.arange(31) / found.seen.sum()
-    assert finished < 12
-    stay = residence(found, inside.sum(0))
-    np.testing.assert_allclose(stay[:20], 0.95 ** np.arange(20), atol=0.03)
+    # 4 leaves in 1 + 2 + 2 + 4 frames inside, and 2 more after which the last one was seen to stay
+    assert mean_by_rate(Durations(*counts)) == (11 / 4, 11 / 8)
 
 
 @given(seeds)
 @settings(max_examples=20)
 def test_residence_and_its_intermittent_counterpart_are_averages_over_all_origins(seed: int) -> None:
     inside, _, history = made(seed, frames=15)
-    found = contacts(history)
-    parts = Durations.of(found, history.frames)
-    pairs = inside.sum(0)
-    kept = residence(parts, pairs)
-    lags = np.arange(15)
-    both, once = again(found, lags, 15)
+    found, pairs = contacts(history), inside.sum(0)
+    kept = residence(Durations.of(found, history.frames), pairs)
+    both, once = again(found, np.arange(15), 15)
     for lag in range(15):
         origins = range(15 - lag)
-        whole = sum(int(inside[:, t : t + lag + 1].all(1).sum()) for t in origins)
         asked = sum(int(pairs[t]) for t in origins)
+        whole = sum(int(inside[:, t : t + lag + 1].all(1).sum()) for t in origins)
         assert kept[lag] == pytest.approx(whole / asked, abs=1e-12)
         assert both[lag] == sum(int((inside[:, t] & inside[:, t + lag]).sum()) for t in origins)
         assert once[lag] == asked
 
 
-def test_counts_of_parts_of_the_pairs_add_up_to_those_of_all() -> None:
-    inside, names, history = made(11)
-    whole = Durations.of(contacts(history), history.frames)
-    parts = [
-        Durations.of(contacts(History.of(*ledger(inside[part], [names[p] for p in part]), 25)), 25)
-        for part in (range(0, 30, 2), range(1, 30, 2))
-    ]
-    total = parts[0] + parts[1]
-    for name in ("seen", "goes_on", "older", "throughout"):
-        np.testing.assert_array_equal(getattr(total, name), getattr(whole, name))
-    assert total.exposure == sum(int(row[:-1].sum()) for row in inside)
-
-
-@given(seeds, st.booleans())
-@settings(max_examples=20)
-def test_flips_and_time_inside_by_class(seed: int, directed: bool) -> None:
+@given(seeds, st.booleans(), st.integers(1, 9))
+@settings(max_examples=30)
+def test_what_is_counted_of_pairs_is_what_plain_loops_count(seed: int, directed: bool, window: int) -> None:
+    """By class and group, by how soon a flip is reversed, by pair, by stride; and parts add up."""
     inside, names, history = made(seed)
     classes = np.random.default_rng(seed).integers(0, 3, 8)
-    found = ClassTally.of(contacts(history), Classes(classes, ["a", "b", "c"]), inside.shape[1], directed)
-    entered, left, time, exposed = Counter(), Counter(), Counter(), Counter()
-    for (i, j, _), row in zip(names, inside.astype(int), strict=True):
-        pair = (int(classes[i]), int(classes[j]))
-        key = pair if directed else tuple(sorted(pair))
-        entered[key] += int((np.diff(row) == 1).sum())
-        left[key] += int((np.diff(row) == -1).sum())
-        time[key] += int(row.sum())
-        exposed[key] += int(row[:-1].sum())
-    for a in range(3):
-        for b in range(3):
-            assert found.entered[a, b] == entered[a, b] and found.left[a, b] == left[a, b]
-            assert found.inside[a, b] == time[a, b] and found.exposure[a, b] == exposed[a, b]
-    assert np.isnan(found.mean_stay[found.left == 0]).all()
-
-
-@given(seeds, st.integers(1, 8))
-@settings(max_examples=20)
-def test_flips_taken_back_and_how_soon(seed: int, window: int) -> None:
-    inside, _, history = made(seed)
-    found = Chatter.of(history, window)
-    within, beyond, total = Counter(), Counter(), 0
-    for row in inside:
-        at = np.flatnonzero(np.diff(row.astype(int))) + 1
-        total += len(at)
-        for one, following in itertools.pairwise(at):
+    groups, frames, flips = Classes(classes, ["a", "b", "c"]), inside.shape[1], np.diff(inside.astype(int))
+    parts = [range(0, 30, 2), range(1, 30, 2)]
+    halves = [History.of(*ledger(inside[part], [names[p] for p in part]), frames) for part in parts]
+    found = ClassTally.of(contacts(history), groups, frames, directed)
+    entered, left, time, exposed = (np.zeros((3, 3), int) for _ in range(4))
+    grouped, within, beyond = np.zeros((2, 3), int), Counter(), Counter()
+    for (i, j, _), row, flipped in zip(names, inside.astype(int), flips, strict=True):
+        pair = (classes[i], classes[j]) if directed else tuple(sorted((classes[i], classes[j])))
+        entered[pair] += (flipped == 1).sum()
+        left[pair] += (flipped == -1).sum()
+        time[pair] += row.sum()
+        exposed[pair] += row[:-1].sum()
+        for group in {classes[i], classes[j]}:
+            grouped[int(classes[i] == classes[j]), group] += np.count_nonzero(flipped)
+        for one, following in itertools.pairwise(np.flatnonzero(flipped) + 1):
             (within if row[one] else beyond)[int(following - one)] += 1
-    assert found.flips == total and found.window == window
-    assert found.inside.tolist() == [within[n] for n in range(window + 1)]
-    assert found.outside.tolist() == [beyond[n] for n in range(window + 1)]
-    assert found.undone == sum(found.inside) + sum(found.outside)
-
-
-@given(seeds)
-@settings(max_examples=20)
-def test_the_busiest_pairs_are_the_same_from_parts(seed: int) -> None:
-    inside, names, whole = made(seed)
-    frames = inside.shape[1]
-    found = Busiest.of(whole, contacts(whole), 6)
-    expected = sorted(
-        (-int((np.diff(row.astype(int)) != 0).sum()), name, int(row.sum()))
-        for name, row in zip(names, inside, strict=True)
-    )[:6]
-    told = [
-        (-flips, (i, j, rank), time)
-        for i, j, rank, flips, time in zip(
-            found.i, found.j, found.rank, found.flips, found.inside, strict=True
-        )
-    ]
-    assert told == [row for row in expected if row[0]]
-    parts = []
-    for part in (range(0, 30, 2), range(1, 30, 2)):
-        one = History.of(*ledger(inside[part], [names[p] for p in part]), frames)
-        parts.append(Busiest.of(one, contacts(one), 6))
-    joined = (parts[0] + parts[1]).first(6)
-    for name in ("i", "j", "rank", "flips", "inside"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(found, name))
-
-
-def test_flips_of_groups_with_others_and_within() -> None:
-    inside, names, history = made(4)
-    residues = np.array([0, 0, 1, 1, 1, 2, 3, 3])
-    found = Residues.of(history, Classes(residues, ["r"] * 5))
-    expected = np.zeros((2, 5), int)
-    for (i, j, _), row in zip(names, inside, strict=True):
-        flips = int((np.diff(row.astype(int)) != 0).sum())
-        if residues[i] == residues[j]:
-            expected[1, residues[i]] += flips
-        else:
-            expected[0, residues[i]] += flips
-            expected[0, residues[j]] += flips
-    np.testing.assert_array_equal([found.between, found.within], expected)
+    np.testing.assert_array_equal([found.entered, found.left, found.inside], [entered, left, time])
+    np.testing.assert_array_equal(found.exposure, exposed)
+    assert np.isnan(found.mean_stay[found.left == 0]).all()
+    residues, chatter = Residues.of(history, groups), Chatter.of(history, window)
+    np.testing.assert_array_equal([residues.between, residues.within], grouped)
+    assert chatter.flips == np.count_nonzero(flips) and chatter.window == window
+    assert chatter.inside.tolist() == [within[n] for n in range(window + 1)]
+    assert chatter.outside.tolist() == [beyond[n] for n in range(window + 1)]
+    assert chatter.undone == sum(chatter.inside) + sum(chatter.outside)
+    busiest = Busiest.of(history, contacts(history), 40)
+    expected = sorted(zip((-(flips != 0).sum(1)).tolist(), names, inside.sum(1).tolist(), strict=True))
+    columns = (-busiest.flips, busiest.i, busiest.j, busiest.rank, busiest.inside)
+    told = list(zip(*(column.tolist() for column in columns), strict=True))
+    assert told == [(less, *name, there) for less, name, there in expected if less]
+    one, other = (Busiest.of(half, contacts(half), 40) for half in halves)
+    assert (one + other).first(40).equals(busiest)
+    strides = Strides.of_history(history, [1, window])
+    assert strides.flips[1] == flips_of(inside[:, ::window])
+    assert strides.of[1] == flips_of(inside[:, : (frames - 1) // window * window + 1])
+    assert strides.flips[0] == strides.of[0] == flips_of(inside)
+    durations = [Durations.of(contacts(one), frames) for one in (history, *halves)]
+    total, halved = durations[0], durations[1] + durations[2]
+    for name in ("seen", "goes_on", "older", "throughout"):
+        np.testing.assert_array_equal(getattr(halved, name), getattr(total, name))
+    assert halved.exposure == exposed.sum()
+    several = [Strides.of_history(one, [1, window]) for one in halves]
+    np.testing.assert_array_equal((several[0] + several[1]).flips, strides.flips)
 
 
 def flips_of(inside: np.ndarray) -> int:
     return int((np.diff(inside.astype(int), axis=1) != 0).sum())
-
-
-@given(st.integers(0, 10**6), st.integers(1, 9))
-@settings(max_examples=30)
-def test_flips_of_every_so_manieth_frame(seed: int, stride: int) -> None:
-    inside, _, history = made(seed)
-    found = Strides.of_history(history, [1, stride])
-    assert found.flips[1] == flips_of(inside[:, ::stride])
-    assert found.of[1] == flips_of(inside[:, : (inside.shape[1] - 1) // stride * stride + 1])
-    assert found.flips[0] == found.of[0] == flips_of(inside)
-    doubled = found + found
-    np.testing.assert_array_equal(doubled.flips, 2 * found.flips)
 
 
 def test_strides_leave_four_intervals() -> None:

@@ -1,4 +1,4 @@
-"""Flips between frames are the differences of what brute force finds at each, however they were found."""
+"""Decisions and flips over frames are those of brute force, however they were found."""
 
 from __future__ import annotations
 
@@ -7,79 +7,97 @@ import pickle
 import tracemalloc
 
 import numpy as np
+import oracles
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trajectories import brute_force
-from trajectories.brute_force import atoms, boxes
+from trajectories.brute_force import PERIODIC, as_dict, atoms, boxes, cube, differences, rows, same
 from trajectories.files import arrays_held
 
 from mdnum.errors import InputError
 from mdnum.trajectories import superset
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.ledger import FlipTable
-from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, SpeciesCutoffs
+from mdnum.trajectories.rules import NEVER, Capped, CutoffRule, Nearest, SpeciesCutoffs
 from mdnum.trajectories.tracker import HORIZON, Tracker
 
-PERIODIC = np.ones(3, bool)
+BOUND = 0.05
 
 
-def rows(flips: FlipTable) -> list:
-    columns = (flips.i, flips.j, flips.rank, flips.entered)
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def differences(before: dict, now: dict) -> list:
-    entered = [(*key, True) for key in now.keys() - before.keys()]
-    left = [(*key, False) for key in before.keys() - now.keys()]
-    return sorted(entered + left)
-
-
-@settings(max_examples=25)
-@given(st.data(), st.sampled_from([0.01, 0.3, 5.0]))
-def test_flips_are_differences_of_brute_force(data, step):
+@pytest.mark.parametrize("by_species", [False, True])
+@settings(max_examples=60)
+@given(data=st.data(), step=st.sampled_from([0.01, 0.3, 5.0]), radius=st.floats(0.5, 4.0))
+def test_pairs_and_flips_of_a_radius(by_species, data, step, radius):
+    """In any box, images and all; a radius for all, or for pairs of species between two sides."""
     box = data.draw(boxes())
     x = data.draw(atoms(box))
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
-    radius, everyone = 2.0, range(len(x))
-    tracker, before, old = Tracker(CutoffRule(radius), bound=0.01), None, x
+    sides, species, radii = (None, None), ["X"] * len(x), {("X", "X"): radius}
+    if by_species:
+        x = np.concatenate([x, rng.uniform(-3, 3, (2, 3))])
+        species = [*rng.choice(["O", "H", "N"], len(x) - 2).tolist(), "O", "H"]
+        radii = {("O", "H"): 2.5, ("O", "O"): 1.5}
+        sides = tuple(rng.permutation(len(x))[: rng.integers(0, len(x) + 1)] for _ in range(2))
+    chosen = [range(len(x)) if side is None else set(side.tolist()) for side in sides]
+    reach = max(radii.values())
+
+    def radius_of(i, j):
+        return radii.get((species[i], species[j]), radii.get((species[j], species[i])))
+
+    rule = SpeciesCutoffs(radii) if by_species else CutoffRule(radius)
+    tracker, before, old = Tracker(rule, *sides, species, BOUND), None, x
     for frame in range(3):
         flips = tracker.step(Frame(frame, 0.0, x, box))
-        pairs = brute_force.everything(x, box.matrix, box.pbc, everyone, everyone, 1.1 * radius)
-        assume(brute_force.clear(pairs, lambda i, j: radius))
-        now = brute_force.members(pairs, lambda i, j: radius)
-        assert rows(flips) == (differences(before, now) if before is not None else [])
+        pairs = brute_force.everything(x, box.matrix, box.pbc, *chosen, 1.1 * reach)
+        assume(brute_force.clear(pairs, radius_of))
+        now = brute_force.members(pairs, radius_of)
+        same(as_dict(tracker.members()), now)
+        assert rows(flips) == differences(before, now)
         for at, (i, j, rank, entered) in enumerate(rows(flips)):
-            held, distance = (now, flips.distance) if entered else (before, flips.before)
-            assert distance[at] == pytest.approx(held[i, j, rank], abs=1e-9)
+            held, there, gone = (now, flips.distance, flips.before) if entered else (
+                before, flips.before, flips.distance
+            )  # fmt: skip
+            assert there[at] == pytest.approx(held[i, j, rank], abs=1e-9)
             other = brute_force.image_list(old if entered else x, box.matrix, box.pbc, i, j, 8.0)
             if len(other) > rank:
-                beyond = flips.before[at] if entered else flips.distance[at]
-                assert beyond == pytest.approx(np.sqrt(other[rank]), abs=1e-9)
-        assert flips.margin == pytest.approx(radius - flips.distance)
-        assert flips.margin_before == pytest.approx(radius - flips.before)
+                assert gone[at] == pytest.approx(np.sqrt(other[rank]), abs=1e-9)
+        limits = np.array([radius_of(i, j) for i, j, *_ in rows(flips)])
+        assert flips.margin == pytest.approx(limits - flips.distance)
+        assert flips.margin_before == pytest.approx(limits - flips.before)
         close = np.minimum(abs(flips.margin), abs(flips.margin_before)) <= flips.bound
-        assert (flips.ambiguous == close).all() and (flips.bound >= 0.01).all()
+        assert (flips.ambiguous == close).all() and (flips.bound >= BOUND).all()
         assert tracker.pairs == len(now) and tracker.frames == frame + 1
+        known = {pair: squares for pair, squares in pairs.items() if radius_of(*pair)}
+        margins = np.array(
+            [abs(radius_of(*p) - np.sqrt(one)) for p, squares in known.items() for one in squares]
+        )
+        if (abs(margins - BOUND) > 1e-9).all():
+            assert tracker.near == (margins <= BOUND).sum()
+        smallest = margins.min(initial=np.inf)
+        if abs(smallest - HORIZON * reach) > 1e-3 * HORIZON * reach:
+            smallest = smallest if smallest < HORIZON * reach else np.inf
+            assert tracker.min_margin == pytest.approx(smallest, abs=1e-9)
         before, old = now, x
         # wrapped by the code that wrote it, or not
         x = x + rng.normal(size=x.shape) * step
         x = x + rng.integers(-1, 2, x.shape) @ np.where(box.pbc[:, None], box.matrix, 0.0)
 
 
-@settings(max_examples=20)
-@given(st.data(), st.booleans())
-def test_flips_of_the_nearest_few(data, capped):
+@settings(max_examples=40)
+@given(st.data(), st.integers(1, 6), st.booleans())
+def test_pairs_and_flips_of_the_nearest_few(data, most, capped):
     box = data.draw(boxes())
-    x = data.draw(atoms(box, 8))
+    x = data.draw(atoms(box))
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
-    everyone, before, limits = range(len(x)), None, {}
-    tracker = Tracker(Capped(2.5, 3) if capped else Nearest(3, 2.5))
+    sides = [np.sort(rng.permutation(len(x))[: rng.integers(0, len(x) + 1)]) for _ in range(2)]
+    tracker, before, limits = Tracker(Capped(2.5, most) if capped else Nearest(most, 2.5), *sides), None, {}
     for frame in range(3):
         flips = tracker.step(Frame(frame, 0.0, x, box))
-        now, new, clearly = brute_force.nearest(x, box.matrix, box.pbc, everyone, everyone, 3, 2.5, 3.2)
+        now, new, clearly = brute_force.nearest(x, box.matrix, box.pbc, *sides, most, 2.5, 3.2)
         assume(clearly)
-        assert rows(flips) == (differences(before, now) if before is not None else [])
+        same(as_dict(tracker.members()), now)
+        assert rows(flips) == differences(before, now)
         for at, (i, _, _, entered) in enumerate(rows(flips)):
             last, after = new[i]
             assert flips.margin[at] == pytest.approx((after if entered else last) - flips.distance[at])
@@ -89,100 +107,100 @@ def test_flips_of_the_nearest_few(data, capped):
         x = x + rng.normal(size=x.shape) * 0.2
 
 
-class Oracle:
-    """Minimum-image distances of all pairs in a wide box, in plain numpy."""
-
-    def __init__(self, radius):
-        self.radius, self.before = radius, None
-
-    def look(self, x, matrix, bound):
-        """(flips, pairs inside, pairs in doubt, smallest |margin|)."""
-        i, j = np.triu_indices(len(x), 1)
-        d = x[j] - x[i]
-        d = d - np.rint(d @ np.linalg.inv(matrix)) @ matrix
-        r = np.sqrt((d * d).sum(axis=1))
-        inside = r < self.radius
-        flips = []
-        if self.before is not None:
-            k = np.flatnonzero(inside != self.before)
-            flips = list(zip(i[k].tolist(), j[k].tolist(), [0] * len(k), inside[k].tolist(), strict=True))
-        self.before = inside
-        margins = abs(self.radius - r)
-        return flips, int(inside.sum()), int((margins <= bound).sum()), float(margins.min())
+@pytest.mark.parametrize("periodic", [True, False])
+def test_the_nearest_without_a_radius(periodic):
+    rng, everyone = np.random.default_rng(1), range(40)
+    x = rng.uniform(0, 12, (40, 3))
+    # far from all others: the first radius tried holds nobody
+    x[5] += 3.0 if periodic else 400.0
+    box, reach = Box(np.eye(3) * 12.0, np.full(3, periodic)), 11.0 if periodic else 2000.0
+    tracker = Tracker(Nearest(4))
+    tracker.step(Frame(0, 0.0, x, box))
+    right, limits, _ = brute_force.nearest(x, box.matrix, box.pbc, everyone, everyone, 4, np.inf, reach)
+    same(as_dict(tracker.members()), right)
+    assert tracker.min_margin == pytest.approx(min(after - last for last, after in limits.values()))
+    # fewer others than asked for: all of them, and nothing that could replace one
+    tracker = Tracker(Nearest(4), first=[0, 1, 2])
+    tracker.step(Frame(0, 0.0, x, Box()))
+    assert tracker.pairs == 6 and tracker.min_margin == np.inf
 
 
-def wrapped(x, matrix, rng):
-    return x + rng.integers(-1, 2, x.shape) @ matrix
+def test_a_neighbor_under_a_cap_stays_one_no_further_than_the_radius():
+    # the next outside is beyond the radius, so the radius is what this one has to pass to leave
+    x = np.array([[0.0, 0, 0], [2.5, 0, 0], [0, 2.01, 0]])
+    tracker = Tracker(Capped(2.0, 1), first=[0], second=[1, 2])
+    tracker.step(Frame(0, 0.0, x, Box()))
+    x[1, 0] = 1.5
+    flips = tracker.step(Frame(1, 0.0, x, Box()))
+    assert rows(flips) == [(0, 1, 0, True)]
+    assert (flips.margin, flips.margin_before) == (pytest.approx([0.5]), pytest.approx([-0.5]))
 
 
-def head_on(x, matrix, k, rng):
+def test_a_tie_for_the_last_place_is_in_doubt():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 2, 0]])
+    tracker = Tracker(Capped(5.0, 1), first=[0], second=[1, 2, 3])
+    tracker.step(Frame(0, 0.0, x, Box()))
+    assert set(as_dict(tracker.members())) == {(0, 1, 0)} and tracker.near == 2 and tracker.min_margin == 0.0
+    # and its flip is called ambiguous, either way
+    x[2] += [1e-17, 1e-9, 0]
+    assert len(tracker.step(Frame(1, 1.0, x, Box()))) == 0
+    x[1, 0] = 1.5
+    flips = tracker.step(Frame(2, 2.0, x, Box()))
+    assert rows(flips) == [(0, 1, 0, False), (0, 2, 0, True)]
+    assert flips.ambiguous.all() and flips.margin == pytest.approx([-0.5, 0.5])
+
+
+# ---- lists that are kept from frame to frame
+
+
+def shifted(x, where, by):
+    moved = x.copy()
+    moved[where] += by
+    return moved
+
+
+STRAIN = np.eye(3) + np.array([[-0.004, 0.002, 0], [0, 0.003, -0.001], [0.001, 0, -0.004]])
+#: The next positions and box from those of a frame k and displacements drawn at random.
+MOVERS = {
     # two atoms run at one another at the same speed, all others rest
-    moved = x.copy()
-    moved[0, 0] += 0.03
-    moved[1, 0] -= 0.03
-    return moved, matrix
-
-
-def drift(x, matrix, k, rng):
-    return x + np.array([0.03, -0.02, 0.01]), matrix
-
-
-def one_fast(x, matrix, k, rng):
-    moved = x.copy()
-    moved[3] += 0.04 if k % 9 else 1.5
-    return moved, matrix
-
-
-def jitter(x, matrix, k, rng):
-    return x + rng.normal(size=x.shape) * 0.01, matrix
-
-
-def strained(x, matrix, k, rng):
+    "head on": lambda x, m, k, drawn, rng: (shifted(shifted(x, (0, 0), 0.03), (1, 0), -0.03), m),
+    "drift": lambda x, m, k, drawn, rng: (x + np.array([0.03, -0.02, 0.01]), m),
+    "one fast": lambda x, m, k, drawn, rng: (shifted(x, 3, 0.04 if k % 9 else 1.5), m),
+    "jitter": lambda x, m, k, drawn, rng: (x + drawn, m),
     # fractional coordinates rest: nothing but the box moves
-    strain = np.eye(3) + np.array([[-0.004, 0.002, 0], [0, 0.003, -0.001], [0.001, 0, -0.004]])
-    return x @ strain, matrix @ strain
-
-
-def wrapping(x, matrix, k, rng):
-    moved = x + rng.normal(size=x.shape) * 0.01
-    return (wrapped(moved, matrix, rng) if k % 3 == 0 else moved), matrix
-
-
-def resting(x, matrix, k, rng):
-    return x, matrix
-
-
-def reduced_anew(x, matrix, k, rng):
+    "strained": lambda x, m, k, drawn, rng: (x @ STRAIN, m @ STRAIN),
+    "wrapping": lambda x, m, k, drawn, rng: (x + drawn + (k % 3 == 0) * rng.integers(-1, 2, x.shape) @ m, m),
+    "resting": lambda x, m, k, drawn, rng: (x, m),
     # the same lattice with another vector from the middle on
-    moved = x + rng.normal(size=x.shape) * 0.01
-    if k == 15:
-        matrix = matrix + np.array([[0, 0, 0], [0, 0, 0], [2.0, 0, 0]]) @ matrix
-    return moved, matrix
-
-
-MOVERS = [head_on, drift, one_fast, jitter, strained, wrapping, resting, reduced_anew]
+    "reduced again": lambda x, m, k, drawn, rng: (x + drawn, shifted(m, 2, (k == 15) * 2.0 * m[0])),
+}
 MATRIX = np.array([[11.0, 0, 0], [2.0, 10.5, 0], [-1.0, 3.0, 10.0]])
 
 
-@pytest.mark.parametrize("mover", MOVERS, ids=lambda mover: mover.__name__)
+@pytest.mark.parametrize("mover", MOVERS)
 @pytest.mark.parametrize("bound", [0.0, 0.03])
 def test_a_list_in_use_misses_nothing(mover, bound):
     rng = np.random.default_rng(7)
-    x, matrix, radius = rng.uniform(0, 1, (150, 3)) @ MATRIX, MATRIX, 2.2
+    x, matrix, radius, before = rng.uniform(0, 1, (150, 3)) @ MATRIX, MATRIX, 2.2, None
     x[1] = x[0] + [3.4, 0.01, 0.0]
-    tracker, oracle, used, flipped = Tracker(CutoffRule(radius), bound=bound), Oracle(radius), 0, 0
+    tracker, used, flipped = Tracker(CutoffRule(radius), bound=bound), 0, 0
     for k in range(30):
         held = tracker._list
         flips = tracker.step(Frame(k, 0.0, x, Box(matrix, PERIODIC)))
-        right, inside, doubts, smallest = oracle.look(x, matrix, bound)
-        assert rows(flips) == right
-        assert tracker.pairs == inside and (bound == 0.0 or tracker.near == doubts)
+        i, j, d = oracles.all_pairs(x, matrix, PERIODIC)
+        r = np.sqrt((d * d).sum(axis=1))
+        now = {(*pair, 0): 0.0 for pair in np.transpose([i, j])[r < radius].tolist()}
+        margins = abs(radius - r)
+        assert rows(flips) == differences(before, now)
+        assert tracker.pairs == len(now) and (bound == 0.0 or tracker.near == (margins <= bound).sum())
+        smallest = margins.min()
         assert tracker.min_margin == pytest.approx(smallest if smallest <= HORIZON * radius else np.inf)
         used += held is not None and (tracker._list is held or held.gone > 0)
         flipped += len(flips)
-        x, matrix = mover(x, matrix, k, rng)
+        before = now
+        x, matrix = MOVERS[mover](x, matrix, k, rng.normal(size=x.shape) * 0.01, rng)
     # it was the list that answered, most of the time
-    assert used > 18 and (flipped > 0 or mover is drift or mover is resting)
+    assert used > 18 and (flipped > 0 or mover in ("drift", "resting"))
 
 
 def test_a_box_that_becomes_too_narrow_for_a_list():
@@ -195,7 +213,7 @@ def test_a_box_that_becomes_too_narrow_for_a_list():
         flips = tracker.step(Frame(k, 0.0, x, Box(matrix, PERIODIC)))
         pairs = brute_force.everything(x, matrix, PERIODIC, everyone, everyone, 1.05 * radius)
         now = brute_force.members(pairs, lambda i, j: radius)
-        assert rows(flips) == (differences(before, now) if before is not None else [])
+        assert rows(flips) == differences(before, now)
         used.append(tracker._list is not None)
         before, x = now, x + rng.normal(size=x.shape) * 0.005
     assert all(used[2:10]) and not any(used[10:]) and any(rank for _, _, rank in now)
@@ -206,7 +224,7 @@ def test_the_nearest_miss_is_found_though_only_another_pair_is_due():
     x = np.array([[0.0, 0, 0], [1.95, 0, 0], [0, 8, 0], [1.97, 8, 0], [6, 5, 5]])
     tracker, used = Tracker(CutoffRule(2.0)), 0
     for k in range(40):
-        tracker.step(Frame(k, 0.0, x, Box(np.eye(3) * 20.0, PERIODIC)))
+        tracker.step(Frame(k, 0.0, x, cube(20.0)))
         used += tracker._list is not None
         assert tracker.min_margin == pytest.approx(0.03)
         x[4, 2] += 0.01
@@ -229,10 +247,8 @@ def test_a_list_and_a_fresh_search_tell_the_same_to_the_last_bit(monkeypatch):
         made = []
         for rule, first, second in rules:
             tracker = Tracker(rule, first, second, species, 0.01)
-            parts = [
-                tracker.step(Frame(k, 0.0, x, Box(np.eye(3) * 10, PERIODIC))) for k, x in enumerate(frames)
-            ]
-            made.append((FlipTable.concatenate(parts), tracker.near, tracker.min_margin, tracker.members()))
+            flips = [tracker.step(Frame(k, 0.0, x, cube(10.0))) for k, x in enumerate(frames)]
+            made.append((FlipTable.concatenate(flips), tracker.members(), tracker.near, tracker.min_margin))
             lists.append(tracker._list is not None)
         return made
 
@@ -242,34 +258,17 @@ def test_a_list_and_a_fresh_search_tell_the_same_to_the_last_bit(monkeypatch):
     fresh = follow()
     assert lists == [True] * 3 + [False] * 3
     for one, other in zip(listed, fresh, strict=True):
-        assert len(one[0]) > 50 and one[1:3] == other[1:3]
-        for a, b in ((one[0], other[0]), (one[3], other[3])):
-            for name in vars(a):
-                assert np.array_equal(getattr(a, name), getattr(b, name)), name
-
-
-@pytest.mark.parametrize("rule", [CutoffRule(2.0), Nearest(4), Capped(2.0, 5)], ids=lambda rule: rule.name)
-def test_a_tracker_can_be_sent_to_another_process(rule):
-    rng = np.random.default_rng(1)
-    x, box = rng.uniform(0, 9, (80, 3)), Box(np.eye(3) * 9.0, PERIODIC)
-    tracker = Tracker(rule)
-    for k in range(12):
-        if k == 6:
-            copy = pickle.loads(pickle.dumps(tracker))
-        flips = tracker.step(Frame(k, 0.0, x, box))
-        if k >= 6:
-            assert rows(copy.step(Frame(k, 0.0, x, box))) == rows(flips)
-        x = x + rng.normal(size=x.shape) * 0.02
-    assert copy.pairs == tracker.pairs
+        assert len(one[0]) > 50 and one[2:] == other[2:]
+        assert one[0].equals(other[0]) and one[1].equals(other[1])
 
 
 def test_memory_does_not_grow_with_frames():
     rng = np.random.default_rng(1)
-    x, box = rng.uniform(0, 12, (200, 3)), Box(np.eye(3) * 12.0, PERIODIC)
+    x = rng.uniform(0, 12, (200, 3))
     tracker, arrays, whole = Tracker(CutoffRule(2.0)), [], []
     tracemalloc.start()
     for k in range(80):
-        tracker.step(Frame(k, 0.0, x, box))
+        tracker.step(Frame(k, 0.0, x, cube(12.0)))
         x = (x + rng.normal(size=x.shape) * (0.01 if k % 20 else 0.3)) % 12.0
         if k % 40 == 39:
             gc.collect()
@@ -281,53 +280,97 @@ def test_memory_does_not_grow_with_frames():
         assert last < first + 10 * x.nbytes
 
 
+@pytest.mark.parametrize("rule", [CutoffRule(2.0), Nearest(4), Capped(2.0, 5)], ids=lambda rule: rule.name)
+def test_a_tracker_can_be_sent_to_another_process(rule):
+    rng = np.random.default_rng(1)
+    x, tracker, sent = rng.uniform(0, 9, (80, 3)), Tracker(rule), None
+    for k in range(12):
+        sent = pickle.loads(pickle.dumps(tracker)) if k == 6 else sent
+        flips = tracker.step(Frame(k, 0.0, x, cube(9.0)))
+        assert sent is None or sent.step(Frame(k, 0.0, x, cube(9.0))).equals(flips)
+        x = x + rng.normal(size=x.shape) * 0.02
+    assert sent is not None and sent.pairs == tracker.pairs
+
+
+# ---- boxes, bounds and atoms that change, and what is refused
+
+
 def test_a_box_may_come_and_go_and_a_bound_may_change():
     x = np.array([[0.5, 5, 5], [9.5, 5, 5], [3.0, 5, 5]])
     tracker = Tracker(CutoffRule(2.0))
-    box = Box(np.eye(3) * 10.0, PERIODIC)
-    tracker.step(Frame(0, 0.0, x, box))
+    tracker.step(Frame(0, 0.0, x, cube(10.0)))
     flips = tracker.step(Frame(1, 1.0, x, Box()))
     assert rows(flips) == [(0, 1, 0, False)] and flips.distance[0] == 9.0 and flips.before[0] == 1.0
-    flips = tracker.step(Frame(2, 2.0, x, box), bound=1.5)
+    flips = tracker.step(Frame(2, 2.0, x, cube(10.0)), bound=1.5)
     assert rows(flips) == [(0, 1, 0, True)] and flips.ambiguous.all() and flips.frame[0] == 2
     assert tracker.bound == 1.5 and tracker.near == 3
 
 
 def test_images_of_an_atom_itself_come_and_go_with_the_box():
-    x = np.array([[0.0, 0, 0], [1.0, 1.0, 1.0]])
-    tracker = Tracker(CutoffRule(3.0))
-    tracker.step(Frame(0, 0.0, x, Box(np.diag([3.1, 7.0, 7.0]), PERIODIC)))
-    flips = tracker.step(Frame(1, 0.0, x, Box(np.diag([2.9, 7.0, 7.0]), PERIODIC)))
-    assert [row for row in rows(flips) if row[0] == row[1]] == [(0, 0, 0, True), (1, 1, 0, True)]
-    flips = tracker.step(Frame(2, 0.0, x, Box(np.diag([1.4, 7.0, 7.0]), PERIODIC)))
-    assert [row[2] for row in rows(flips) if row[0] == row[1] == 0] == [1]
-    flips = tracker.step(Frame(3, 0.0, x, Box(np.diag([9.0, 7.0, 7.0]), PERIODIC)))
-    assert [row[2:] for row in rows(flips) if row[:2] == (1, 1)] == [(0, False), (1, False)]
+    tracker, own = Tracker(CutoffRule(3.0)), []
+    for frame, edge in enumerate((3.1, 2.9, 1.4, 9.0)):
+        box = Box(np.diag([edge, 7.0, 7.0]), PERIODIC)
+        flips = tracker.step(Frame(frame, 0.0, np.array([[0.0, 0, 0], [1.0, 1.0, 1.0]]), box))
+        own.append([row[1:] for row in rows(flips) if row[0] == row[1]])
+    assert own == [
+        [],
+        [(0, 0, True), (1, 0, True)],
+        [(0, 1, True), (1, 1, True)],
+        [(0, 0, False), (0, 1, False), (1, 0, False), (1, 1, False)],
+    ]
 
 
 def test_positions_that_are_no_numbers():
     x, box = np.zeros((4, 3)), Box()
     tracker = Tracker(CutoffRule(2.0), first=[1, 3])
     tracker.step(Frame(0, 0.0, x, box))
-    broken = x.copy()
-    broken[3, 1] = np.nan
+    broken = shifted(x, (3, 1), np.nan)
     with pytest.raises(InputError, match=r"frame 17: atom 3 is at \[0.0, nan, 0.0\]"):
         tracker.step(Frame(17, 0.0, broken, box))
     # what was read before is still there, and an atom that takes no part may be anywhere
     assert tracker.frames == 1 and tracker.pairs == 1
-    broken[3, 1], broken[2, 0] = 0.0, np.inf
-    assert len(tracker.step(Frame(18, 0.0, broken, box))) == 0
+    assert len(tracker.step(Frame(18, 0.0, shifted(x, (2, 0), np.inf), box))) == 0
     with pytest.raises(InputError, match="5 atoms, 4 in the frames before"):
         tracker.step(Frame(19, 0.0, np.zeros((5, 3)), box))
 
 
-def test_selections_that_are_none():
-    for chosen, says in (([0, 4], "atom 4 is selected"), ([-1, 2], "whole numbers")):
-        with pytest.raises(InputError, match=says):
-            Tracker(CutoffRule(1.0), first=np.array(chosen)).step(Frame(0, 0.0, np.zeros((4, 3)), Box()))
-    with pytest.raises(InputError, match="3 species for frames of 4 atoms"):
-        Tracker(CutoffRule(1.0), species=["O"] * 3).step(Frame(0, 0.0, np.zeros((4, 3)), Box()))
-    for chosen in ([], [2]):
-        tracker = Tracker(CutoffRule(1.0), first=np.array(chosen, int))
-        assert len(tracker.step(Frame(0, 0.0, np.zeros((4, 3)), Box()))) == 0
-        assert len(tracker.step(Frame(1, 0.0, np.ones((4, 3)), Box()))) == 0 == len(tracker.members())
+def test_species_cutoffs_are_the_same_in_both_directions():
+    kinds, radii = SpeciesCutoffs({("O", "H"): 2.5, ("O", "O"): 3.5}).table(["O", "H", "H", "Na"])
+    assert radii[kinds[0], kinds[1]] == radii[kinds[2], kinds[0]] == 2.5
+    assert radii[kinds[1], kinds[2]] == radii[kinds[3], kinds[0]] == NEVER
+
+
+def first_of_four(chosen, **options):
+    return Tracker(CutoffRule(1.0), np.array(chosen, int), **options).step(
+        Frame(0, 0.0, np.zeros((4, 3)), Box())
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        *((lambda r=r: CutoffRule(r), "positive length") for r in (0.0, -1.0, np.nan, np.inf)),
+        (lambda: Capped(-1.0, 3), "positive length"),
+        (lambda: SpeciesCutoffs({("O", "H"): np.nan}), "positive length"),
+        (lambda: Nearest(2, 0.0), "positive length"),
+        *((lambda k=k: Nearest(k), "whole number") for k in (0, -1, True)),
+        (lambda: Capped(1.0, 0), "whole number"),
+        (lambda: SpeciesCutoffs({("O", "H"): 2.5, ("H", "O"): 2.6}), "two radii"),
+        (lambda: SpeciesCutoffs({}), "no pair"),
+        (lambda: SpeciesCutoffs({("Ow", "H"): 2.5}).table(["O", "H"]), "no atom is of species 'Ow'"),
+        (lambda: Tracker(SpeciesCutoffs({("O", "H"): 2.5})), "which species"),
+        (lambda: first_of_four([0, 4]), "atom 4 is selected"),
+        (lambda: first_of_four([-1, 2]), "whole numbers"),
+        (lambda: first_of_four([0], species=["O"] * 3), "3 species for frames of 4 atoms"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("chosen", [[], [2]])
+def test_nobody_and_one_atom_have_no_pairs(chosen):
+    tracker = Tracker(CutoffRule(1.0), first=np.array(chosen, int))
+    flips = [tracker.step(Frame(k, 0.0, np.full((4, 3), float(k)), Box())) for k in range(2)]
+    assert [len(one) for one in flips] == [0, 0] and len(tracker.members()) == 0

@@ -131,13 +131,10 @@ def _only_molecules(subject: CalculatorSubject) -> bool:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """Two runs and where their energy went.
-
-    Attributes:
-        whole, half: the run, and the one with half its time step.
-    """
+    """Two runs and where their energy went."""
 
     subject: CalculatorSubject
+    # whole, half: the run, and the one with half its time step
     whole: NveRun
     half: NveRun
     balance: EnergyBalance  # of the run
@@ -466,11 +463,9 @@ class RigidGroups:
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
-
-    Attributes:
-        first, second: atoms of each bond, a row for each bond of a group.
     """
 
+    # first, second: atoms of each bond, a row for each bond of a group
     first: Int[np.ndarray, "bonds groups"]
     second: Int[np.ndarray, "bonds groups"]
     lengths: Float[np.ndarray, "bonds groups"]  # Å

@@ -153,12 +153,7 @@ class StateCheck(AuditCheck):
 
 @dataclass
 class Comparison:
-    """An answer of an object in use, beside that of a new one.
-
-    Attributes:
-        energy, force: by which the answers differ, eV and eV/Å; infinite where the object in use
-            fails alone.
-    """
+    """An answer of an object in use, beside that of a new one."""
 
     sequence: str  # in which it was asked
     what: str  # happened to the structure
@@ -167,6 +162,7 @@ class Comparison:
     old: Answered
     new: Answered
     broken: bool  # whether it had failed then, and fails since
+    # energy, force: by which the answers differ, eV and eV/Å; infinite where the object in use fails alone
     energy: float = 0.0
     force: float = 0.0
     allowed: float = 0.0  # of the energy, eV

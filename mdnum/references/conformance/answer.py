@@ -28,19 +28,15 @@ class Malformed(Exception):
 
 @dataclass(frozen=True)
 class ListAnswer:
-    """The rows that a list gave.
+    """The rows that a list gave."""
 
-    Attributes:
-        i, j: atoms, shape (rows,).
-        shift: lattice vectors added to atom j, integers of shape (rows, 3); None where it has none.
-        distance: length, shape (rows,); None where it has none.
-        vector: x_j - x_i of the image, length, shape (rows, 3); None where it has none.
-    """
-
+    # i, j: atoms, shape (rows,)
     i: np.ndarray
     j: np.ndarray
+    # lattice vectors added to atom j, integers of shape (rows, 3); None where it has none
     shift: np.ndarray | None = None
-    distance: np.ndarray | None = None
+    distance: np.ndarray | None = None  # length, shape (rows,); None where it has none
+    # x_j - x_i of the image, length, shape (rows, 3); None where it has none
     vector: np.ndarray | None = None
 
     def __len__(self) -> int:

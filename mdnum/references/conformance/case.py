@@ -64,19 +64,12 @@ Length = Annotated[FiniteFloat, Ge(0)]
 
 @dataclass(frozen=True)
 class Still:
-    """Where the atoms are at one moment.
+    """Where the atoms are at one moment."""
 
-    Attributes:
-        positions: length, shape (atoms, 3).
-        cell: lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite.
-        fresh: a list that is kept is allocated here, rather than updated.
-        skin: that it is allocated with, length; None for that of the case.
-    """
-
-    positions: Rows
-    cell: Vectors
-    fresh: StrictBool = False
-    skin: Length | None = None
+    positions: Rows  # length, shape (atoms, 3)
+    cell: Vectors  # lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite
+    fresh: StrictBool = False  # a list that is kept is allocated here, rather than updated
+    skin: Length | None = None  # that it is allocated with, length; None for that of the case
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "positions", _rows(self.positions))
@@ -85,29 +78,19 @@ class Still:
 
 @dataclass(frozen=True)
 class Case:
-    """Atoms in a box at one moment or several, a cutoff, and what is to be learned from them.
+    """Atoms in a box at one moment or several, a cutoff, and what is to be learned from them."""
 
-    Attributes:
-        name: what is special, in words.
-        area: a key of `AREAS`.
-        stills: one for a list that is asked once; the steps of a sequence for one that is kept.
-        pbc: which axes repeat.
-        r_cut: cutoff, length.
-        skin: of a list that is kept, length; the largest where it changes.
-        known: the pairs of a single still where they are known without a search.
-        motions: how many of its steps bring a pair from beyond the list to inside the cutoff (`rule`).
-    """
-
-    name: str
-    area: str
+    name: str  # what is special, in words
+    area: str  # a key of `AREAS`
+    # one for a list that is asked once; the steps of a sequence for one that is kept
     stills: tuple[Still, ...]
-    pbc: Pbc
-    r_cut: Length
-    skin: Length = 0.0
+    pbc: Pbc  # which axes repeat
+    r_cut: Length  # cutoff, length
+    skin: Length = 0.0  # of a list that is kept, length; the largest where it changes
     known: Annotated[PairSet | None, PlainValidator(lambda pairs: pairs)] = field(
         default=None, repr=False, compare=False
-    )
-    motions: int = 0
+    )  # the pairs of a single still where they are known without a search
+    motions: int = 0  # how many of its steps bring a pair from beyond the list to inside the cutoff (`rule`)
 
     @property
     def atoms(self) -> int:

@@ -34,23 +34,17 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Pairs in and around the cutoff at one still, out to the reach that was asked for.
+    """Pairs in and around the cutoff at one still, out to the reach that was asked for."""
 
-    Attributes:
-        positions, cell: as the list was given them; rows of axes that do not repeat are zero.
-        tie: the pairs at exactly r_cut.
-        r_cut: length.
-        scale: `rounding_bound` for a unit roundoff of 1, times what fractional coordinates of a skewed cell
-            lose: how far a distance can be off, by the roundoff of the arithmetic.
-        reach: pairs as far as this may be listed, length; the cutoff unless a list holds a skin.
-    """
-
+    # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
     cell: ndarray
-    tie: ndarray
-    r_cut: float
+    tie: ndarray  # the pairs at exactly r_cut
+    r_cut: float  # length
+    # `rounding_bound` for a unit roundoff of 1, times what fractional coordinates of a skewed cell lose: how
+    # far a distance can be off, by the roundoff of the arithmetic
     scale: float
-    reach: float
+    reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
         """The pairs that a list of this roundoff cannot be excused for lacking."""
@@ -125,34 +119,21 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """What kind of list it is, which is nobody's mistake.
+    """What kind of list it is, which is nobody's mistake."""
 
-    Attributes:
-        full: every pair from both of its atoms (True), or once (False).
-        sign: +1 where shifts are added to atom j, -1 where they are added to atom i.
-        toward: +1 where vectors point from i to j, -1 where they point from j to i.
-        unit: roundoff of its arithmetic: 2**-53 or 2**-24.
-    """
-
-    full: bool = True
-    sign: int = 1
-    toward: int = 1
-    unit: float = DOUBLE
+    full: bool = True  # every pair from both of its atoms (True), or once (False)
+    sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
+    toward: int = 1  # +1 where vectors point from i to j, -1 where they point from j to i
+    unit: float = DOUBLE  # roundoff of its arithmetic: 2**-53 or 2**-24
 
 
 @dataclass(frozen=True)
 class Failure:
-    """One way in which an answer is wrong.
+    """One way in which an answer is wrong."""
 
-    Attributes:
-        code: one of `CODES`.
-        text: what was seen, with atoms and numbers.
-        step: at which still.
-    """
-
-    code: Code
-    text: str
-    step: Count = 0
+    code: Code  # one of `CODES`
+    text: str  # what was seen, with atoms and numbers
+    step: Count = 0  # at which still
 
     @property
     def kind(self) -> tuple[str, str]:
@@ -356,39 +337,24 @@ def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What became of a question.
+    """What became of a question."""
 
-    Attributes:
-        case: its name.
-        failures: what was wrong at the first step at which anything was.
-        refused: the step and the exception by which the list refused it.
-        ties: pairs at exactly r_cut (counted, not counted).
-        aliased: a call wrote to the arrays of the answer before it.
-        single: it was decided as float32 does and float64 would not.
-        seconds: that the list took.
-    """
-
-    case: str
-    failures: tuple[Failure, ...] = ()
-    refused: tuple[Count, str] | None = None
-    ties: tuple[Count, Count] = (0, 0)
-    aliased: bool = False
-    single: bool = False
-    seconds: Seconds = 0.0
+    case: str  # its name
+    failures: tuple[Failure, ...] = ()  # what was wrong at the first step at which anything was
+    refused: tuple[Count, str] | None = None  # the step and the exception by which the list refused it
+    ties: tuple[Count, Count] = (0, 0)  # pairs at exactly r_cut (counted, not counted)
+    aliased: bool = False  # a call wrote to the arrays of the answer before it
+    single: bool = False  # it was decided as float32 does and float64 would not
+    seconds: Seconds = 0.0  # that the list took
 
 
 @dataclass(frozen=True)
 class Failed:
-    """A case that a list failed, on a few atoms where it was shrunk.
+    """A case that a list failed, on a few atoms where it was shrunk."""
 
-    Attributes:
-        case: up to the step that failed; its name and area are those of the question.
-        failures: what was wrong at that step.
-        alone: it fails when it is the first that a new process is asked; else what was asked before matters.
-    """
-
-    case: Case
-    failures: tuple[Failure, ...]
+    case: Case  # up to the step that failed; its name and area are those of the question
+    failures: tuple[Failure, ...]  # what was wrong at that step
+    # it fails when it is the first that a new process is asked; else what was asked before matters
     alone: bool = True
 
     def __post_init__(self) -> None:
@@ -433,37 +399,27 @@ class CaseAnswers:
 
 @dataclass(frozen=True)
 class RefusalKind:
-    """A kind of question that a list refuses.
+    """A kind of question that a list refuses."""
 
-    Attributes:
-        exception: in words.
-        case: the smallest question that met it, up to the step that was refused.
-        uneven: how the same question was put and answered where no list has a reason to treat it differently.
-        answers: how it was put and answered where a list may treat it differently: another unit of length,
-            other images of the atoms.
-    """
-
-    exception: str
-    case: Case
+    exception: str  # in words
+    case: Case  # the smallest question that met it, up to the step that was refused
+    # how the same question was put and answered where no list has a reason to treat it differently
     uneven: tuple[str, ...] = ()
+    # how it was put and answered where a list may treat it differently: another unit of length, other images
+    # of the atoms
     answers: tuple[str, ...] = ()
 
 
 @dataclass
 class AreaTally:
-    """What became of the questions of one area.
+    """What became of the questions of one area."""
 
-    Attributes:
-        asked, refused, skipped: cases; refused by the list itself, skipped because of its limits.
-        codes: failed cases by code of their worst failure.
-        why: reasons of refusing and skipping, with how often.
-    """
-
+    # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
     refused: int = 0
     skipped: int = 0
-    codes: dict[str, int] = field(default_factory=dict)
-    why: dict[str, int] = field(default_factory=dict)
+    codes: dict[str, int] = field(default_factory=dict)  # failed cases by code of their worst failure
+    why: dict[str, int] = field(default_factory=dict)  # reasons of refusing and skipping, with how often
 
     @property
     def failed(self) -> int:
@@ -483,51 +439,33 @@ class AreaTally:
 
 @dataclass
 class Report:
-    """What the suite found out about a list.
+    """What the suite found out about a list."""
 
-    Attributes:
-        tested: the list.
-        how: its conventions, as declared or found out.
-        found_out: which of them were found out rather than declared.
-        single: a case that it decides as float32 does and float64 would not, where that was found out.
-        ties: (counted, not counted) pairs at exactly r_cut.
-        keeps_order: whether the same question gives the same rows in the same order.
-        superset: pairs beyond the cutoff are part of what it gives.
-        padding: out to which a list that is kept has all pairs, in units of the skin that it is given; None
-            where it neither states nor shows it.
-        stated: it states it, rather than shows it.
-        shifts: whether it gives the images that pairs are through.
-        areas: tallies by area.
-        aliased: the first case in which a call wrote to the arrays of the answer before it, or None.
-        refusals: kinds of refusals, and what each depends on.
-        failed: the first failure of each kind and area, in the order in which they were met.
-        seconds: in all.
-        large: (atoms, seconds) of its largest question.
-        questions: cases that there are, those that it does not claim to do included.
-        motions: against its rebuild rule, that it was asked; and calls: of it in those.
-        whole: all failures were shrunk as far as they are.
-    """
-
-    tested: PairList
-    how: Conventions = field(default_factory=Conventions)
-    found_out: list[str] = field(default_factory=list)
+    tested: PairList  # the list
+    how: Conventions = field(default_factory=Conventions)  # its conventions, as declared or found out
+    found_out: list[str] = field(default_factory=list)  # which of them were found out rather than declared
+    # a case that it decides as float32 does and float64 would not, where that was found out
     single: Case | None = None
-    ties: tuple[int, int] = (0, 0)
-    keeps_order: bool | None = None
-    superset: bool = False
+    ties: tuple[int, int] = (0, 0)  # (counted, not counted) pairs at exactly r_cut
+    keeps_order: bool | None = None  # whether the same question gives the same rows in the same order
+    superset: bool = False  # pairs beyond the cutoff are part of what it gives
+    # out to which a list that is kept has all pairs, in units of the skin that it is given; None where it
+    # neither states nor shows it
     padding: float | None = None
-    stated: bool = False
-    shifts: bool = False
-    areas: dict[str, AreaTally] = field(default_factory=dict)
+    stated: bool = False  # it states it, rather than shows it
+    shifts: bool = False  # whether it gives the images that pairs are through
+    areas: dict[str, AreaTally] = field(default_factory=dict)  # tallies by area
+    # the first case in which a call wrote to the arrays of the answer before it, or None
     aliased: str | None = None
-    refusals: list[RefusalKind] = field(default_factory=list)
+    refusals: list[RefusalKind] = field(default_factory=list)  # kinds of refusals, and what each depends on
+    # the first failure of each kind and area, in the order in which they were met
     failed: list[Failed] = field(default_factory=list)
-    seconds: float = 0.0
-    large: tuple[int, float] | None = None
-    questions: int = 0
-    motions: int = 0
+    seconds: float = 0.0  # in all
+    large: tuple[int, float] | None = None  # (atoms, seconds) of its largest question
+    questions: int = 0  # cases that there are, those that it does not claim to do included
+    motions: int = 0  # against its rebuild rule, that it was asked; and calls: of it in those
     calls: int = 0
-    whole: bool = True
+    whole: bool = True  # all failures were shrunk as far as they are
 
     def skip(self, case: Case, why: str) -> None:
         """Counts a case that is not asked."""

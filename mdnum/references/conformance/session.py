@@ -44,22 +44,16 @@ _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jax
 
 @dataclass(frozen=True)
 class CallOutcome:
-    """What became of one call.
+    """What became of one call."""
 
-    Attributes:
-        answer: the pairs, or None.
-        failure: why there is no answer, or None: it crashed, came too late, raised or returned no pairs.
-        refused: the exception, in words, where it states on purpose that this cannot be done (`meant`).
-        changed: the input that the call wrote to, or None.
-        aliased: the rows of the answer before this one were other ones after this call.
-        skin: the padding that a list that is kept states, length; None where it states none.
-    """
-
-    answer: ListAnswer | None = None
+    answer: ListAnswer | None = None  # the pairs, or None
+    # why there is no answer, or None: it crashed, came too late, raised or returned no pairs
     failure: Failure | None = None
+    # the exception, in words, where it states on purpose that this cannot be done (`meant`)
     refused: str | None = None
-    changed: str | None = None
-    aliased: bool = False
+    changed: str | None = None  # the input that the call wrote to, or None
+    aliased: bool = False  # the rows of the answer before this one were other ones after this call
+    # the padding that a list that is kept states, length; None where it states none
     skin: float | None = None
 
 

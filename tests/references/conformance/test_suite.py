@@ -14,7 +14,7 @@ import pytest
 
 from mdnum.errors import InputError
 from mdnum.references.conformance import NeighborListConformance, reproduction
-from mdnum.references.conformance.case import AREAS, gas, once, sequence
+from mdnum.references.conformance.case import AREAS, Case, Still, gas, once, sequence
 from mdnum.references.conformance.judge import Failed, Failure
 from mdnum.references.conformance.lists import ListLimits, from_object
 from mdnum.references.conformance.motions import motions, movers
@@ -51,6 +51,15 @@ class TestAdoptedKept(NeighborListConformance):
     def asked(self, tested, area):
         # the rest is asked of the list above
         return super().asked(tested, area) if area in ("few", "strain", "rule") else []
+
+
+def test_pairs_of_a_box_that_grew_are_no_phantoms():
+    """What was listed through a face is further apart then than any skin, and nothing moved."""
+    x, cell = [[0.5, 2, 2], [3.5, 2, 2]], np.eye(3)
+    stills = (Still(x, 4 * cell), Still(x, 6 * cell))
+    case = Case("grown", "strain", stills, (True, True, True), r_cut=1.25, skin=0.5)
+    report = examine(from_object(planted_lists.kept("never again")), asked=[case], large=False)
+    assert report.superset and report.asked == 1 and not report.failed
 
 
 def test_an_adopted_suite_fails_with_a_script_and_skips_with_a_reason(monkeypatch: pytest.MonkeyPatch):
@@ -154,6 +163,8 @@ def test_a_question_put_in_another_way_has_the_same_pairs():
 
 _GAS = once("", "few", gas(3, 4.0, 0), 4.0)
 _FREE = once("", "few", gas(3, 4.0, 0))
+_SLAB = once("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True))
+_SHRINKS = sequence("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0)
 
 
 def _in(cell) -> object:
@@ -163,11 +174,7 @@ def _in(cell) -> object:
 @pytest.mark.parametrize(
     ("limits", "case", "why"),
     [
-        (
-            ListLimits(all_axes=True),
-            once("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)),
-            "axis by axis",
-        ),
+        (ListLimits(all_axes=True), _SLAB, "axis by axis"),
         (ListLimits(periodic=True), _FREE, "no free atoms"),
         (ListLimits(free=True), _GAS, "free atoms only"),
         (ListLimits(right_handed=True), _in(np.eye(3)[[1, 0, 2]] * 4), "left-handed"),
@@ -181,11 +188,7 @@ def _in(cell) -> object:
         (ListLimits(most_atoms=2), _GAS, "at most 2"),
         (ListLimits(least_cutoff=2.0), _GAS, "no cutoff below 2"),
         (ListLimits(roomy=10.0), _GAS, "cells"),
-        (
-            ListLimits(fixed_cell=True),
-            sequence("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0),
-            "box that changes",
-        ),
+        (ListLimits(fixed_cell=True), _SHRINKS, "box that changes"),
     ],
 )
 def test_each_limit_refuses_what_it_should(limits: ListLimits, case, why: str):
