@@ -82,10 +82,12 @@ def test_bounds_hold_the_error_of_the_height_that_was_compared(dtype):
 @pytest.mark.parametrize(
     ("dtype", "first"),
     [
-        ("float32", None), ("bfloat16", 66),
-        pytest.param("float64", None, marks=NIGHTLY), pytest.param("float16", 170, marks=NIGHTLY),
+        ("float32", None),
+        ("bfloat16", 66),
+        pytest.param("float64", None, marks=NIGHTLY),
+        pytest.param("float16", 170, marks=NIGHTLY),
     ],
-)  # fmt: skip
+)
 def test_contact_history_against_exact_rationals(dtype, first):
     """The same program in exact arithmetic: the events of 64 and 32 bits hold, those of 16 bits do not."""
     steps, start, h, g, k = 300, 0.40625, 2.0**-6, 9.75, 512.0
