@@ -1,4 +1,5 @@
-"""The closed forms against a ball that mpmath bounces one contact at a time, in 50 digits."""
+"""The closed forms against a ball that mpmath bounces one contact at a time, in 50 digits, and a program that
+locates its impacts against them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from mdnum.ball.exact import ExactImpact, ExactPenalty
+from mdnum.ball import EventLocated, ExactImpact, ExactPenalty, Impact, World, simulate
 from mdnum.errors import InputError
 
 EPS = 2.0**-52
@@ -177,6 +178,18 @@ def test_no_time_is_lost_on_the_way_to_rest():
 def test_what_has_no_exact_motion_is_refused(motion, message):
     with pytest.raises(InputError, match=message):
         motion()
+
+
+def test_located_impacts_meet_the_exact_motion_at_every_step():
+    exact = ExactImpact(1.0, -0.5, 9.81, 0.8)
+    world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
+    run = simulate(world, world.start(1.0, -0.5), 340)
+    assert int(run.iterations.sum()) == int(exact.bounces(3.4)) == 8
+    y, v = exact.state(run.time)
+    np.testing.assert_allclose(run.y[:, 0], y.value, atol=2e-14)
+    # next to an impact a rounding of the time moves the velocity across it
+    away = np.abs(run.time[:, None] - exact.impact_time(np.arange(1, 12)).value).min(axis=1) > 1e-9
+    np.testing.assert_allclose(run.v[away, 0], v.value[away], atol=2e-13)
 
 
 # The spring floor

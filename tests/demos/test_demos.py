@@ -91,6 +91,15 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         "dy_dy0_explicit": 3.7304193, "dy_dy0_semi_implicit": -2.96736885, "dy_dy0_exact": -2.69467177,
         "dy_dk_explicit": -0.00869065082, "dy_dk_semi_implicit": 0.0174131148,
         "first_contact_explicit": 47, "first_contact_semi_implicit": 46,
+        "order_of_height": {
+            "explicit Euler": 0.990509, "semi-implicit Euler": 1.008769, "velocity Verlet": 1.996696,
+            "implicit midpoint": 2.043383,
+        },
+        # the force has a kink at the floor: its slope jumps there, so that derivatives are of order 1
+        "order_of_derivative": {
+            "explicit Euler": 1.071676, "semi-implicit Euler": 1.022325, "velocity Verlet": 1.028794,
+            "implicit midpoint": 1.055851,
+        },
     }),
     "zeno": ("", 1e-6, {
         "rest_time": 4.063712768871579, "rest_time_located": 4.063712768871, "rest_by_y0": 2.0318563844,
