@@ -215,7 +215,7 @@ class _Rollout(eqx.Module):
     loss: BallLoss
 
     def __call__(self, values, world, y0, v0):
-        return loss_at((self.steps, self.loss), world, y0, v0, values, None, shifts=True)
+        return loss_at((self.steps, self.loss), world, y0, v0, values, None)
 
 
 def used(
@@ -311,26 +311,17 @@ class Frozen(BallMethod):
         Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
         """
         run = problem.run(keep=False)
-        decisions = run.decisions()
-        decisions = type(decisions)(jnp.asarray(decisions.contact), jnp.asarray(decisions.iterations))
+        decisions = jax.tree.map(jnp.asarray, run.decisions())
         value, slopes = problem.value_and_grad(names, decisions)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
         if problem.world.policy.arithmetic == "float64":
-            at = problem.origin(names)
-            widths = {name: 6e-6 * size for name, size in _sizes(problem, names).items()}
-
-            def loss(name: str, shift: float) -> float:
-                values = at | {name: at[name] + shift}
-                rest = (problem.world, *problem.start_arrays, values, decisions)
-                return float(_evaluated(problem.bare, *rest, True))
-
-            details["finite_difference"] = {
-                name: (loss(name, width) - loss(name, -width)) / (2 * width) for name, width in widths.items()
-            }
+            at, difference = problem.values(names), {}
+            for name, size in _sizes(problem, names).items():
+                width = 6e-6 * size
+                high, low = (problem.value({name: at[name] + shift}, decisions) for shift in (width, -width))
+                difference[name] = (high - low) / (2 * width)
+            details["finite_difference"] = difference
         return self.result(value, slopes, used(problem, names, slopes, run), details)
-
-
-_evaluated = eqx.filter_jit(loss_at)
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
@@ -403,4 +394,4 @@ class RandomizedSmoothing(BallMethod):
 
 @eqx.filter_jit
 def _many(values, bare, world, y0, v0):
-    return jax.vmap(lambda one: loss_at(bare, world, y0, v0, one, None, shifts=True))(values)
+    return jax.vmap(lambda one: loss_at(bare, world, y0, v0, one, None))(values)
