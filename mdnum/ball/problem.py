@@ -213,12 +213,12 @@ def loss_at(bare, world, y0, v0, values, imposed):
         old + jnp.asarray(values[name]).astype(old.dtype) if name in values else old
         for name, old in zip(START, (y0, v0), strict=True)
     )
-    return loss_of(world, y0, v0, *bare, imposed)
+    return loss_of(world, y0, v0, *bare, imposed=imposed)
 
 
 @eqx.filter_jit
 def _loss(bare, world, y0, v0, imposed):
-    return loss_of(world, y0, v0, *bare, imposed)
+    return loss_of(world, y0, v0, *bare, imposed=imposed)
 
 
 @eqx.filter_jit

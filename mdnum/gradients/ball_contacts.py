@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -101,7 +100,7 @@ class Implicit(BallMethod):
         "the derivative of the fixed point that the solver approaches, not of the iterations it took"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The derivative, by reverse mode.
 
         Raises:
@@ -136,7 +135,7 @@ class Implicit(BallMethod):
             "regularization": self.regularization, "condition": condition,
             "at": "the stopped iterate" if self.at_iterate else "the fixed point",
         }  # fmt: skip
-        return self.result(value, slopes, use, details)
+        return self.of(value, slopes, use, details)
 
 
 def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
@@ -196,7 +195,7 @@ class SoftFloor(BallMethod):
         "the derivative of another program, whose floor acts over a width eps; its loss is another too"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The derivative, by reverse mode, of the smooth program; the value is its loss.
 
         Raises:
@@ -209,7 +208,6 @@ class SoftFloor(BallMethod):
         if not eps > 0:
             raise InputError(f"eps is {eps}", remedy="Choose a width above 0.", where="eps")
         soft = softened(problem, eps)
-        problem.values(names)
         # the soft floor's own stiffness and width are not what these names mean in the given program
         own = () if isinstance(problem.world.contact, Penalty) else (*_SOLVER, "eps", "rest_speed")
         here = [name for name in names if (name in START or problem.world.has(name)) and name not in own]
@@ -220,7 +218,7 @@ class SoftFloor(BallMethod):
                 slopes[name], use[name] = 0.0, Use(False, f"the smooth program has no {name}")
         hard = problem.value()
         details = {"eps": eps, "loss_of_the_given_program": hard, "bias_of_the_loss": value - hard}
-        return self.result(value, slopes, use, details)
+        return self.of(value, slopes, use, details)
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
@@ -282,7 +280,7 @@ class ThroughContacts(BallMethod):
     kind = "flow"
     description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The derivative, by reverse mode.
 
         Raises:
@@ -301,7 +299,7 @@ class ThroughContacts(BallMethod):
             # the time of an impact without speed has an infinite derivative
             flagged = 0 if np.all(np.isfinite(list(slopes.values()))) else 1
         else:
-            contact = world.contact
+            contact: Any = world.contact
             kind = next(own for given, own in _SALTATING.items() if isinstance(contact, given))
             parts = {one.name: getattr(contact, one.name) for one in fields(contact)}
             value, slopes = _with_contact(problem, kind(**parts)).value_and_grad(names)
@@ -318,7 +316,7 @@ class ThroughContacts(BallMethod):
             elif name in _SOLVER and isinstance(world.contact, Projection):
                 use[name] = Use(False, f"the impact that is solved for does not depend on {name}")
         spring = isinstance(world.contact, Penalty) and not float(world.contact.damping)
-        made = self.result(value, slopes, use, {"events": events, "located": located})
+        made = self.of(value, slopes, use, {"events": events, "located": located})
         return replace(made, description=_SPRING) if spring else made
 
 
