@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
-from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
+from mdnum.gradients.ball_contacts import FixedPointRule, Implicit
 from mdnum.report.section import Table
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
@@ -159,6 +161,55 @@ def _tangent(matrix, direction, tolerance, regularization):
     one = (jnp.ones(()),)
     options = {"tolerance": tolerance, "regularization": regularization, "max_iter": 10_000}
     return fixed_point_tangent(update, direction, one, one, **options)
+
+
+def solve(
+    matvec: Callable[[Any], Any],
+    right: Float[Array, "unknowns"],
+    tolerance: float | Float[Array, ""] = 1e-12,
+    regularization: float | Float[Array, ""] = 0.0,
+    max_iter: int = 200,
+) -> Float[Array, "unknowns"]:
+    """x of (A + regularization) x = right by conjugate gradients, differentiable both ways.
+
+    Args:
+        matvec: A, symmetric and positive definite.
+        tolerance: of the residual, relative to the right-hand side.
+        regularization: added to the diagonal of A; moves the answer by about regularization / smallest
+            eigenvalue, relative.
+
+    Error: at most tolerance times the condition number, relative.
+    """
+
+    def matrix(x):
+        return matvec(x) + jnp.asarray(regularization, x.dtype) * x
+
+    def conjugate(matvec, b):
+        return cg(matvec, b, tol=tolerance, maxiter=max_iter)[0]  # type: ignore[arg-type]
+
+    return jax.lax.custom_linear_solve(matrix, right, conjugate, symmetric=True)
+
+
+def fixed_point_tangent(
+    update: Callable[..., Float[Array, "unknowns"]],
+    x: Float[Array, "unknowns"],
+    parameters: tuple[Any, ...],
+    tangents: tuple[Any, ...],
+    **options: Any,
+) -> Float[Array, "unknowns"]:
+    """dx of x = update(x, *parameters), by the implicit function theorem: (1 - dG/dx) dx = dG/dp dp.
+
+    Args:
+        update: G; 1 - dG/dx symmetric and positive definite at x.
+        x: a fixed point. At a point that is only near one, the answer is off by about that distance.
+        options: of `solve`.
+    """
+    _, right = jax.jvp(lambda *given: update(x, *given), parameters, tangents)
+
+    def matvec(dx):
+        return dx - jax.jvp(lambda at: update(at, *parameters), (x,), (dx,))[1]
+
+    return solve(matvec, right, **options)
 
 
 def relaxation(tol: float, derivative: FixedPointRule | None = None) -> BallProblem:

@@ -73,7 +73,7 @@ def test_each_world_points_to_the_other(capsys: pytest.CaptureFixture[str], tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ball_alone_lists_systems_and_demonstrations(capsys: pytest.CaptureFixture[str]):
+def test_balls_and_demonstrations_are_listed_shown_and_checked(capsys: pytest.CaptureFixture[str]):
     assert call("ball") == 0
     out = capsys.readouterr().out
     assert "ball/zeno" in out and "argon" not in out and all(name in out for name in demos.names())
@@ -81,9 +81,6 @@ def test_ball_alone_lists_systems_and_demonstrations(capsys: pytest.CaptureFixtu
     document = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in document["demos"]] == demos.names()
     assert {row["name"]: row["balls"] for row in document["systems"]}["ball/batch-on-the-boundary"] == 9
-
-
-def test_a_ball_is_shown_and_checked(capsys: pytest.CaptureFixture[str]):
     assert call("systems", "show", "ball/drop", "--set", "contact.k=2e4", "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert (shown["contact"]["k"], shown["precision"]["reduction"]) == (2e4, "sequential")
@@ -134,28 +131,25 @@ def test_a_demonstration_for_people(demo: dict[str, Demo], capsys: pytest.Captur
     assert Path("page/report.html").read_text(encoding="utf-8") == page
 
 
-def test_a_demonstration_as_json(demo: dict[str, Demo], capsys: pytest.CaptureFixture[str]):
+def test_demonstrations_as_json_and_one_that_fails_its_check(
+    demo: dict[str, Demo], capsys: pytest.CaptureFixture[str]
+):
     assert call("ball", "--demo", "fork", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["name"], document["ok"], document["folder"]) == ("fork", True, "runs/demo-fork-1")
     assert document["numbers"]["large_first"] == 0.0009760856628
     assert document["data"] == {"history": [1.0, None]}
     assert document["tables"][0]["rows"][1] == [1, 1 + 1e-7]
-
-
-def test_a_demonstration_that_fails_its_check_is_a_finding(
-    demo: dict[str, Demo], capsys: pytest.CaptureFixture[str]
-):
     demo["fork"] = make(ok=False)
-    assert call("ball", "--demo", "fork", "--no-report") == 1
+    assert call("ball", "--demo", "fork", "--no-report", "-o", "failed") == 1
     assert "failed it holds" in " ".join(capsys.readouterr().out.split())
-    assert not list(Path("runs").rglob("report.html"))
+    assert not list(Path("failed").rglob("report.html"))
     assert call("ball", "--demo", "all", "--no-report", "--json") == 1
     document = json.loads(capsys.readouterr().out)
-    assert document["ok"] is False
-    assert [one["name"] for one in document["demos"]] == demos.names()
-    assert [one["name"] for one in document["demos"] if not one["ok"]] == ["fork"]
-    assert [one["code"] for one in document["findings"]] == ["DEMO_FAILED"]
+    assert document["ok"] is False and [one["code"] for one in document["findings"]] == ["DEMO_FAILED"]
+    assert [(one["name"], one["ok"]) for one in document["demos"]] == [
+        (x, x != "fork") for x in demos.names()
+    ]
 
 
 def test_a_real_run_and_its_report(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):

@@ -16,9 +16,9 @@ so it shares no code with them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -28,9 +28,6 @@ from mdnum.errors import InputError
 Times = float | Shaped[np.ndarray, "*times"]
 Counts = int | float | Shaped[np.ndarray, "*counts"]
 
-#: Terms of the series in 1 - e that stands in for the geometric sums' slope near e = 1; below m (1 - e) = 1
-#: the first neglected one is under 1e-17 of the sum.
-_TERMS = 20
 #: Imaginary step of a derivative: its square is far below rounding.
 _STEP = 1e-40
 #: Contacts after which something is wrong: each damped one takes a share of the energy.
@@ -50,40 +47,48 @@ class Known:
     gradient: Mapping[str, Float[np.ndarray, "..."]]
 
 
-def _known(value, gradient: Mapping[str, Any]) -> Known:
-    value = np.asarray(value, np.float64)
-    whole = {name: np.broadcast_to(np.asarray(d, np.float64), value.shape) for name, d in gradient.items()}
-    return Known(value, whole)
+Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """What both motions check of a start, and their height and velocity one by one."""
+    """What both motions check of a start, their derivatives, and their height and velocity one by one.
+
+    Source: derivatives by the complex step, in which nothing cancels (Squire & Trapp, SIAM Review 40 (1998)
+    110).
+    """
 
     y0: float
     v0: float
     gravity: float
+    NAMES: ClassVar[tuple[str, ...]]
 
-    def _check(self, *, y0: float, v0: float, gravity: float):
-        _positive("y0", y0, zero=True)
-        _positive("v0", abs(v0), zero=True)
-        _positive("gravity", gravity)
-        if y0 == 0 and v0 == 0:
+    def _check(self):
+        for name, zero in (("y0", True), ("v0", True), ("gravity", False)):
+            value = getattr(self, name)
+            _positive(name, abs(value) if name == "v0" else value, zero=zero)
+        if self.y0 == 0 and self.v0 == 0:
             raise InputError("the ball starts at rest on the floor", remedy="Give it a height or a velocity")
 
+    def _known(self, quantities: Callable[[Parameters], tuple[Any, ...]]) -> tuple[Known, ...]:
+        """Functions of complex parameters, with their derivatives."""
+        at = self._at
+        moved = {name: quantities(at | {name: value + 1j * _STEP}) for name, value in at.items()}
+        found = []
+        for k, value in enumerate(quantities(at)):
+            gradient = {name: np.asarray(np.imag(one[k]) / _STEP) for name, one in moved.items()}
+            found.append(Known(np.asarray(np.real(value)), gradient))
+        return tuple(found)
+
+    @property
+    def _at(self) -> dict[str, complex]:
+        return {name: complex(getattr(self, name)) for name in self.NAMES}
+
     def first_contact(self) -> Known:
-        """Time at which the ball first reaches the floor, s."""
-        return self._first_flight()[0]
+        """Time at which the ball first reaches the floor, s.
 
-    def _first_flight(self) -> tuple[Known, Known]:
-        """Time and speed at which the ball first reaches height 0.
-
-        Error: a few ulps each, for either sign of v0: (v0 + s) / g would cancel for a ball thrown down.
+        Error: a few ulps, for either sign of v0.
         """
-        y0, v0, g = self.y0, self.v0, self.gravity
-        s = float(np.hypot(v0, np.sqrt(2 * g * y0)))
-        t = (v0 + s) / g if v0 >= 0 else 2 * y0 / (s - v0)
-        time = {"y0": 1 / s, "v0": t / s, "gravity": -t * t / (2 * s)}
-        return _known(t, time), _known(s, {"y0": g / s, "v0": v0 / s, "gravity": y0 / s})
+        return self._known(_down)[0]
 
     def state(self, t: Times) -> tuple[Known, Known]:
         """Height (m) and velocity (m/s) at time t (s)."""
@@ -96,6 +101,21 @@ class _Motion:
     def velocity(self, t: Times) -> Known:
         """Velocity at time t (s), m/s; after the impact where t is the time of one."""
         return self.state(t)[1]
+
+
+def _down(p: Parameters) -> tuple[complex, complex]:
+    """Time and speed at which the ball first reaches height 0: (v0 + s) / g would cancel where it falls."""
+    y0, v0, g = p["y0"], p["v0"], p["gravity"]
+    speed = np.sqrt(v0 * v0 + 2 * g * y0)
+    return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed
+
+
+def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
+    """Time of impact n, and the speed after it."""
+    first, speed = _down(p)
+    e = p["restitution"]
+    power, between = _powers(e, np.asarray(n, np.float64) - 1)
+    return first + 2 * speed / p["gravity"] * e * between, power * e * speed
 
 
 @dataclass(frozen=True)
@@ -126,17 +146,18 @@ class ExactImpact(_Motion):
     NAMES = ("y0", "v0", "gravity", "restitution")
 
     def __post_init__(self):
-        self._check(y0=self.y0, v0=self.v0, gravity=self.gravity)
+        self._check()
         _positive("restitution", self.restitution, zero=True, most=1.0)
 
     def impact_speed(self, n: Counts) -> Known:
         """Speed with which impact n meets the floor, e^(n-1) s, m/s."""
-        return self._rebound(_numbers(n) - 1)
+        power = _numbers(n) - 1
+        return self._known(lambda p: (_powers(p["restitution"], power)[0] * _down(p)[1],))[0]
 
     def impact_time(self, n: Counts) -> Known:
         """Time of impact n, s."""
-        n, e = _numbers(n), self.restitution
-        return self._after_first(e * _geometric(e, n - 1), _geometric_slope(e, n))
+        n = _numbers(n)
+        return self._known(lambda p: _impact(p, n))[0]
 
     def rest_time(self) -> Known:
         """Time after which the ball lies still, infinitely many impacts later, s.
@@ -144,20 +165,25 @@ class ExactImpact(_Motion):
         Raises:
             InputError: the restitution is 1.
         """
-        e = self.restitution
-        if e == 1:
+        if self.restitution == 1:
             raise InputError(
                 "a ball of restitution 1 never comes to rest",
                 remedy="Choose a restitution below 1",
                 where="restitution",
             )
-        return self._after_first(np.asarray(e / (1 - e)), np.asarray(1 / (1 - e) ** 2))
+
+        def at_rest(p):
+            (first, speed), e = _down(p), p["restitution"]
+            return (first + 2 * speed / p["gravity"] * e / (1 - e),)
+
+        return self._known(at_rest)[0]
 
     def bounces(self, t: Times) -> Float[np.ndarray, "*times"]:
         """Number of impacts up to and including time t (s); infinite once the ball lies still."""
         t = _later(t)
-        first, speed = self._first_flight()
-        t_1, e, scale = float(first.value), self.restitution, 2 * float(speed.value) / self.gravity
+        at = self._at
+        first, speed = (part.real for part in _down(at))
+        t_1, e, scale = first, self.restitution, 2 * speed / self.gravity
         if e == 0:
             # one impact, and the ball stays
             return np.where(t >= t_1, 1.0, 0.0)
@@ -172,53 +198,26 @@ class ExactImpact(_Motion):
         # the logarithm is right to some ulps; the impact times themselves have the last word
         finite = np.isfinite(n) & (n > 0)
         now = np.where(finite, n, 1.0)
-        n = np.where(finite & (self.impact_time(now + 1).value <= t), now + 1, n)
+        n = np.where(finite & (np.real(_impact(at, now + 1)[0]) <= t), now + 1, n)
         now = np.where(finite, n, 2.0)
-        return np.where(finite & (self.impact_time(now).value > t) & (n > 1), n - 1, n)
+        return np.where(finite & (np.real(_impact(at, now)[0]) > t) & (n > 1), n - 1, n)
 
     def state(self, t: Times) -> tuple[Known, Known]:
         """Height and velocity at time t (s); zero, with zero derivatives, once the ball lies still."""
         t = _later(t)
-        n, g = self.bounces(t), self.gravity
+        n = self.bounces(t)
         still = np.isinf(n) | ((n > 0) & (self.restitution == 0))
-        flying = (n == 0) & ~still
-        number = np.where(still | flying, 1.0, n)
-        left, kick = self.impact_time(number), self._rebound(number)
-        tau = t - left.value
-        v = kick.value - g * tau
-        y = tau * (kick.value - 0.5 * g * tau)
-        zero = np.zeros_like(t)
-        dy0 = {"y0": zero + 1, "v0": t, "gravity": -t * t / 2, "restitution": zero}
-        dv0 = {"y0": zero, "v0": zero + 1, "gravity": -t, "restitution": zero}
+        number = np.where(still, 1.0, np.maximum(n, 1.0))
 
-        def choose(first, later):
-            return np.where(still, 0.0, np.where(flying, first, later))
+        def moved(p):
+            left, kick = _impact(p, number)
+            tau, v, g = t - np.where(n == 0, 0, left), np.where(n == 0, p["v0"], kick), p["gravity"]
+            height = np.where(n == 0, p["y0"], 0) + tau * (v - 0.5 * g * tau)
+            height = np.maximum(height.real, 0) + 1j * height.imag
+            return np.where(still, 0, height), np.where(still, 0, v - g * tau)
 
-        dy, dv = {}, {}
-        for name in self.NAMES:
-            own = tau * float(name == "gravity")
-            start, faster = left.gradient[name], kick.gradient[name]
-            dy[name] = choose(dy0[name], faster * tau - v * start - own * tau / 2)
-            dv[name] = choose(dv0[name], faster + g * start - own)
-        height = np.maximum(choose(self.y0 + t * (self.v0 - 0.5 * g * t), y), 0.0)
-        return _known(height, dy), _known(choose(self.v0 - g * t, v), dv)
-
-    def _rebound(self, n: Counts) -> Known:
-        """e^n s: the speed after impact n."""
-        speed = self._first_flight()[1]
-        s, power = float(speed.value), self.restitution**n
-        gradient = {name: power * value for name, value in speed.gradient.items()}
-        return _known(power * s, gradient | {"restitution": _power_slope(self.restitution, n) * s})
-
-    def _after_first(self, between, slope) -> Known:
-        """t_1 + (2 s / g) `between`, where `between` has the given slope in e."""
-        first, speed = self._first_flight()
-        s, g, v0 = float(speed.value), self.gravity, self.v0
-        # by g: 2 (ds/dg) / g - 2 s / g², collected into terms of one sign
-        scale = {"y0": 2 / s, "v0": 2 * v0 / (g * s), "gravity": -2 * (v0 * v0 + g * self.y0) / (s * g * g)}
-        gradient = {name: first.gradient[name] + value * between for name, value in scale.items()}
-        gradient["restitution"] = 2 * s / g * np.asarray(slope)
-        return _known(first.value + 2 * s / g * between, gradient)
+        y, v = self._known(moved)
+        return y, v
 
 
 @dataclass(frozen=True)
@@ -241,9 +240,6 @@ class ExactPenalty(_Motion):
         InputError: a parameter out of range, or a ball that starts at rest on the floor.
 
     Error: some ten ulps per contact, in values and in derivatives.
-
-    Source: derivatives by the complex step, in which nothing cancels (Squire & Trapp, SIAM Review 40 (1998)
-    110).
     """
 
     y0: float
@@ -255,7 +251,7 @@ class ExactPenalty(_Motion):
     NAMES = ("y0", "v0", "gravity", "k", "damping")
 
     def __post_init__(self):
-        self._check(y0=self.y0, v0=self.v0, gravity=self.gravity)
+        self._check()
         _positive("k", self.k)
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
@@ -266,16 +262,11 @@ class ExactPenalty(_Motion):
     def state(self, t: Times) -> tuple[Known, Known]:
         """Height and velocity at time t (s); the height is negative in contact."""
         t = _later(t)
-        values = {name: complex(getattr(self, name)) for name in self.NAMES}
-        y, v = _bounced(values, t)
-        dy, dv = {}, {}
-        for name in self.NAMES:
-            moved = _bounced(values | {name: values[name] + 1j * _STEP}, t)
-            dy[name], dv[name] = (np.imag(x) / _STEP for x in moved)
-        return _known(np.real(y), dy), _known(np.real(v), dv)
+        y, v = self._known(lambda p: _bounced(p, t))
+        return y, v
 
 
-def _bounced(p: Mapping[str, complex], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Height and velocity on a penalty contact with complex parameters, at real times."""
     y, v = np.zeros(t.shape, complex), np.zeros(t.shape, complex)
     g = p["gravity"]
@@ -304,7 +295,7 @@ def _bounced(p: Mapping[str, complex], t: np.ndarray) -> tuple[np.ndarray, np.nd
     return y, v
 
 
-def _arc(p: Mapping[str, complex], s: complex, tau):
+def _arc(p: Parameters, s: complex, tau):
     """Height and velocity a time tau into a contact entered with speed s."""
     k, half, deep = p["k"], p["damping"] / 2, p["gravity"] / p["k"]
     w = np.sqrt(k - half * half)
@@ -316,7 +307,7 @@ def _arc(p: Mapping[str, complex], s: complex, tau):
     return y, v
 
 
-def _end(p: Mapping[str, complex], s: complex) -> complex | None:
+def _end(p: Parameters, s: complex) -> complex | None:
     """How long a contact entered with speed s lasts; None for ever."""
     half = p["damping"].real / 2
     if half * half > p["k"].real:
@@ -362,34 +353,15 @@ def _later(t: Times) -> Float[np.ndarray, "*times"]:
     return t
 
 
-def _power_slope(e: float, n):
-    """n e^(n-1), zero for n = 0."""
-    return np.where(n > 0, n * e ** np.maximum(n - 1, 0.0), 0.0)
+def _powers(e: complex, n: Any) -> tuple[Any, Any]:
+    """e^n, and 1 + e + ... + e^(n-1), for whole numbers: bit by bit, in sums of one sign.
 
-
-def _geometric(e: float, m):
-    """1 + e + ... + e^(m-1)."""
-    if e == 1:
-        return m
-    if e == 0:
-        return np.where(m > 0, 1.0, 0.0)
-    # 1 - e is exact from e = 1/2 on, and the exponential is near 1 only where the logarithm is small
-    return -np.expm1(m * np.log(e)) / (1 - e)
-
-
-def _geometric_slope(e: float, m):
-    """1 + 2 e + ... + (m-1) e^(m-2): the derivative of the sum above.
-
-    (G - m e^(m-1)) / (1 - e) loses everything where m (1 - e) is small; there it is a short alternating
-    series in 1 - e with the terms j binom(m, j + 1) (e - 1)^(j-1).
+    (1 - e^n) / (1 - e) loses everything next to e = 1, and its derivative before that.
     """
-    d = 1 - e
-    near = m * d < 1
-    few = np.where(near, m, 0.0)
-    term, series = few * (few - 1) / 2, 0.0
-    for j in range(1, _TERMS):
-        series = series + j * term
-        term = -term * d * (few - j - 1) / (j + 2)
-    many = np.where(near, 2.0, m)
-    direct = (_geometric(e, many) - _power_slope(e, many)) / d if d else 0.0
-    return np.where(near, series, direct)
+    n = np.asarray(n, np.float64)
+    power, total = np.ones(n.shape, complex), np.zeros(n.shape, complex)
+    for bit in reversed(range(int(np.max(n, initial=0)).bit_length())):
+        power, total = power * power, total * (1 + power)
+        odd = np.floor(n / 2.0**bit) % 2 == 1
+        power, total = np.where(odd, power * e, power), np.where(odd, 1 + e * total, total)
+    return power, total

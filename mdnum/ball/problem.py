@@ -116,10 +116,16 @@ class BallProblem:
             for name in names
         }
 
-    def value(self, overrides: Mapping[str, Any] | None = None) -> float:
-        """The loss, also with other values of named parameters: one compiled program for all of them."""
+    def value(
+        self, overrides: Mapping[str, Any] | None = None, imposed: BallDecisions | None = None
+    ) -> float:
+        """The loss, also with other values of named parameters: one compiled program for all of them.
+
+        Args:
+            imposed: decisions of every step to act on instead of its own, leading axis steps.
+        """
         problem = self.with_values(overrides or {})
-        return float(_loss(problem.bare, problem.world, *problem.start_arrays))
+        return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
         """Where it is, as `loss_at` takes it: parameters by value, the start by how far it is moved, 0.
@@ -195,35 +201,29 @@ def loss_of(
     return loss.end(state, steps, total)
 
 
-def loss_at(bare, world, y0, v0, values, imposed, shifts=False):
+def loss_at(bare, world, y0, v0, values, imposed):
     """`loss_of` with parameters set, everything an argument, so that no fence is folded.
 
     Args:
         bare: number of steps, and loss.
-        values: by name; with `shifts` those of the start are how far it is moved (`BallProblem.origin`).
+        values: by name; those of the start are how far it is moved (`BallProblem.origin`).
     """
-    steps, loss = bare
-    rest = {name: value for name, value in values.items() if name not in START}
-    world = world.with_values(rest)
-    for name in START:
-        if name in values:
-            value = jnp.asarray(values[name])
-            old = y0 if name == "y0" else v0
-            new = old + value.astype(old.dtype) if shifts else value.astype(old.dtype)
-            y0, v0 = (new, v0) if name == "y0" else (y0, new)
-    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, imposed)
+    world = world.with_values({name: value for name, value in values.items() if name not in START})
+    y0, v0 = (
+        old + jnp.asarray(values[name]).astype(old.dtype) if name in values else old
+        for name, old in zip(START, (y0, v0), strict=True)
+    )
+    return loss_of(world, y0, v0, *bare, imposed=imposed)
 
 
 @eqx.filter_jit
-def _loss(bare, world, y0, v0):
-    return loss_of(world, y0, v0, *bare)
+def _loss(bare, world, y0, v0, imposed):
+    return loss_of(world, y0, v0, *bare, imposed=imposed)
 
 
 @eqx.filter_jit
 def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
-    return scaled_gradient(
-        lambda given: loss_at(bare, world, y0, v0, given, imposed, shifts=True), scale, values
-    )
+    return scaled_gradient(lambda given: loss_at(bare, world, y0, v0, given, imposed), scale, values)
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:

@@ -98,6 +98,7 @@ class Motion(NamedTuple):
         y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
             arithmetic.
         free: acceleration without contact (control minus gravity), shape (balls,).
+        touching: the contact decision of the step before.
         judge: the contact decision at a height: the world's own, or what was imposed.
         imposed: iterations that are imposed, or None.
         integrator, policy, rounding: of the world.
@@ -108,6 +109,7 @@ class Motion(NamedTuple):
     v: Balls
     carried: Balls
     free: Balls
+    touching: Touching
     judge: Callable[[Balls], Touching]
     imposed: Int[Array, "..."] | None
     integrator: Scheme

@@ -205,7 +205,8 @@ class World(eqx.Module):
                 y=state.y.astype(arithmetic),
                 v=state.v.astype(arithmetic),
                 carried=state.a.astype(arithmetic),
-                free=self._free(state.step, state.y.shape),
+                free=self.free(state.step, state.y.shape),
+                touching=state.touching,
                 judge=self._judge(state, imposed),
                 imposed=None if imposed is None else imposed.iterations,
                 integrator=self.integrator,
@@ -229,7 +230,8 @@ class World(eqx.Module):
             return lambda _: contact
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
 
-    def _free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
+    def free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
+        """Acceleration without contact, control minus gravity, m/s², of so many balls in a step."""
         free = -self.gravity
         if self.control is not None:
             # a control that ends before the run does stays at its last value
@@ -252,7 +254,7 @@ def _start(world: World, y: Array, v: Array) -> BallState:
     step = jnp.zeros((), jnp.int32)
     touching = world.touches(y.astype(arithmetic), jnp.zeros(y.shape, bool))
     a = world.contact.acceleration(
-        y.astype(arithmetic), v.astype(arithmetic), world._free(step, y.shape), touching, world.rounding
+        y.astype(arithmetic), v.astype(arithmetic), world.free(step, y.shape), touching, world.rounding
     )
     return BallState(step, y, v, a, touching)
 

@@ -10,8 +10,8 @@ derivative underflowed or was clamped away. `dependence` tells them apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from mdnum.ball.problem import BallLoss, BallProblem, loss_at
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
-from mdnum.gradients.problem import Gradient, Kind
+from mdnum.gradients.problem import Gradient, Method
 from mdnum.registry import Registry
 
 
@@ -35,34 +35,24 @@ class Use(NamedTuple):
     note: str
 
 
-class BallMethod:
-    """A way to differentiate a ball's rollout, called with a problem and names of parameters.
+class BallMethod(Method):
+    """A way to differentiate a ball's rollout: a `Method` that is called with a `BallProblem`.
 
-    Attributes:
-        name: as in system files. description: which derivative it gives, one sentence.
-        kind: what it differentiates.
+    A batch moves as a whole along y0 and v0.
     """
 
-    name: ClassVar[str]
-    description: ClassVar[str]
-    kind: ClassVar[Kind] = "steps"
+    def known(self, problem: BallProblem, names: Sequence[str]) -> tuple[str, ...]:
+        """The names, as they are."""
+        problem.values(names)
+        return tuple(names)
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
-        """The derivative of the loss by the named parameters; a batch moves as a whole along y0 and v0.
-
-        Raises:
-            InputError: this derivative does not exist for this world, or there is no such parameter.
-        """
-        raise NotImplementedError
-
-    def result(
+    def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
         """A gradient of this method."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
-        notes = {name: one.note for name, one in use.items()}
-        depends = {name: one.depends for name, one in use.items()}
-        return Gradient(self.name, self.description, value, gradient, notes, details, self.kind, depends)
+        made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
+        return replace(made, depends={name: one.depends for name, one in use.items()})
 
 
 #: Methods by the names that system files give them; names take the options of the classes.
@@ -215,7 +205,7 @@ class _Rollout(eqx.Module):
     loss: BallLoss
 
     def __call__(self, values, world, y0, v0):
-        return loss_at((self.steps, self.loss), world, y0, v0, values, None, shifts=True)
+        return loss_at((self.steps, self.loss), world, y0, v0, values, None)
 
 
 def used(
@@ -286,10 +276,11 @@ class ThroughIterations(BallMethod):
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
+        names = self.check(problem, names)
         run = problem.run(keep=False) if run is None else run
         value, slopes = problem.value_and_grad(names, scale=self.loss_scale)
         details = {"iterations": int(run.iterations.sum()), "loss_scale": self.loss_scale}
-        return self.result(value, slopes, used(problem, names, slopes, run), details)
+        return self.of(value, slopes, used(problem, names, slopes, run), details)
 
 
 @dataclass(frozen=True)
@@ -305,32 +296,23 @@ class Frozen(BallMethod):
         "the derivative of a program without branches, with the decisions and counts of a recorded run"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The derivative, by reverse mode, with central differences of the pinned program beside it.
 
         Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
         """
         run = problem.run(keep=False)
-        decisions = run.decisions()
-        decisions = type(decisions)(jnp.asarray(decisions.contact), jnp.asarray(decisions.iterations))
+        decisions = jax.tree.map(jnp.asarray, run.decisions())
         value, slopes = problem.value_and_grad(names, decisions)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
         if problem.world.policy.arithmetic == "float64":
-            at = problem.origin(names)
-            widths = {name: 6e-6 * size for name, size in _sizes(problem, names).items()}
-
-            def loss(name: str, shift: float) -> float:
-                values = at | {name: at[name] + shift}
-                rest = (problem.world, *problem.start_arrays, values, decisions)
-                return float(_evaluated(problem.bare, *rest, True))
-
-            details["finite_difference"] = {
-                name: (loss(name, width) - loss(name, -width)) / (2 * width) for name, width in widths.items()
-            }
-        return self.result(value, slopes, used(problem, names, slopes, run), details)
-
-
-_evaluated = eqx.filter_jit(loss_at)
+            at, difference = problem.values(names), {}
+            for name, size in _sizes(problem, names).items():
+                width = 6e-6 * size
+                high, low = (problem.value({name: at[name] + shift}, decisions) for shift in (width, -width))
+                difference[name] = (high - low) / (2 * width)
+            details["finite_difference"] = difference
+        return self.of(value, slopes, used(problem, names, slopes, run), details)
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
@@ -362,7 +344,7 @@ class RandomizedSmoothing(BallMethod):
         "with a standard error"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The estimate; `details` holds its standard error for each name.
 
         Raises:
@@ -398,9 +380,9 @@ class RandomizedSmoothing(BallMethod):
             if np.any(half) and not use[name].depends:
                 use[name] = Use(True, f"the loss jumps with {name}, which the run itself did not use")
         details = {"standard_error": errors, "width": widths, "samples": self.samples, "seed": self.seed}
-        return self.result(float(np.mean(losses)), slopes, use, details)
+        return self.of(float(np.mean(losses)), slopes, use, details)
 
 
 @eqx.filter_jit
 def _many(values, bare, world, y0, v0):
-    return jax.vmap(lambda one: loss_at(bare, world, y0, v0, one, None, shifts=True))(values)
+    return jax.vmap(lambda one: loss_at(bare, world, y0, v0, one, None))(values)

@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import cg
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.step import (
-    BallDecisions,
-    BallRecord,
-    BallState,
-    BallVerlet,
-    EventLocated,
-    Motion,
-    Moved,
-    Penalty,
-    Projection,
-)
+from mdnum.ball.rollout import BallRun
+from mdnum.ball.step import BallVerlet, EventLocated, Impact, Motion, Moved, Penalty, Projection
 from mdnum.ball.stopping import FixedCount
-from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
 from mdnum.gradients.ball import BallMethod, Use, used
 from mdnum.gradients.problem import Gradient
 from mdnum.numerics.saltation import carry, grazing
 
-#: Beyond this condition number the linear solve means nothing in float64.
+#: Beyond this condition number a derivative of the fixed point means nothing in float64.
 LIMIT = 1e12
 #: Steps that the soft floor of an impact must act for.
 _RESOLVED = 10
@@ -47,53 +36,9 @@ _SPRING = (
 _NARROW = 1e-6
 
 
-def solve(
-    matvec: Callable[[Any], Any],
-    right: Float[Array, "unknowns"],
-    tolerance: float | Float[Array, ""] = 1e-12,
-    regularization: float | Float[Array, ""] = 0.0,
-    max_iter: int = 200,
-) -> Float[Array, "unknowns"]:
-    """x of (A + regularization) x = right by conjugate gradients, differentiable both ways.
-
-    Args:
-        matvec: A, symmetric and positive definite.
-        tolerance: of the residual, relative to the right-hand side.
-        regularization: added to the diagonal of A; moves the answer by about regularization / smallest
-            eigenvalue, relative.
-
-    Error: at most tolerance times the condition number, relative.
-    """
-
-    def matrix(x):
-        return matvec(x) + jnp.asarray(regularization, x.dtype) * x
-
-    def conjugate(matvec, b):
-        return cg(matvec, b, tol=tolerance, maxiter=max_iter)[0]  # type: ignore[arg-type]
-
-    return jax.lax.custom_linear_solve(matrix, right, conjugate, symmetric=True)
-
-
-def fixed_point_tangent(
-    update: Callable[..., Float[Array, "unknowns"]],
-    x: Float[Array, "unknowns"],
-    parameters: tuple[Any, ...],
-    tangents: tuple[Any, ...],
-    **options: Any,
-) -> Float[Array, "unknowns"]:
-    """dx of x = update(x, *parameters), by the implicit function theorem: (1 - dG/dx) dx = dG/dp dp.
-
-    Args:
-        update: G; 1 - dG/dx symmetric and positive definite at x.
-        x: a fixed point. At a point that is only near one, the answer is off by about that distance.
-        options: of `solve`.
-    """
-    _, right = jax.jvp(lambda *given: update(x, *given), parameters, tangents)
-
-    def matvec(dx):
-        return dx - jax.jvp(lambda at: update(at, *parameters), (x,), (dx,))[1]
-
-    return solve(matvec, right, **options)
+def _moving(x: Any) -> Any:
+    """0 with the derivative of x: what a value is given another derivative with."""
+    return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
@@ -101,16 +46,15 @@ class FixedPointRule(eqx.Module):
 
     For a ball in contact the fixed point of y ← y + gain max(0, -y) that is reached from below is y = 0. It
     lies on the kink of max(0, -y), where dG/dy has two values: the one from below is used, because the ball
-    comes from there (a choice of branch, as the active set of a complementarity problem).
+    comes from there (a choice of branch, as the active set of a complementarity problem). By the implicit
+    function theorem (1 - dG/dy) dy = dG/dgain dgain, ball by ball: gain dy = -y dgain.
 
     Attributes:
-        tolerance, regularization, max_iter: of the linear solve.
+        regularization: added to 1 - dG/dy; moves the answer by about regularization / gain, relative.
         at_iterate: evaluate at the height where the iteration stopped instead, which is no fixed point.
     """
 
-    tolerance: float = eqx.field(static=True, default=1e-12)
     regularization: float = eqx.field(static=True, default=0.0)
-    max_iter: int = eqx.field(static=True, default=200)
     at_iterate: bool = eqx.field(static=True, default=False)
 
     def attach(
@@ -123,25 +67,9 @@ class FixedPointRule(eqx.Module):
             gain: alpha k, by ball.
             contact: the contact decision.
         """
-
-        @jax.custom_jvp
-        def given(y, gain, contact):
-            return y
-
-        @given.defjvp
-        def rule(primals, tangents):
-            y, gain, contact = primals
-            ends = y if self.at_iterate else jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
-
-            def update(y, gain):
-                # the branch below the floor for every ball in contact; the others stay where they are
-                return jnp.where(contact, y - gain * y, jnp.zeros_like(y))
-
-            options = {key: getattr(self, key) for key in ("tolerance", "regularization", "max_iter")}
-            moved = fixed_point_tangent(update, ends, (gain,), (tangents[1],), **options)
-            return y, jnp.where(contact, moved, tangents[0])
-
-        return given(y, gain, contact)
+        ends = y if self.at_iterate else _Settled().attach(y, gain, contact)
+        moved = lax.stop_gradient(-ends / (gain + self.regularization)) * _moving(gain)
+        return lax.stop_gradient(y) + jnp.where(contact, moved, _moving(y))
 
 
 class _Settled(eqx.Module):
@@ -160,28 +88,25 @@ class Implicit(BallMethod):
     whatever the gain. What the unrolled one gives by k is an artefact of the tolerance.
 
     Attributes:
-        tolerance, regularization, max_iter: of the linear solve.
+        regularization: added to 1 - dG/dy, for a gain too small to divide by.
         at_iterate: take the stopped iterate for the fixed point (an error of the order of the tolerance).
     """
 
-    tolerance: float = 1e-12
     regularization: float = 0.0
-    max_iter: int = 200
     at_iterate: bool = False
 
     name = "implicit"
     description = (
-        "the derivative of the fixed point that the solver approaches, not of the iterations it took; a "
-        "linear solve with a tolerance of its own"
+        "the derivative of the fixed point that the solver approaches, not of the iterations it took"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
-        """The derivative, by reverse mode through the linear solve.
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
+        """The derivative, by reverse mode.
 
         Raises:
-            InputError: nothing is iterated here, or the linear system is too ill conditioned.
+            InputError: nothing is iterated here, or 1 - dG/dy is too ill conditioned.
 
-        Error: tolerance times the condition number of 1 - dG/dy, and what regularization moves.
+        Error: rounding times the condition number of 1 - dG/dy, and what regularization moves.
         """
         contact = problem.world.contact
         if not isinstance(contact, Projection):
@@ -196,7 +121,7 @@ class Implicit(BallMethod):
                 f"1 - dG/dy has the condition number {condition:.3g}; expected at most {LIMIT:g}",
                 remedy="Regularize the solve, and read the derivative as that of a regularized problem.",
             )
-        rule = FixedPointRule(self.tolerance, self.regularization, self.max_iter, self.at_iterate)
+        rule = FixedPointRule(self.regularization, self.at_iterate)
         attached = _with_contact(problem, replace(contact, derivative=rule))
         value, slopes = attached.value_and_grad(names)
         # what the run would be if every solve ended at its fixed point
@@ -207,10 +132,10 @@ class Implicit(BallMethod):
             if not self.at_iterate and not use[name].depends:
                 use[name] = Use(False, f"the fixed point does not depend on {name}")
         details = {
-            "tolerance": self.tolerance, "regularization": self.regularization, "condition": condition,
+            "regularization": self.regularization, "condition": condition,
             "at": "the stopped iterate" if self.at_iterate else "the fixed point",
         }  # fmt: skip
-        return self.result(value, slopes, use, details)
+        return self.of(value, slopes, use, details)
 
 
 def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
@@ -270,7 +195,7 @@ class SoftFloor(BallMethod):
         "the derivative of another program, whose floor acts over a width eps; its loss is another too"
     )
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """The derivative, by reverse mode, of the smooth program; the value is its loss.
 
         Raises:
@@ -283,7 +208,6 @@ class SoftFloor(BallMethod):
         if not eps > 0:
             raise InputError(f"eps is {eps}", remedy="Choose a width above 0.", where="eps")
         soft = softened(problem, eps)
-        problem.values(names)
         # the soft floor's own stiffness and width are not what these names mean in the given program
         own = () if isinstance(problem.world.contact, Penalty) else (*_SOLVER, "eps", "rest_speed")
         here = [name for name in names if (name in START or problem.world.has(name)) and name not in own]
@@ -294,7 +218,7 @@ class SoftFloor(BallMethod):
                 slopes[name], use[name] = 0.0, Use(False, f"the smooth program has no {name}")
         hard = problem.value()
         details = {"eps": eps, "loss_of_the_given_program": hard, "bias_of_the_loss": value - hard}
-        return self.result(value, slopes, use, details)
+        return self.of(value, slopes, use, details)
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
@@ -346,18 +270,18 @@ class ThroughContacts(BallMethod):
     """The derivative of the ball's motion, contacts included, rather than of the steps that imitate it.
 
     A step decides about contact at its end, so its derivative does not know that a ball which starts higher
-    arrives later. Here a tangent is carried along with the rollout and multiplied by the saltation matrix at
-    every contact. Where the impact is located inside the step the program's own derivative is already this
-    one. A projection is read as the impact that it stands for. The force of a spring without a damper does
-    not jump: of a spring this is the unrolled derivative, and says so.
+    arrives later. Here every contact has the derivative of its saltation matrix. Where the impact is located
+    inside the step the program's own derivative is already this one. A projection is read as the impact that
+    it stands for. The force of a spring without a damper does not jump: of a spring this is the unrolled
+    derivative, and says so.
     """
 
     name = "event-aware"
     kind = "flow"
     description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
-    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
-        """The derivative, by tangents that are carried with the rollout.
+    def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
+        """The derivative, by reverse mode.
 
         Raises:
             NumericalError: a contact grazes the floor, so that its time has no derivative.
@@ -366,19 +290,20 @@ class ThroughContacts(BallMethod):
         as the rollout itself.
         """
         world = problem.world
-        run = problem.run(keep=False)
         located = isinstance(world.integrator, EventLocated)
         smooth = isinstance(world.contact, Penalty) and world.contact.smooth
+        run = problem.run(keep=not (located or smooth))
         if located or smooth:
             value, slopes = problem.value_and_grad(names)
             events = int(run.iterations.sum()) if located else 0
             # the time of an impact without speed has an infinite derivative
             flagged = 0 if np.all(np.isfinite(list(slopes.values()))) else 1
         else:
-            at = problem.origin(names)
-            value, slopes, events, flagged = _tangents(at, world, *problem.start_arrays, *problem.bare)
-            value, events = float(value), int(events)
-            slopes = {name: float(slopes[name]) for name in names}
+            contact: Any = world.contact
+            kind = next(own for given, own in _SALTATING.items() if isinstance(contact, given))
+            parts = {one.name: getattr(contact, one.name) for one in fields(contact)}
+            value, slopes = _with_contact(problem, kind(**parts)).value_and_grad(names)
+            events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
                 f"contacts that graze the floor: {int(flagged)}; their time has no derivative",
@@ -391,107 +316,55 @@ class ThroughContacts(BallMethod):
             elif name in _SOLVER and isinstance(world.contact, Projection):
                 use[name] = Use(False, f"the impact that is solved for does not depend on {name}")
         spring = isinstance(world.contact, Penalty) and not float(world.contact.damping)
-        made = self.result(value, slopes, use, {"events": events, "located": located})
+        made = self.of(value, slopes, use, {"events": events, "located": located})
         return replace(made, description=_SPRING) if spring else made
 
 
-@eqx.filter_jit
-def _tangents(values, world, y0, v0, steps, loss):
-    """Loss, its derivatives, the number of contacts and of those that graze."""
-    dtype = world.policy.dtype("loss")
-    names = list(values)
-    rest = {name: value for name, value in values.items() if name not in START}
+class _SaltatingReset:
+    """A contact that resets the velocity at the end of a step, with the derivative of the motion."""
 
-    def begin(values):
-        y, v = (
-            old + values[name].astype(old.dtype) if name in values else old
-            for name, old in zip(START, (y0, v0), strict=True)
+    def move(self, motion: Motion) -> Moved:
+        """The step of the contact; derivatives go through the flight and the saltation matrix alone."""
+        made = super().move(motion)  # type: ignore[misc]
+        height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
+        arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
+        held, free = lax.stop_gradient(bounce), lax.stop_gradient(motion.free)
+        reset = jnp.stack([_pair(nothing + 1, nothing), _pair(nothing, nothing - held)], axis=-2)
+        before, after = _pair(arrived, free), _pair(-held * arrived, free)
+        rate, along = _pair(nothing, -arrived * _moving(bounce)), _pair(_moving(height), _moving(v))
+        kicked = carry(along, reset, before, after, _normal(arrived), reset_rate=rate)
+        contact = made.record.contact
+        falls, rests = contact & (arrived < 0), contact & (made.v == 0)
+        moved = jnp.where(rests[:, None], 0.0, jnp.where(falls[:, None], kicked, along))
+        y, v, left = (lax.stop_gradient(one) for one in (made.y, made.v, made.record.left))
+        return made._replace(
+            y=y + moved[:, 0].astype(y.dtype),
+            v=v + moved[:, 1].astype(v.dtype),
+            record=made.record._replace(left=left),
         )
-        state = world.with_values({name: values[name] for name in rest}).start(y, v)
-        return (state.y, state.v, state.a), state
-
-    def along(name):
-        return {key: jnp.full_like(value, key == name) for key, value in values.items()}
-
-    def step(carried, _):
-        state, tangents, total, rates, events, flagged = carried
-        after, record = world.advance(state)
-        moved = {
-            name: _carry(world, rest, values, along(name), state, after, record, tangents[name])
-            for name in names
-        }
-
-        def adds(y, v, left):
-            return loss.step(after._replace(y=y, v=v), record._replace(left=left), dtype)
-
-        rates = {
-            name: rates[name]
-            + jax.jvp(adds, (after.y, after.v, record.left), (*moved[name][0][:2], moved[name][1]))[1]
-            for name in names
-        }
-        hit, grazes = _events(world, state, after, record)
-        total = total + loss.step(after, record, dtype)
-        new = {name: moved[name][0] for name in names}
-        return (after, new, total, rates, events + hit, flagged + grazes), None
-
-    state = begin(values)[1]
-    nothing = jnp.zeros((), dtype)
-    count = jnp.zeros((), jnp.int64)
-    started = {name: jax.jvp(lambda given: begin(given)[0], (values,), (along(name),))[1] for name in names}
-    carried = (state, started, nothing, dict.fromkeys(names, nothing), count, count)
-    (state, tangents, total, rates, events, flagged), _ = jax.lax.scan(step, carried, None, length=steps)
-
-    def ends(y, v, total):
-        return loss.end(state._replace(y=y, v=v), steps, total)
-
-    slopes = {
-        name: jax.jvp(ends, (state.y, state.v, total), (*tangents[name][:2], rates[name]))[1]
-        for name in names
-    }
-    return ends(state.y, state.v, total), slopes, events, flagged
 
 
-def _advance(world: World, rest: dict, state: BallState, told: BallDecisions):
-    """One told step as a function of what carries derivatives."""
-
-    def run(values, y, v, a):
-        given = world.with_values({name: values[name] for name in rest})
-        after, record = given.advance(state._replace(y=y, v=v, a=a), imposed=told)
-        return after.y, after.v, after.a, record.left, record.height
-
-    return run
+class _SaltatingImpact(_SaltatingReset, Impact):
+    pass
 
 
-def _flight(world: World, state: BallState, record: BallRecord) -> BallDecisions:
-    return BallDecisions(jnp.zeros_like(record.contact), jnp.zeros_like(record.solve.iterations))
+class _SaltatingProjection(_SaltatingReset, Projection):
+    pass
 
 
-def _carry(world, rest, values, seed, state, after, record, tangent):
-    """A tangent over one step, with the saltation term of its contacts."""
-    point = (values, state.y, state.v, state.a)
-    if isinstance(world.contact, Penalty):
-        # a spring that starts at 0 moves no tangent, a damper does: the force jumps by -damping v
-        sign = jnp.where(record.contact, -1.0, 1.0).astype(state.v.dtype)
-        flips = record.contact != state.touching
-        still, jump = jnp.zeros_like(state.v), sign * world.contact.damping * state.v
-        before, behind = _pair(state.v, still), _pair(state.v, still + jump)
-        kicked = carry(_pair(*tangent[:2]), None, before, behind, _normal(state.v))
-        dy = jnp.where(flips, kicked[:, 0], tangent[0])
-        dv = jnp.where(flips, kicked[:, 1], tangent[1])
-        _, out = jax.jvp(_advance(world, rest, state, record.decisions), point, (seed, dy, dv, tangent[2]))
-        return out[:3], out[3]
-    flight = _advance(world, rest, state, _flight(world, state, record))
-    (_, v, free, _, _), (dy, dv, da, _, _) = jax.jvp(flight, point, (seed, *tangent))
-    bounce = world.contact.restitution.astype(v.dtype)
-    nothing = jnp.zeros_like(v)
-    reset = jnp.stack([_pair(nothing + 1, nothing), _pair(nothing, nothing - bounce)], axis=-2)
-    rate = _pair(nothing, -v * seed["restitution"].astype(v.dtype)) if "restitution" in seed else 0.0
-    out = carry(_pair(dy, dv), reset, _pair(v, free), _pair(-bounce * v, free), _normal(v), reset_rate=rate)
-    falls = record.contact & (v < 0)
-    rests = record.contact & (after.v == 0)
-    dy = jnp.where(rests, nothing, jnp.where(falls, out[:, 0], dy))
-    dv = jnp.where(rests, nothing, jnp.where(falls, out[:, 1], dv))
-    return (dy, dv, da), jnp.zeros_like(record.left)
+class _SaltatingPenalty(Penalty):
+    def move(self, motion: Motion) -> Moved:
+        """A spring that starts at 0 moves no tangent, a damper does: the force jumps by -damping v."""
+        contact = super().move(motion).record.contact
+        y, v = lax.stop_gradient((motion.y, motion.v))
+        jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v
+        along, still = _pair(_moving(motion.y), _moving(motion.v)), jnp.zeros_like(v)
+        kicked = carry(along, None, _pair(v, still), _pair(v, jump), _normal(v))
+        moved = jnp.where((contact != motion.touching)[:, None], kicked, along)
+        return super().move(motion._replace(y=y + moved[:, 0], v=v + moved[:, 1]))
+
+
+_SALTATING = {Penalty: _SaltatingPenalty, Projection: _SaltatingProjection, Impact: _SaltatingImpact}
 
 
 def _pair(y, v):
@@ -502,15 +375,19 @@ def _normal(v):
     return _pair(jnp.ones_like(v), jnp.zeros_like(v))
 
 
-def _events(world, state, after, record):
-    """How many contacts this step has, and how many of them graze."""
+def _events(problem: BallProblem, run: BallRun) -> tuple[int, int]:
+    """How many contacts a run has, and how many of them graze."""
+    world, contact = problem.world, run.contact
+    free = jax.vmap(lambda step: world.free(step, contact.shape[1:]))(jnp.arange(run.steps))
+    free, v = np.asarray(free, np.float64), run.v[:-1].astype(np.float64)
     if isinstance(world.contact, Penalty):
-        hits, v = record.contact != state.touching, state.v
+        start = world.start(problem.y0, problem.v0)
+        hits = contact != np.vstack([np.asarray(start.touching), contact[:-1]])
         # without a damper nothing jumps, so there is nothing to graze
-        counts = hits & (world.contact.damping > 0)
+        counts = hits & (float(world.contact.damping) > 0)
     else:
-        (_, v, *_) = _advance(world, {}, state, _flight(world, state, record))({}, state.y, state.v, state.a)
-        hits = record.contact & (v < 0)
-        counts = hits
-    grazes = counts & grazing(_pair(v, after.a.astype(v.dtype)), _normal(v), _NARROW)
-    return jnp.sum(hits, dtype=jnp.int64), jnp.sum(grazes, dtype=jnp.int64)
+        v = v + run.h * free
+        hits = counts = contact & (v < 0)
+    normal = np.broadcast_to([1.0, 0.0], (*v.shape, 2))
+    grazes = counts & grazing(np.stack([v, free], axis=-1), normal, _NARROW)
+    return int(hits.sum()), int(grazes.sum())

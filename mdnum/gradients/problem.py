@@ -114,6 +114,8 @@ class Gradient:
 class Method:
     """A way to differentiate a rollout: a frozen dataclass of its options, in a file with a row in METHODS.
 
+    The contract of both worlds: `ball.BallMethod` is called with the problem of a ball.
+
     Attributes:
         name: as the command line has it. description: which derivative it gives, one sentence.
         kind: what it differentiates.
@@ -123,11 +125,11 @@ class Method:
     description: ClassVar[str]
     kind: ClassVar[Kind] = "steps"
 
-    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+    def reason_unavailable(self, problem: Any, names: Sequence[str]) -> str | None:
         """Why this derivative does not exist for this problem; None where it does."""
         return None
 
-    def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
+    def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
         """The derivative by the named parameters.
 
         Raises:
@@ -135,19 +137,23 @@ class Method:
         """
         return self.differentiate(problem, self.check(problem, names), progress)
 
-    def check(self, problem: Problem, names: Sequence[str]) -> tuple[str, ...]:
+    def known(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
+        """Full names of the parameters, of which there is none of another name."""
+        return parameters.resolve(problem.simulation, names)
+
+    def check(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
         """Full names of the parameters.
 
         Raises:
             InputError: no such parameter, or the method does not apply.
         """
-        full = parameters.resolve(problem.simulation, names)
+        full = self.known(problem, names)
         why = self.reason_unavailable(problem, full)
         if why is not None:
             raise InputError(f"the method {self.name} does not apply: {why}")
         return full
 
-    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+    def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         """The derivative, of names that were checked."""
         raise NotImplementedError
 

@@ -1,4 +1,5 @@
-"""The closed forms against a ball that mpmath bounces one contact at a time, in 50 digits."""
+"""The closed forms against a ball that mpmath bounces one contact at a time, in 50 digits, and a program that
+locates its impacts against them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from mdnum.ball.exact import ExactImpact, ExactPenalty, _geometric, _geometric_slope
+from mdnum.ball import EventLocated, ExactImpact, ExactPenalty, Impact, World, simulate
 from mdnum.errors import InputError
 
 EPS = 2.0**-52
@@ -22,6 +23,8 @@ BALLS = [
     (1.0, 0.5, 9.81, 1.0),
     (1.0, 0.5, 9.81, 1 - 2.0**-40),
 ]
+#: Where the sums of powers cancel most.
+NEAR_ONE = [((1.0, 0.5, 9.81, e), 300) for e in (0.999, 1 - 1e-9, 1 - 2.0**-50)]
 NAMES = ("y0", "v0", "gravity", "restitution")
 
 
@@ -61,28 +64,22 @@ def slopes(function, ball):
     ]
 
 
-def part_of(function, which):
-    """One of the values that a function returns, as a function."""
-    return lambda *p: function(*p)[which]
-
-
 def close(found, exact, ulps, scale=0.0):
     """Within so many ulps of the exact value, or of a scale where the value itself cancels."""
     return abs(mpf(float(found)) - exact) <= ulps * EPS * max(abs(exact), mpf(scale))
 
 
-@pytest.mark.parametrize("ball", BALLS)
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 40])
+@pytest.mark.parametrize(("ball", "n"), [*itertools.product(BALLS, [1, 2, 3, 7, 40]), *NEAR_ONE])
 def test_impacts_with_their_derivatives(ball, n):
     exact = ExactImpact(*ball)
-    quantities = {
-        "time": (exact.impact_time(n), lambda *p: bounce(*p, n)[-1][0]),
-        "speed": (exact.impact_speed(n), lambda *p: bounce(*p, n)[-1][1]),
-    }
-    for what, (found, function) in quantities.items():
-        assert close(found.value, function(*map(mpf, ball)), 10 + 2 * n), what
+    for which, found in enumerate((exact.impact_time(n), exact.impact_speed(n))):
+
+        def function(*p, which=which):
+            return bounce(*p, n)[-1][which]
+
+        assert close(found.value, function(*map(mpf, ball)), 10 + 2 * n), which
         for name, slope in zip(NAMES, slopes(function, ball), strict=True):
-            assert close(found.gradient[name], slope, 20 + 4 * n, scale=1e-40), (what, name)
+            assert close(found.gradient[name], slope, 20 + 4 * n, scale=1e-40), (which, name)
 
 
 @pytest.mark.parametrize("ball", BALLS[:5])
@@ -113,7 +110,10 @@ def test_the_state_between_impacts_with_its_derivatives(ball):
             assert exact.bounces(t) == impacts
             y, v = exact.state(t)
             for found, which, most in ((y, 0, abs(float(v.value))), (v, 1, ball[2])):
-                function = part_of(lambda *p, t=t, n=impacts: fly(*p, mpf(t), n), which)
+
+                def function(*p, t=t, n=impacts, which=which):
+                    return fly(*p, mpf(t), n)[which]
+
                 # the promise: the motion at a time some ulps away, and some ulps of the parts summed
                 scale = most * t + abs(float(found.value)) + float(times[0][1]) * (t if which == 0 else 1)
                 assert close(found.value, function(*map(mpf, ball)), 8 + 2 * impacts, scale), (t, which)
@@ -135,6 +135,12 @@ def test_the_state_is_the_one_after_the_impact_and_rest_is_rest():
     for gradient in (y.gradient, v.gradient):
         for name in NAMES:
             assert gradient[name][-2:].tolist() == [0, 0]
+    # without restitution the first impact is the last
+    exact = ExactImpact(1.0, 0.0, 8.0, 0.0)
+    assert exact.bounces(np.array([0.25, 0.5, 3.0])).tolist() == [0, 1, 1]
+    assert exact.height(np.array([0.25, 0.5, 3.0])).value.tolist() == [0.75, 0, 0]
+    assert float(exact.rest_time().value) == 0.5
+    assert float(exact.rest_time().gradient["restitution"]) == 1.0
 
 
 def test_no_time_is_lost_on_the_way_to_rest():
@@ -151,23 +157,6 @@ def test_no_time_is_lost_on_the_way_to_rest():
     # the apex between impacts n and n + 1 is (e^n s)² / (2 g)
     apex = exact.impact_speed(n + 1).value ** 2 / (2 * 9.81)
     assert np.all(y <= apex + 4 * EPS * rest * exact.impact_speed(n + 1).value)
-
-
-def test_without_restitution_the_first_impact_is_the_last():
-    exact = ExactImpact(1.0, 0.0, 8.0, 0.0)
-    assert exact.bounces(np.array([0.25, 0.5, 3.0])).tolist() == [0, 1, 1]
-    assert exact.height(np.array([0.25, 0.5, 3.0])).value.tolist() == [0.75, 0, 0]
-    assert float(exact.rest_time().value) == 0.5
-    assert float(exact.rest_time().gradient["restitution"]) == 1.0
-
-
-@pytest.mark.parametrize("e", [0.3, 0.999, 1 - 1e-9, 1 - 2.0**-50])
-@pytest.mark.parametrize("m", [1, 2, 5, 300])
-def test_geometric_sums_next_to_one(e, m):
-    value = sum(mpf(e) ** k for k in range(m))
-    slope = sum(k * mpf(e) ** (k - 1) for k in range(1, m))
-    assert close(_geometric(e, np.float64(m)), value, 8)
-    assert close(_geometric_slope(e, np.float64(m)), slope, 40, scale=1e-40)
 
 
 @pytest.mark.parametrize(
@@ -189,6 +178,18 @@ def test_geometric_sums_next_to_one(e, m):
 def test_what_has_no_exact_motion_is_refused(motion, message):
     with pytest.raises(InputError, match=message):
         motion()
+
+
+def test_located_impacts_meet_the_exact_motion_at_every_step():
+    exact = ExactImpact(1.0, -0.5, 9.81, 0.8)
+    world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
+    run = simulate(world, world.start(1.0, -0.5), 340)
+    assert int(run.iterations.sum()) == int(exact.bounces(3.4)) == 8
+    y, v = exact.state(run.time)
+    np.testing.assert_allclose(run.y[:, 0], y.value, atol=2e-14)
+    # next to an impact a rounding of the time moves the velocity across it
+    away = np.abs(run.time[:, None] - exact.impact_time(np.arange(1, 12)).value).min(axis=1) > 1e-9
+    np.testing.assert_allclose(run.v[away, 0], v.value[away], atol=2e-13)
 
 
 # The spring floor
@@ -235,7 +236,10 @@ def test_the_spring_floor_with_its_derivatives(ball):
     for t in np.array([0.4, 1.02, 1.3, 1.9, 2.7, 4.1]) * float(exact.first_contact().value):
         y, v = exact.state(t)
         for found, which in ((y, 0), (v, 1)):
-            function = part_of(lambda *p, t=t: spring(*p, mpf(t)), which)
+
+            def function(*p, t=t, which=which):
+                return spring(*p, mpf(t))[which]
+
             size = 1 + abs(float(found.value))
             assert close(found.value, function(*map(mpf, ball)), 400, size), (t, which)
             for name, slope in zip(exact.NAMES, slopes(function, ball), strict=True):

@@ -7,13 +7,16 @@ import math
 import numpy as np
 import pytest
 from ball import oracles
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mdnum import ball
 from mdnum.errors import InputError
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Sequential
+
+NIGHTLY = pytest.mark.nightly
+SUM6 = ball.GlobalSum(1e-6)
 
 
 def solve(depths, stop, k=0.5, alpha=0.5, policy=None, steps=1, history=False):
@@ -27,16 +30,9 @@ def solve(depths, stop, k=0.5, alpha=0.5, policy=None, steps=1, history=False):
     return ball.simulate(world, start, steps, history=history)
 
 
-@pytest.mark.parametrize(("tol", "iterations"), [(1e-2, 14), (1e-4, 30), (1e-6, 46)])
-def test_known_iteration_counts(tol, iterations):
-    assert solve([0.45], ball.GlobalSum(tol)).iterations[0] == iterations
-
-
-@given(
-    st.floats(0.05, 0.9),
-    st.floats(1e-6, 1e-2),
-    st.floats(0.05, 1.0),
-)
+@given(st.floats(0.05, 0.9), st.floats(1e-6, 1e-2), st.floats(0.05, 1.0))
+@example(0.25, 1e-2, 0.45)
+@example(0.25, 1e-6, 0.45)
 def test_iterations_follow_from_the_contraction(gain, tol, depth):
     run = solve([depth], ball.GlobalSum(tol, 1000), k=gain, alpha=1.0, history=True)
     count = int(run.iterations[0])
@@ -44,84 +40,73 @@ def test_iterations_follow_from_the_contraction(gain, tol, depth):
     # within rounding of a whole number of iterations either neighbor is right
     allowed = {max(0, math.ceil(exact + shift)) for shift in (-1e-9, 0, 1e-9)}
     assert count in allowed or (exact == int(exact) and count == exact + 1)
-    history = run.history[0]
-    there = history[np.isfinite(history)]
-    assert len(there) == count + 1
-    np.testing.assert_allclose(there[1:] / there[:-1], 1 - gain, rtol=1e-12)
+    made = run.history[0][np.isfinite(run.history[0])]
+    assert len(made) == count + 1
+    np.testing.assert_allclose(made[1:] / made[:-1], 1 - gain, rtol=1e-12)
 
 
-def test_the_cap_is_named_and_the_margin_says_by_how_much():
-    run = solve([0.45], ball.GlobalSum(1e-9, 46))
-    assert run.ended() == {"cap": 1}
-    assert run.iterations[0] == 46
-    np.testing.assert_allclose(run.margin[0], 1e-9 - 0.45 * 0.75**46, rtol=1e-12)
-    met = solve([0.45], ball.GlobalSum(1e-6, 46))
-    assert met.ended() == {"tolerance": 1}
-    assert met.margin[0] > 0 > met.before[0]
+def needed(tol: float, depth: float) -> int:
+    """Iterations that each leave three quarters."""
+    return math.ceil(math.log(tol / depth) / math.log(0.75))
 
 
-def test_a_fixed_count_decides_nothing():
-    run = solve([0.45, 0.0], ball.FixedCount(7))
-    assert run.iterations[0] == 7
-    assert run.ended() == {"fixed": 1}
+@pytest.mark.parametrize(
+    ("depths", "rule", "iterations", "ended"),
+    [
+        ([0.45], ball.GlobalSum(1e-9, 46), 46, "cap"),
+        ([0.45], ball.GlobalSum(1e-6, 46), 46, "tolerance"),
+        ([0.45, 0.0], ball.FixedCount(7), 7, "fixed"),
+        # each ball by itself
+        ([0.45, 1e-3, 0.0, 1e-7], ball.PerInstance(1e-4), [30, 9, 0, 0], "tolerance"),
+        # starts above one threshold and runs below another
+        ([0.9e-3], ball.HysteresisStop(SUM6, 1e-3), 0, "tolerance"),
+        ([1.1e-3], ball.HysteresisStop(SUM6, 1e-3), needed(1e-6, 1.1e-3), "tolerance"),
+        *(([depth], ball.Relative(1e-3), needed(1e-3, 1.0), "tolerance") for depth in (1e-8, 1.0, 1e5)),
+        ([0.0], ball.Relative(1e-3), 0, "tolerance"),
+    ],
+)
+def test_a_rule_ends_a_solve(depths, rule, iterations, ended):
+    run = solve(depths, rule)
+    np.testing.assert_array_equal(run.iterations[0], iterations)
+    assert list(run.ended()) == [ended]
+    if iterations == 46:
+        # the margin says by how much
+        np.testing.assert_allclose(run.margin[0], rule.tol - 0.45 * 0.75**46, rtol=1e-9)
+        assert run.margin[0] > run.before[0] and run.before[0] < 0
 
 
 def test_a_global_sum_couples_balls_and_a_rule_per_ball_does_not():
     near = 1e-4 / 0.75**10 * (1 - 1e-9)
     for rule, coupling in ((ball.GlobalSum, 1), (ball.Relative, 0), (ball.PerInstance, 0), (ball.Maximum, 0)):
-        alone = solve([near], rule(1e-4))
-        joined = solve([near, 1e-12], rule(1e-4))
-        both = solve([near, 1e-8], rule(1e-4))
-        counts = [int(np.ravel(run.iterations[0])[0]) for run in (alone, joined, both)]
-        assert counts[2] - counts[0] == coupling, rule
-        assert counts[1] == counts[0]
-
-
-def test_each_ball_stops_by_itself():
-    depths = np.array([0.45, 1e-3, 0.0, 1e-7])
-    run = solve(depths, ball.PerInstance(1e-4))
-    expected = [max(0, math.ceil(math.log(1e-4 / p) / math.log(0.75))) if p else 0 for p in depths]
-    np.testing.assert_array_equal(run.iterations[0], expected)
-    assert run.iterations.shape == (1, 4)
-
-
-def test_hysteresis_starts_above_one_threshold_and_runs_below_another():
-    rule = ball.HysteresisStop(ball.GlobalSum(1e-6), 1e-3)
-    assert solve([0.9e-3], rule).iterations[0] == 0
-    assert solve([1.1e-3], rule).iterations[0] == math.ceil(math.log(1e-6 / 1.1e-3) / math.log(0.75))
-
-
-def test_relative_tolerance_scales():
-    for depth in (1e-8, 1.0, 1e5):
-        assert solve([depth], ball.Relative(1e-3)).iterations[0] == math.ceil(math.log(1e-3) / math.log(0.75))
-    assert solve([0.0], ball.Relative(1e-3)).iterations[0] == 0
+        runs = [solve(depths, rule(1e-4)) for depths in ([near], [near, 1e-12], [near, 1e-8])]
+        alone, joined, both = (int(np.ravel(run.iterations[0])[0]) for run in runs)
+        assert (joined, both) == (alone, alone + coupling), rule
 
 
 @pytest.mark.parametrize(
-    "dtype", ["float16", *(pytest.param(x, marks=pytest.mark.nightly) for x in ("bfloat16", "float32"))]
+    "dtype", ["float16", pytest.param("bfloat16", marks=NIGHTLY), pytest.param("float32", marks=NIGHTLY)]
 )
 def test_nothing_to_solve_is_below_a_relative_tolerance_in_every_dtype(dtype):
     run = solve([0.0], ball.Relative(1e-2, 7), policy=RolePrecision(dtype, dtype, dtype, dtype, "float64"))
-    assert run.ended() == {"tolerance": 1}
-    assert run.iterations[0] == 0
+    assert (run.ended(), run.iterations[0]) == ({"tolerance": 1}, 0)
 
 
-@pytest.mark.parametrize(("dtype", "accumulate", "iterations"), [
-    ("float32", "float32", 1),
-    ("bfloat16", "bfloat16", 0),
-    ("bfloat16", "float32", 1),
-    pytest.param("float16", "float16", 0, marks=pytest.mark.nightly),
-    pytest.param("float16", "float32", 1, marks=pytest.mark.nightly),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("dtype", "accumulate", "iterations"),
+    [
+        ("float32", "float32", 1), ("bfloat16", "bfloat16", 0), ("bfloat16", "float32", 1),
+        pytest.param("float16", "float16", 0, marks=NIGHTLY),
+        pytest.param("float16", "float32", 1, marks=NIGHTLY),
+    ],
+)  # fmt: skip
 def test_a_fragile_sum_stops_before_the_first_iteration(dtype, accumulate, iterations):
     low = "bfloat16" if dtype == "float32" else dtype
-    kind = oracles.DTYPES[low]
-    tol = kind(1e-3)
-    below = np.nextafter(tol, kind(0)) if low == "float16" else kind(float(tol) - 2.0**-17)
-    ulp = float(tol) - float(below)
+    tol = oracles.DTYPES[low](1e-3)
+    below = float(np.nextafter(tol, tol.dtype.type(0)))
+    ulp = float(tol) - below
     policy = RolePrecision(dtype, dtype, accumulate, accumulate, "float32")
-    depths = np.array([float(below)] + [ulp / 8] * 8)
-    run = solve(depths, ball.GlobalSum(float(tol), 25, Sequential()), policy=policy, steps=4)
+    rule = ball.GlobalSum(float(tol), 25, Sequential())
+    run = solve([below] + [ulp / 8] * 8, rule, policy=policy, steps=4)
     np.testing.assert_array_equal(run.iterations, [iterations, 0, 0, 0])
 
 

@@ -64,28 +64,22 @@ def test_a_derivative_that_is_exactly_zero_is_never_silent(problem):
         jax.grad(differentiable(hard, ("r_cut",), "symmetric"))({"r_cut": jnp.asarray(2.2)})
 
 
-def test_what_cannot_be_traced_or_named_is_refused(problem):
-    loss = differentiable(problem, ("sigma",), "symmetric")
-    with pytest.raises(InputError, match="outside of jit"):
-        jax.jit(loss)({"sigma": jnp.asarray(1.0)})
-    with pytest.raises(InputError, match="not asked for"):
-        loss({"epsilon": 1.0})
-    with pytest.raises(InputError, match="Did you mean symmetric"):
-        value_and_grad(problem, ("sigma",), "symetric")
-    with pytest.raises(InputError, match="seed"):
-        value_and_grad(problem, ("seed",))
-    with pytest.raises(InputError, match="expected finite numbers"):
-        loss({"sigma": jnp.asarray(np.nan)})
-
-
-def test_a_loss_that_is_no_number_is_refused_before_the_run(problem):
+def test_what_is_no_loss_or_cannot_be_traced_or_named_is_refused(problem):
+    loss, simulation = differentiable(problem, ("sigma",), "symmetric"), problem.simulation
     vector = Custom(see=lambda frame, origin, around: jnp.sum(frame.x, axis=1))
-    with pytest.raises(InputError, match="shape \\(3,\\)"):
-        Problem(problem.simulation, vector, STEPS)
     count = Custom(see=lambda frame, origin, around: frame.step, conclude=lambda total, frames: total)
-    with pytest.raises(InputError, match="int"):
-        Problem(problem.simulation, count, STEPS)
-    assert Problem(problem.simulation, MeanPotential(), STEPS).loss.name == "potential"
+    for ask, text in (
+        (lambda: jax.jit(loss)({"sigma": jnp.asarray(1.0)}), "outside of jit"),
+        (lambda: loss({"epsilon": 1.0}), "not asked for"),
+        (lambda: value_and_grad(problem, ("sigma",), "symetric"), "Did you mean symmetric"),
+        (lambda: value_and_grad(problem, ("seed",)), "seed"),
+        (lambda: loss({"sigma": jnp.asarray(np.nan)}), "expected finite numbers"),
+        (lambda: Problem(simulation, vector, STEPS), "shape \\(3,\\)"),
+        (lambda: Problem(simulation, count, STEPS), "int"),
+    ):
+        with pytest.raises(InputError, match=text):
+            ask()
+    assert Problem(simulation, MeanPotential(), STEPS).loss.name == "potential"
 
 
 def test_every_name_is_that_of_its_method():

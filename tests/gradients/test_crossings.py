@@ -54,34 +54,23 @@ def along(gradient: dict[str, np.ndarray], axis: int) -> dict[str, float]:
 
 def test_leaving_a_well_has_the_derivatives_of_the_closed_form(well):
     problem, axis = well
-    found = EventAware()(problem, NAMES)
-    got = along(found.gradient, axis)
-    for name, value in exact().items():
-        assert got[name] == pytest.approx(value, abs=1e-4), name
-    assert found.details["crossings"] == 1
-
-
-def test_without_the_flip_the_error_is_an_eighth_and_the_radius_seems_not_to_matter(well):
-    problem, axis = well
-    found = Symmetric()(problem, NAMES)
-    got, true = along(found.gradient, axis), exact()
-    assert got["initial.positions"] == pytest.approx(0.875 * true["initial.positions"], rel=2e-3)
-    assert got["cutoff.radius"] == 0.0
-    assert "exactly 0" in found.notes["cutoff.radius"]
-    assert "event-aware" in found.notes["potential.sigma"]
-
-
-def test_a_crossing_slower_than_the_guard_is_left_out_and_listed(well):
-    problem, axis = well
-    # far above any speed of this run
-    found = EventAware(guard=100.0)(problem, NAMES)
-    plain = Symmetric()(problem, NAMES)
-    assert along(found.gradient, axis) == along(plain.gradient, axis)
-    (row,) = found.details["heaviest"]
-    assert row["grazing"] and found.details["grazing"] == 1
+    aware, plain = EventAware()(problem, NAMES), Symmetric()(problem, NAMES)
+    true, steps = exact(), along(plain.gradient, axis)
+    assert along(aware.gradient, axis) == pytest.approx(true, abs=1e-4)
+    assert aware.details["crossings"] == 1
+    # without the flip the error is an eighth, and the radius seems not to matter
+    assert steps["initial.positions"] == pytest.approx(0.875 * true["initial.positions"], rel=2e-3)
+    assert steps["cutoff.radius"] == 0.0
+    assert "exactly 0" in plain.notes["cutoff.radius"]
+    assert "event-aware" in plain.notes["potential.sigma"]
+    # a crossing slower than the guard, far above any speed of this run, is left out and listed
+    guarded = EventAware(guard=100.0)(problem, NAMES)
+    assert along(guarded.gradient, axis) == steps
+    (row,) = guarded.details["heaviest"]
+    assert row["grazing"] and guarded.details["grazing"] == 1
     # its weight is what it would have added to the derivative by the radius
-    assert row["weight"] == pytest.approx(exact()["cutoff.radius"], abs=1e-4)
-    assert found.details["weight left out"] == abs(row["weight"])
+    assert row["weight"] == pytest.approx(true["cutoff.radius"], abs=1e-4)
+    assert guarded.details["weight left out"] == abs(row["weight"])
 
 
 def averages(w: str, time: float) -> dict[str, float]:
@@ -163,12 +152,6 @@ def forward(hot):
     return {jumps: list(tangents(hot, names, saltation=jumps, states=True)) for jumps in (False, True)}
 
 
-@pytest.fixture(scope="module")
-def backward(hot):
-    """Reverse passes in which every flip grazes and none does: one program, plain and event-aware."""
-    return {jumps: reverse(hot, saltation=True, guard=0.0 if jumps else np.inf) for jumps in (False, True)}
-
-
 def agree(ours, theirs):
     for name, value in theirs.items():
         scale = max(float(np.max(np.abs(value))), 1e-300)
@@ -176,30 +159,29 @@ def agree(ours, theirs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jumps", [False, True])
-def test_tangents_agree_with_the_reverse_pass(hot, forward, backward, jumps):
+def test_tangents_agree_with_the_reverse_pass_and_flips_add_their_weights(hot, forward):
     names = resolve(hot.simulation, WORDS)
-    ours = gathered(hot.simulation, names, by_column(hot, forward[jumps][-1].total))
-    theirs = {name: gradient(hot.simulation, backward[jumps][0], name) for name in names}
-    agree(ours, theirs)
-    # with flips, and only with them, the radius counts
-    assert np.all((theirs["cutoff.radius"] != 0) == jumps)
-
-
-@pytest.mark.slow
-def test_what_flips_add_is_the_sum_of_their_weights(hot, forward, backward):
-    names = resolve(hot.simulation, WORDS)
-    (plain, _), (parts, found) = backward[False], backward[True]
-    added, count = 0.0, 0
-    for met, part in zip(reversed(found), forward[False], strict=True):
-        assert part.dr is not None and part.dr_cut is not None
+    # in which every flip grazes and none does: one program, plain and event-aware
+    passes = {jumps: reverse(hot, saltation=True, guard=0.0 if jumps else np.inf) for jumps in (False, True)}
+    theirs = {
+        jumps: {name: gradient(hot.simulation, parts, name) for name in names}
+        for jumps, (parts, _) in passes.items()
+    }
+    for jumps, value in theirs.items():
+        agree(gathered(hot.simulation, names, by_column(hot, forward[jumps][-1].total)), value)
+        # with flips, and only with them, the radius counts
+        assert np.all((value["cutoff.radius"] != 0) == jumps)
+    added = np.zeros(())
+    for met, part in zip(reversed(passes[True][1]), forward[False], strict=True):
         added = added + np.where(met.grazing, 0, met.weight) @ (part.dr_cut - part.dr)
-        count += len(met)
-    assert count > 50
-    by_name = [{name: gradient(hot.simulation, one, name) for name in names} for one in (parts, plain)]
-    difference = {name: by_name[0][name] - by_name[1][name] for name in names}
+    difference = {name: theirs[True][name] - theirs[False][name] for name in names}
     assert all(np.all(value != 0) for value in difference.values())
-    agree(gathered(hot.simulation, names, np.asarray(added)), difference)
+    agree(gathered(hot.simulation, names, added), difference)
+    # and the method is what it is made of
+    found = EventAware(guard=0.0)(Problem(hot.simulation, hot.loss, STEPS), names)
+    assert found.value == hot.value and found.gradient["potential.epsilon"].shape == (3,)
+    assert found.details["crossings"] == sum(len(part.crossings) for part in forward[True]) > 50
+    agree(theirs[True], found.gradient)
 
 
 @pytest.mark.slow
@@ -231,16 +213,6 @@ def test_bad_input_says_what_would_do(hot):
         Forward()(problem, ("x0",))
     with pytest.raises(InputError, match="without its flips"):
         next(tangents(RunTape(hot.simulation, hot.loss, STEPS), ("potential.sigma",), saltation=True))
-
-
-@pytest.mark.slow
-def test_the_method_is_what_it_is_made_of(hot, forward):
-    names = resolve(hot.simulation, WORDS)
-    found = EventAware(guard=0.0)(Problem(hot.simulation, hot.loss, STEPS), names)
-    ours = gathered(hot.simulation, names, by_column(hot, forward[True][-1].total))
-    assert found.value == hot.value and ours["potential.epsilon"].shape == (3,)
-    assert found.details["crossings"] == sum(len(part.crossings) for part in forward[True]) > 50
-    agree(ours, found.gradient)
 
 
 @pytest.mark.slow

@@ -58,8 +58,7 @@ def test_replicas_differ_in_velocities_of_one_temperature(hard):
     assert np.mean(kinetic) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (3 * 108 * 30)))
     assert len({float(one.velocities[0, 0]) for one in starts}) == 30
     assert np.abs(np.sum(starts[0].velocities, axis=0)).max() < 1e-12
-    settled = replica(hard, 3, settle=5)
-    assert not np.array_equal(settled.positions, hard.positions)
+    assert not np.array_equal(replica(hard, 3, settle=5).positions, hard.positions)
     with pytest.raises(InputError, match="at least 2"):
         Replicas(1)
 
@@ -105,6 +104,10 @@ def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps()
     assert float(plain.gradient["cutoff.radius"]) == 0.0
 
 
+def by_sigma(method: Method, problem: Problem) -> float:
+    return float(method(problem, ("sigma",)).gradient["potential.sigma"])
+
+
 @pytest.mark.slow
 def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one(smooth):
     cutoff = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
@@ -112,16 +115,10 @@ def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one(smooth):
     problem = Problem(
         build(make(crystal(), LENNARD_JONES, cutoff, precision=narrow)), MeanSquaredDisplacement(), 30
     )
-    shadow = ShadowDifferences(levels=2)(problem, ("sigma",))
-    true = Symmetric()(replace(problem, simulation=smooth), ("sigma",))
-    assert float(shadow.gradient["potential.sigma"]) == pytest.approx(
-        float(true.gradient["potential.sigma"]), rel=1e-6
-    )
+    true = by_sigma(Symmetric(), replace(problem, simulation=smooth))
+    assert by_sigma(ShadowDifferences(levels=2), problem) == pytest.approx(true, rel=1e-6)
     # the narrow run's own differences are noise of a rounding over the step
-    own = FiniteDifferences(levels=2)(problem, ("sigma",))
-    assert float(own.gradient["potential.sigma"]) != pytest.approx(
-        float(true.gradient["potential.sigma"]), rel=1e-4
-    )
+    assert by_sigma(FiniteDifferences(levels=2), problem) != pytest.approx(true, rel=1e-4)
     with pytest.raises(InputError, match="no wider format"):
         ShadowDifferences()(replace(problem, simulation=smooth), ("sigma",))
 
@@ -134,10 +131,8 @@ def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
     twin = replace(problem, simulation=switched)
     assert found.value == pytest.approx(twin.value(), rel=1e-12)
     assert found.value != pytest.approx(problem.value(), rel=1e-6)
-    own = Symmetric()(twin, ("sigma",))
-    assert float(found.gradient["potential.sigma"]) == pytest.approx(
-        float(own.gradient["potential.sigma"]), rel=1e-10
-    )
+    own = by_sigma(Symmetric(), twin)
+    assert float(found.gradient["potential.sigma"]) == pytest.approx(own, rel=1e-10)
     assert "switched twin" in found.notes["potential.sigma"]
     with pytest.raises(InputError, match="no force jump"):
         Surrogate()(twin, ("sigma",))
@@ -150,14 +145,10 @@ def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_the_noise_of_many_draws_is_found_within_a_factor_of_a_few(noise, slope):
     rng = np.random.default_rng(1)
-    found = [
-        noise_of(2.0 + slope * np.arange(7) * 1e-14 + noise * rng.standard_normal(7)) for _ in range(300)
-    ]
-    assert np.quantile(found, 0.05) > noise / 4
-    assert np.quantile(found, 0.95) < 4 * noise
-
-
-def test_without_noise_there_is_none():
+    line = 2.0 + slope * np.arange(7) * 1e-14
+    found = [noise_of(line + noise * rng.standard_normal(7)) for _ in range(300)]
+    assert noise / 4 < np.quantile(found, 0.05) < np.quantile(found, 0.95) < 4 * noise
+    # without noise there is none
     assert noise_of(np.full(7, 1.25)) == 0
 
 

@@ -103,14 +103,14 @@ def test_diffusion_is_told_per_unit_of_time():
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences(run):
     """All three at once, with weights that no symmetry cancels: one reverse pass to compile."""
-    weights = jnp.asarray(np.random.default_rng(1).standard_normal(BINS))
-    rdf = replace(RDF, weights=weights)
+    rdf = replace(RDF, weights=jnp.asarray(np.random.default_rng(1).standard_normal(BINS)))
+    losses, frames = (rdf, EINSTEIN, GREEN_KUBO), (STEPS // 2 + 1, STEPS // 2 + 1, 1)
 
-    def see(frame, origin, around):
-        return tuple(loss.observe(frame, origin, around) for loss in (rdf, EINSTEIN, GREEN_KUBO))
+    def see(*frame):
+        return tuple(loss.observe(*frame) for loss in losses)
 
-    def conclude(total, frames):
-        return rdf.value(total[0], frames) + EINSTEIN.value(total[1], frames) + GREEN_KUBO.value(total[2], 1)
+    def conclude(total, _):
+        return sum(loss.value(*given) for loss, *given in zip(losses, total, frames, strict=True))
 
     problem = Problem(run.simulation, Custom(see=see, conclude=conclude, every=2), STEPS)
     names = ("sigma", "timestep", "scale")
@@ -121,13 +121,14 @@ def test_derivatives_are_those_of_differences(run):
 
 
 def test_what_has_no_meaning_is_refused(run):
-    with pytest.raises(InputError, match="half the smallest box width"):
-        Problem(run.simulation, RadialDistribution(r_max=2.7), STEPS)
-    with pytest.raises(InputError, match="goes up to step 50"):
-        Problem(run.simulation, GreenKuboDiffusion(until=50), STEPS)
-    with pytest.raises(InputError, match="two frames"):
-        Problem(run.simulation, EinsteinDiffusion(first=40), STEPS)
-    with pytest.raises(InputError, match="no volume"):
-        Problem(build("pair/leaving-well"), MeanPressure(), 10)
+    well = build("pair/leaving-well")
+    for simulation, loss, steps, text in (
+        (run.simulation, RadialDistribution(r_max=2.7), STEPS, "half the smallest box width"),
+        (run.simulation, GreenKuboDiffusion(until=50), STEPS, "goes up to step 50"),
+        (run.simulation, EinsteinDiffusion(first=40), STEPS, "two frames"),
+        (well, MeanPressure(), 10, "no volume"),
+    ):
+        with pytest.raises(InputError, match=text):
+            Problem(simulation, loss, steps)
     with pytest.raises(InputError, match=r"expected \(24,\)"):
         replace(RDF, target=jnp.ones(3))

@@ -38,12 +38,12 @@ REACH = 2.0
 _NEIGHBORS = 20
 
 
-#: Columns of integers, of vectors, and those that the reverse pass, tangents and other runs put in.
+#: Columns of the table of turning points: integers, vectors, and numbers.
 _WHOLE, _VECTORS = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
-_LATER = ("weight", "moved", "shift")
-_COLUMNS = (*_WHOLE, *_VECTORS, *_LATER, "gap", "bend", "unseen", "part", "before", "after")
+_NUMBERS = ("gap", "bend", "unseen", "part", "before", "after", "weight", "shift")
 
 
+@dataclass(frozen=True)
 class Turns:
     """Turning points of pairs near their cutoff.
 
@@ -63,19 +63,7 @@ class Turns:
             part: where between the two steps, 0 to 1. before, after: distances at the two steps.
     """
 
-    def __init__(self, rows: list[dict[str, np.ndarray]], columns: int = 0):
-        count = sum(len(row["step"]) for row in rows)
-        later = {
-            "weight": np.zeros(count), "moved": np.full((count, columns), np.nan), "shift": np.zeros(count)
-        }  # fmt: skip
-        self.table: dict[str, np.ndarray] = {}
-        for name in _COLUMNS:
-            given = bool(rows) and name in rows[0]
-            empty = np.zeros((0, 3) if name in _VECTORS else 0, np.int64 if name in _WHOLE else np.float64)
-            self.table[name] = (
-                np.concatenate([row[name] for row in rows]) if given else later.get(name, empty)
-            )
-        self.table["unseen"] = self.table["unseen"].astype(bool)
+    table: dict[str, np.ndarray]
 
     def __len__(self) -> int:
         return len(self.table["step"])
@@ -150,7 +138,7 @@ class Near:
             return
         simulation = self.simulation
         self.rows = max(self.rows, len(stretch.x))
-        self._found[stretch.first] = found = turning(simulation, stretch).table
+        self._found[stretch.first] = found = turning(simulation, stretch)
         row, a, b = found["row"], found["a"], found["b"]
         half = 0.5 * float(simulation.integrator.timestep)
         masses = simulation.masses[stretch.table.order]
@@ -208,14 +196,23 @@ class Near:
 
     def turns(self, columns: int) -> Turns:
         """All of them, in the order of their steps."""
-        rows = [dict(found) for found in reversed(self._found.values())]
-        for row in rows:
-            if row["moved"].shape[1] != columns:
-                row["moved"] = np.full((len(row["step"]), columns), np.nan)
-        made = Turns(rows, columns)
-        order = np.argsort(made.table["step"], kind="stable")
-        made.table = {name: column[order] for name, column in made.table.items()}
-        return made
+        rows = [
+            # where no tangents have been, how far the cutoff moves is not known
+            found | {"moved": found.get("moved", np.full((len(found["step"]), columns), np.nan))}
+            for found in reversed(self._found.values())
+        ]
+        table = _joined(rows, moved=np.zeros((0, columns)))
+        order = np.argsort(table["step"], kind="stable")
+        return Turns({name: column[order] for name, column in table.items()})
+
+
+def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, np.ndarray]:
+    """Tables under one another; without any, one without rows."""
+    empty = {name: np.zeros(0, np.int64) for name in _WHOLE}
+    empty |= {name: np.zeros((0, 3)) for name in _VECTORS} | {name: np.zeros(0) for name in _NUMBERS}
+    empty |= more
+    table = {name: np.concatenate([row[name] for row in rows] or [none]) for name, none in empty.items()}
+    return table | {"unseen": table["unseen"].astype(bool)}
 
 
 def hermite(
@@ -241,8 +238,12 @@ def hermite(
     return u, r0 + u * (first + u * (square + u * cube)), (2 * square + 6 * u * cube) / time**2
 
 
-def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
-    """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
+def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarray]:
+    """The turning points of pairs near their cutoff within a stretch, from distances and their rates.
+
+    Returns:
+        the table of `Turns`, its weights and shifts still 0, and without what moves.
+    """
     order = stretch.table.order
     i, j, kind = listed(simulation, stretch.table)
     radius = np.asarray(simulation.decider.r_cut, np.float64)[kind]
@@ -286,7 +287,7 @@ def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
                     side, ends = np.sign(bend), np.stack([r0[turned], r[turned]]) - cut[turned]
                     gap = side * (there - cut[turned])
                     raw = (stretch.x[row][:, b[turned]] - stretch.x[row][:, a[turned]]).T.astype(np.float64)
-                    names = {"step": stretch.first + row, "row": row}
+                    names = {"step": stretch.first + row, "row": row, "weight": 0.0, "shift": 0.0}
                     rows.append(
                         {name: np.full(len(turned), value) for name, value in names.items()}
                         | {
@@ -298,6 +299,5 @@ def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
                         }
                     )  # fmt: skip
             before = (r, rate, d)
-    made = Turns(rows)
-    made.table["images"] = np.rint(made.table["images"] @ np.asarray(simulation.cell.inverse, np.float64))
-    return made
+    table = _joined(rows)
+    return table | {"images": np.rint(table["images"] @ np.asarray(simulation.cell.inverse, np.float64))}

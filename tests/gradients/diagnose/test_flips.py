@@ -4,6 +4,7 @@ against where free flight puts them."""
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,7 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose import GradientDiagnosis, diagnose, edges, flips
-from mdnum.gradients.diagnose.flips import FlipTerms
+from mdnum.gradients.diagnose import diagnose, edges, flips
 from mdnum.gradients.losses import MeanSquaredDisplacement
 from mdnum.gradients.parameters import with_values
 from mdnum.plain import plain
@@ -32,61 +32,44 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def whole(problem) -> GradientDiagnosis:
+def whole(problem) -> Any:
     parts = ("growth", "agreement", "flips", "detective", "scaling")
     return diagnose(problem, (*NAMES, "v0"), parts=parts, methods=["event-aware", "symmetric"])
 
 
-@pytest.fixture(scope="module")
-def found(whole) -> FlipTerms:
-    return whole.flips
-
-
 def test_all_parts_tell_of_one_run(problem, whole):
     assert not whole.failed and whole.value == problem.value()
-    aware = whole.agreement.gradient("event-aware")
-    for name in NAMES:
-        value = float(aware.gradient[name])
-        assert whole.growth.table[f"gradient.{name}"][-1] == pytest.approx(value, rel=1e-12)
-        assert whole.flips.total[name] == pytest.approx(value, rel=1e-12)
     means = {(one.name, one.meaning) for one in whole.agreement.comparisons}
     assert ("cutoff.radius", "missing saltation") in means
     assert not whole.detective.found and whole.scaling.format == "float16"
     written = json.loads(json.dumps(plain(whole), allow_nan=False))
     assert written["growth"]["word"] == whole.growth.word and written["trust"] is None
-
-
-def test_contributions_sum_to_what_event_aware_adds(whole, found):
-    """The two gradients come from reverse passes, the contributions from tangents too."""
-    aware, plain = (whole.agreement.gradient(word).gradient for word in ("event-aware", "symmetric"))
-    assert found.flips > 100
-    for name in NAMES:
-        added = float(aware[name] - plain[name])
-        assert found.table[f"contribution.{name}"].sum() == pytest.approx(added, rel=1e-9), name
-        assert found.smooth[name] == pytest.approx(float(plain[name]), rel=1e-9, abs=1e-12), name
-        assert sum(found.share[name].values()) == pytest.approx(1.0, rel=1e-9), name
-    assert found.smooth["cutoff.radius"] == 0.0 and found.half["cutoff.radius"] < found.flips
-
-
-def test_the_heaviest_come_first_and_the_start_is_skipped(found):
-    parts = [np.abs(found.table[f"contribution.{name}"]) for name in found.total]
-    sizes = [part / part.sum() for part in parts]
-    heaviest = np.max(sizes, axis=0)
-    assert np.all(np.diff(heaviest) <= 0)
-    assert found.skipped == {"initial.velocities": 324}
-    assert {len(column) for column in found.table.values()} == {found.flips}
-
-
-def test_by_the_start_alone_there_are_no_contributions(problem):
     with pytest.raises(InputError, match="324 entries"):
         flips(problem, ("v0",))
 
 
-def test_what_grazes_contributes_nothing(problem, found):
+def test_contributions_sum_to_what_event_aware_adds_the_heaviest_first(whole):
+    """The two gradients come from reverse passes, the contributions from tangents too."""
+    aware, steps = (whole.agreement.gradient(word).gradient for word in ("event-aware", "symmetric"))
+    found, heaviest = whole.flips, 0.0
+    assert found.flips > 100 and {len(column) for column in found.table.values()} == {found.flips}
+    for name in NAMES:
+        parts = found.table[f"contribution.{name}"]
+        heaviest = np.maximum(heaviest, np.abs(parts) / np.abs(parts).sum())
+        assert parts.sum() == pytest.approx(float(aware[name] - steps[name]), rel=1e-9), name
+        assert found.smooth[name] == pytest.approx(float(steps[name]), rel=1e-9, abs=1e-12), name
+        assert sum(found.share[name].values()) == pytest.approx(1.0, rel=1e-9), name
+        assert found.total[name] == pytest.approx(float(aware[name]), rel=1e-12)
+        assert whole.growth.table[f"gradient.{name}"][-1] == pytest.approx(found.total[name], rel=1e-12)
+    assert found.smooth["cutoff.radius"] == 0.0 and found.half["cutoff.radius"] < found.flips
+    assert np.all(np.diff(heaviest) <= 0) and found.skipped == {"initial.velocities": 324}
+
+
+def test_what_grazes_contributes_nothing(problem, whole):
     """With a guard above most speeds."""
     guarded = flips(problem, NAMES, guard=1.0)
     grazing, speed = guarded.table["grazing"], np.abs(guarded.table["radial_speed"])
-    assert 0 < guarded.grazing == grazing.sum() < guarded.flips and not found.grazing
+    assert 0 < guarded.grazing == grazing.sum() < guarded.flips and not whole.flips.grazing
     assert not guarded.table["contribution.cutoff.radius"][grazing].any()
     assert np.all(speed[grazing] < speed[~grazing].min())
 
@@ -108,13 +91,9 @@ def flying():
     )
 
 
-@pytest.fixture(scope="module")
-def near(flying):
-    return edges(flying, "temperature", reach=0.5)
-
-
-def test_boundaries_lie_where_free_flight_puts_them(flying, near):
+def test_boundaries_lie_where_free_flight_puts_them(flying):
     """The pair enters at the first step k with APART - 2 v k dt < RADIUS, and v goes with the root of T."""
+    near = edges(flying, "temperature", reach=0.5)
     timestep = float(flying.simulation.integrator.timestep)
     entered = int(np.ceil((APART - RADIUS) / (2 * SPEED * timestep)))
     assert entered == 13
@@ -127,19 +106,9 @@ def test_boundaries_lie_where_free_flight_puts_them(flying, near):
         assert edge.distance == abs(edge.inside - near.value)
         # hotter, it is inside a step earlier
         assert edge.step == k
-
-
-def test_the_gradient_jumps_where_the_kicks_do(near):
-    """One more or one fewer kick inside the cutoff."""
-    for edge in (near.below, near.above):
-        inside, beyond = edge.gradient_inside["symmetric"], edge.gradient_beyond["symmetric"]
-        assert abs(beyond - inside) > 1e-6 * abs(inside)
-        assert edge.value_beyond != edge.value_inside
-
-
-def test_where_nothing_changes_within_reach_that_is_said(flying):
-    found = edges(flying, "temperature", reach=1e-6)
-    assert not found.below.found and not found.above.found and np.isnan(found.above.inside)
+        # the gradient jumps where the kicks do: one more or one fewer inside the cutoff
+        within, beyond = edge.gradient_inside["symmetric"], edge.gradient_beyond["symmetric"]
+        assert abs(beyond - within) > 1e-6 * abs(within) and edge.value_beyond != edge.value_inside
 
 
 def test_along_the_radius_a_boundary_is_where_the_distance_is(flying):
@@ -152,8 +121,9 @@ def test_along_the_radius_a_boundary_is_where_the_distance_is(flying):
     assert found.above.gradient_inside["symmetric"] == 0.0
 
 
-def test_several_entries_and_a_wide_reach_are_refused(flying):
-    with pytest.raises(InputError, match="6 entries"):
-        edges(flying, "v0")
-    with pytest.raises(InputError, match="reach"):
-        edges(flying, "sigma", reach=2.0)
+def test_where_nothing_changes_within_reach_that_is_said(flying):
+    found = edges(flying, "temperature", reach=1e-6)
+    assert not found.below.found and not found.above.found and np.isnan(found.above.inside)
+    for name, reach, text in (("v0", 0.01, "6 entries"), ("sigma", 2.0, "reach")):
+        with pytest.raises(InputError, match=text):
+            edges(flying, name, reach=reach)

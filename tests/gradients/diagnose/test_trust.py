@@ -46,6 +46,8 @@ def problem(smooth):
 def test_every_horizon_has_the_gradient_of_its_own_run(problem):
     """A mean over frames, of which shorter runs have fewer."""
     at = spread(problem, 4)
+    # those that look at nothing are left out
+    assert spread(problem, 20)[0] == 6
     assert at.tolist() == [15, 30, 45, 60]
     found = horizons(problem, ("potential.sigma",), at)
     for k in (1, 3):
@@ -55,17 +57,10 @@ def test_every_horizon_has_the_gradient_of_its_own_run(problem):
         assert found.gradient[k, 0] == pytest.approx(slope.value, rel=1e-7)
 
 
-def test_horizons_that_look_at_nothing_are_left_out(problem):
-    assert spread(problem, 20)[0] == 6
-
-
 def made(gradient, flips=()) -> Horizons:
     gradient = np.asarray(gradient, float)[:, None]
     flips = np.array(flips, np.int64).reshape(-1, 4)
     return Horizons(np.arange(len(gradient)), (ParameterEntry("q"),), gradient[:, 0], gradient, flips)
-
-
-AT = np.array([10, 20, 30, 40, 50])
 
 
 @pytest.mark.parametrize(
@@ -84,32 +79,32 @@ AT = np.array([10, 20, 30, 40, 50])
     ],
 )
 def test_how_far_differences_stay_below_a_limit(judge, values, found):
-    assert judge(AT, {"p": np.zeros(5), "q": np.array(values, float)}, 1.0) == found
+    at = np.array([10, 20, 30, 40, 50])
+    assert judge(at, {"p": np.zeros(5), "q": np.array(values, float)}, 1.0) == found
 
 
-def test_a_gradient_that_grew_is_not_trusted_before_other_starts_were_looked_at():
-    fine = [Limit(what, 2000, False, "agree") for what in ("rounding", "time step", "near miss")]
-    alone = [*fine, Limit("standard error", None, False, "not asked")]
-    assert verdict_of(alone, 2000, True, False) == ("undecided", 2000, "", ("other starts",))
-    assert verdict_of(alone, 2000, False, False)[0] == "trusted"
-    assert verdict_of(alone, 2000, False, True)[0] == "undecided"
-    several = [*fine, Limit("standard error", 2000, False, "scatter")]
-    assert verdict_of(several, 2000, True, False)[:3] == ("trusted", 2000, "")
-    scattered = [*fine, Limit("standard error", 350, True, "scatter")]
-    assert verdict_of(scattered, 2000, True, False)[:3] == ("limited", 350, "standard error")
+FINE = [Limit(what, 2000, False, "agree") for what in ("rounding", "time step", "near miss")]
 
 
-def test_half_the_time_step_of_a_thermostat_is_another_noise(problem):
-    assert not no_half_step(problem.simulation)
-    dynamics = {"kind": "langevin", "friction": 1.0, "timestep": 0.004, "temperature": 1.0, "seed": 3}
-    noisy = build(make(crystal(), LENNARD_JONES, QUINTIC, dynamics=dynamics))
-    assert no_half_step(noisy)
+@pytest.mark.parametrize(
+    ("scatter", "grew", "skipped", "verdict"),
+    [
+        # a gradient that grew is not trusted before other starts were looked at
+        ((None, False), True, False, ("undecided", 2000, "", ("other starts",))),
+        ((None, False), False, False, ("trusted", 2000, "", ())),
+        ((None, False), False, True, ("undecided", 2000, "", ("parameters of many entries",))),
+        ((2000, False), True, False, ("trusted", 2000, "", ())),
+        ((350, True), True, False, ("limited", 350, "standard error", ())),
+    ],
+)
+def test_the_verdict_follows_from_the_limits(scatter, grew, skipped, verdict):
+    limits = [*FINE, Limit("standard error", *scatter, "scatter")]
+    assert verdict_of(limits, 2000, grew, skipped) == verdict
 
 
 def test_the_standard_error_is_that_of_the_mean():
     runs = [made([1.0, 1.0]), made([1.0, -1.0]), made([1.0, 3.0])]
-    found = standard_error(runs)["q"]
-    assert found.tolist() == pytest.approx([0.0, 2 / np.sqrt(3)])
+    assert standard_error(runs)["q"].tolist() == pytest.approx([0.0, 2 / np.sqrt(3)])
 
 
 @pytest.mark.parametrize(
@@ -130,10 +125,13 @@ def test_a_shadow_is_wider_where_there_is_a_wider_format(problem):
     moved = np.abs(ours.positions - problem.simulation.positions)
     assert not none and 0 < moved.max() < 1e-14
     wide, narrow = shadow_of(build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW)))
-    assert narrow == ("float32",)
+    assert narrow == ("float32",) and wide.decider.dtype == "float64"
     force = eqx.filter(wide.force, eqx.is_inexact_array)
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(force)} == {"float64"}
-    assert wide.decider.dtype == "float64"
+    # half the time step of a thermostat is another noise
+    dynamics = {"kind": "langevin", "friction": 1.0, "timestep": 0.004, "temperature": 1.0, "seed": 3}
+    assert no_half_step(build(make(crystal(), LENNARD_JONES, QUINTIC, dynamics=dynamics)))
+    assert not no_half_step(problem.simulation)
 
 
 @pytest.mark.slow
