@@ -63,27 +63,6 @@ def test_a_contact_one_step_earlier_is_the_cause():
     assert len({(cell.arithmetic, cell.decisions, cell.reference) for cell in found.table}) == 8
 
 
-def test_one_more_solver_iteration_is_the_cause():
-    rules = ball.GlobalSum(1e-3), ball.PerInstance(1e-3)
-    world, each = (
-        ball.World.create(ball.Projection(1.5, 1.0, rule), ball.SemiImplicitEuler(0.01)) for rule in rules
-    )
-
-    def iterations(y0):
-        return int(ball.simulate(world, world.start(y0), 400).iterations[:60].sum())
-
-    # a ball that passes the floor by the tolerance or a little less: iterated past the floor, or put on it
-    heights = np.linspace(1.0, 1.05, 400)
-    counts = ball.simulate(each, world.start(heights), 60).iterations.sum(axis=0)
-    place = int(np.flatnonzero(counts[1:] != counts[:-1])[0])
-    low, high = adjacent(iterations, float(heights[place]), float(heights[place + 1]))
-    found = fork(balls(world, world, low, high, 400), split=1e-4)
-    assert found.decision is not None and found.decision.channel == "stop"
-    assert abs(found.decision.a - found.decision.b) == 1
-    assert found.dates.split is not None and found.series["B|A"].max() < 1e-13
-    assert found.verdict.word == "cause"
-
-
 SPRING = ball.World.create(ball.Penalty(1e4), ball.SemiImplicitEuler(1e-3))
 
 
@@ -434,22 +413,6 @@ def test_other_steps_are_those_of_the_program(systems):
 
 
 # --- maps ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_boundaries_of_a_ball_are_adjacent_floats_with_the_decision_between_them(systems):
-    found = boundaries(systems["batch"], "k", 0.45, 0.55, cells=8, most=3, confirm=False)
-    assert found.boundaries and found.number.key == "k" and found.number.unit == ""
-    for edge in found.boundaries:
-        assert edge.above.at == np.nextafter(edge.below.at, 1.0) and edge.channel in ("stop", "contact")
-        assert edge.below.decided != edge.above.decided and edge.below.digest != edge.above.digest
-        number = program_of(systems["batch"]).number("k")
-        runs = [number.at(side.at).run(50) for side in (edge.below, edge.above)]
-        first = cross_decisions(*runs)[0]
-        assert (first.step, first.channel, first.a, first.b) == (
-            edge.step, edge.channel, edge.below.decided, edge.above.decided,
-        )  # fmt: skip
-        assert np.isfinite([edge.below.gradient, edge.above.gradient, edge.below.margin, edge.jump]).all()
 
 
 def relaxation(folder, tol: float, extra: str = "") -> BallSystem:

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_systems
 from forks.harness import made as twin_of
+from rollout.harness import evaluated, listed, terms_of
 
 from mdnum.forks.choices import parse, unavailable
 from mdnum.forks.choices.arithmetic import FORMATS
 from mdnum.forks.reordered import ReorderedSimulation
+from mdnum.forks.worlds import varied
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
-from mdnum.numerics.reductions import Exact
-from mdnum.numerics.sums import Halves, Sequential, Tap, Twice
+from mdnum.numerics.sums import Halves, Sequential, Twice
 from mdnum.systems.build import Simulation, build
 
 
@@ -37,8 +37,7 @@ def simulation() -> Simulation:
 @pytest.fixture(scope="module")
 def rows(simulation: Simulation) -> np.ndarray:
     """Neighbors within the list radius, one row per atom, sorted, padded at the end."""
-    wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
-    return np.sort(simulation.verlet_list().build(wrapped, simulation.cell).unsorted(), axis=1)
+    return np.sort(listed(simulation)[1].unsorted(), axis=1)
 
 
 def forces_of_jax_md(simulation: Simulation, rows: np.ndarray, format: Any):
@@ -117,19 +116,14 @@ def test_the_forces_of_each_format_of_jax_md_are_sums_in_one_order(simulation, r
     assert rows.shape[1] > 32
     mixed = np.stack([np.random.default_rng(i).permutation(row) for i, row in enumerate(rows)])
     seen = {}
-    for kind, listed in (("sorted", rows), ("mixed", mixed)):
+    for kind, order in (("sorted", rows), ("mixed", mixed)):
         for format in FORMATS:
-            forces, idx = forces_of_jax_md(simulation, listed, format)
+            forces, idx = forces_of_jax_md(simulation, order, format)
             seen[kind, format] = np.asarray(forces(jnp.asarray(idx)))
             # a list on the host is packed to the front; a dense one stays as it is
-            assert np.array_equal(seen[kind, format], modeled(listed, terms, format)), (kind, format)
+            assert np.array_equal(seen[kind, format], modeled(order, terms, format)), (kind, format)
     different = {force.tobytes() for force in seen.values()}
     assert len(different) == 6
-
-
-@eqx.filter_jit
-def _evaluated(force, x, tables):
-    return force(x, tables, decisions=False)
 
 
 @pytest.mark.slow
@@ -137,42 +131,36 @@ def _evaluated(force, x, tables):
 def test_the_choice_adds_in_the_order_of_the_format(simulation, rows, format):
     made = ReorderedSimulation.of(simulation, format)
     assert made.reduction == {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}[format]
-    wrapped, _ = wrap_positions(made.cell, made.positions)
-    table = made.verlet_list().build(wrapped, made.cell)
-    x = jnp.asarray(wrapped[table.order].T)
-    tap = Tap(Exact())
-    jax.block_until_ready(_evaluated(replace(made, reduction=tap).force, x, made.tables(table)))
-    jax.effects_barrier()
-    atoms = len(table.order)
+    x, table, tables = listed(made)
+    seen, atoms = terms_of(made, x, tables), len(table.order)
     terms = {}
     for slot, column in zip(*np.nonzero(table.index < atoms), strict=True):
         pair = int(table.order[column]), int(table.order[table.index[slot, column]])
-        terms[pair] = np.array([tap.seen[axis][slot, column] for axis in range(3)])
+        terms[pair] = np.array([seen[axis][slot, column] for axis in range(3)])
     assert all(np.array_equal(term, -terms[j, i]) for (i, j), term in terms.items())
-    listed = [[j for j in row if j < atoms] for row in rows.tolist()]
+    real = [[j for j in row if j < atoms] for row in rows.tolist()]
     if format == "ordered-sparse":
         expected = modeled(rows, terms, format)
     elif format == "sparse":
         # in sorted rows both halves of the sum are one order
-        plain = np.array([in_order(terms[i, j] for j in row) for i, row in enumerate(listed)])
+        plain = np.array([in_order(terms[i, j] for j in row) for i, row in enumerate(real)])
         assert np.array_equal(modeled(rows, terms, "sparse"), plain)
         # backwards, because forwards the loop streams, and XLA then contracts a product and a sum into one
         made = replace(made, reduction=Sequential("reversed"))
-        expected = np.array([in_order(terms[i, j] for j in row[::-1]) for i, row in enumerate(listed)])
+        expected = np.array([in_order(terms[i, j] for j in row[::-1]) for i, row in enumerate(real)])
     else:
-        halves = [[0.5 * terms[i, j] for j in row] for i, row in enumerate(listed)]
+        halves = [[0.5 * terms[i, j] for j in row] for i, row in enumerate(real)]
         expected = np.array([in_order(row, in_order(row)) for row in halves])
     force = np.empty((atoms, 3))
-    force[table.order] = np.asarray(_evaluated(made.force, x, made.tables(table)).force).T
+    force[table.order] = np.asarray(evaluated(made.force, x, tables).force).T
     assert np.array_equal(force, expected)
 
 
 def test_a_list_in_another_format_holds_the_same_pairs(simulation):
-    wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
-    plain = simulation.verlet_list().build(wrapped, simulation.cell)
+    plain = listed(simulation)[1]
     for word in FORMATS:
         twin = twin_of(f"format={word}", simulation.system)
-        table = twin.b.simulation.verlet_list().build(wrapped, simulation.cell)
+        table = listed(twin.b.simulation)[1]
         held, before = (np.sort(one.unsorted(), axis=1)[:, : plain.occupancy] for one in (table, plain))
         assert np.array_equal(held, before)
         assert table.pairs == plain.pairs and table.slots % 8 == 0
@@ -181,9 +169,5 @@ def test_a_list_in_another_format_holds_the_same_pairs(simulation):
         labels = np.append(table.order, len(table.order))[table.index]
         for half in np.split(labels, 2 if word == "ordered-sparse" else 1):
             assert (np.diff(half, axis=0) >= 0).all()
-    assert unavailable(parse("format=sparse"), replace(simulation.system, spec=_pairwise(simulation)))
-
-
-def _pairwise(simulation: Simulation):
-    spec = simulation.system.spec
-    return spec.model_copy(update={"precision": spec.precision.model_copy(update={"reduction": "pairwise"})})
+    pairwise = varied(simulation.system, {"precision.reduction": "pairwise"})
+    assert unavailable(parse("format=sparse"), pairwise)

@@ -8,8 +8,6 @@ import pytest
 from oracles import all_pairs, margins
 from rollout.harness import assert_ledger_is_complete, go, liquid, write_system
 
-from mdnum.systems import load
-
 R_CUT = 2.0
 
 
@@ -145,10 +143,3 @@ def test_the_epoch_table_accounts_for_every_step(path, tmp_path):
         assert epochs["occupancy"][row] <= epochs["capacity"][row]
     assert np.all(series["displacement"] <= skin / 2)
     assert np.all(epochs["build_ms"] > 0)
-
-
-def test_settings_reach_the_rule(path):
-    from mdnum.systems.build import build
-
-    rule = build(load(path, {"neighbors.rebuild.every": 7, "neighbors.rebuild.delay": 3})).rule
-    assert (rule.every, rule.delay, rule.check, rule.skin) == (7, 3, True, 0.3)

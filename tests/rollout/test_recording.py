@@ -34,26 +34,16 @@ def rows_and_end(simulation, last, record):
     return {name: np.concatenate(values) for name, values in numbers.items()}, state, closed
 
 
-def same(a, b):
-    assert a.keys() == b.keys()
-    for name in a:
-        assert a[name].tobytes() == b[name].tobytes(), name
-
-
 def test_a_run_that_is_recorded_has_the_bits_of_one_that_is_not(path):
     simulation = build(load(path))
-    seen, seen_end, seen_closed = rows_and_end(simulation, STEPS, True)
-    blind, blind_end, blind_closed = rows_and_end(simulation, STEPS, False)
-    assert len(seen["potential"]) == STEPS + 1 and len(seen_closed) > 2
-    same(seen, blind)
-    same(seen_end, blind_end)
-    assert seen_closed == blind_closed
-
-
-def test_two_runs_have_the_same_bits(path):
-    first, second = (rows_and_end(build(load(path)), STEPS, True) for _ in range(2))
-    same(first[0], second[0])
-    same(first[1], second[1])
+    seen, blind, again = (rows_and_end(simulation, STEPS, record) for record in (True, False, True))
+    assert len(seen[0]["potential"]) == STEPS + 1 and len(seen[2]) > 2
+    for other in (blind, again):
+        for numbers, theirs in zip(seen[:2], other[:2], strict=True):
+            assert {name: numbers[name].tobytes() for name in numbers} == {
+                name: theirs[name].tobytes() for name in theirs
+            }
+        assert seen[2] == other[2]
 
 
 def test_hard_and_shifted_are_the_same_trajectory_with_other_energies(path, tmp_path):
@@ -79,16 +69,6 @@ def test_hard_and_shifted_are_the_same_trajectory_with_other_energies(path, tmp_
     assert np.std(x["total"]) > 5 * np.std(y["total"])
 
 
-@pytest.mark.nightly
-def test_the_order_of_the_sum_is_part_of_the_program(path, tmp_path):
-    _, one = go(tmp_path / "s", path, STEPS)
-    _, other = go(tmp_path / "p", path, STEPS, {"precision.reduction": "pairwise"})
-    a, b = one.read("series"), other.read("series")
-    assert a["potential"][0] == pytest.approx(b["potential"][0], rel=1e-13)
-    assert not np.array_equal(a["potential"], b["potential"])
-    assert np.array_equal(a["pairs"], b["pairs"])
-
-
 def record_bytes(engine, words):
     record = jax.eval_shape(lambda: engine.take(0, words))
     assert isinstance(record, EpochRecord)
@@ -100,25 +80,18 @@ def test_record_buffers_do_not_grow_with_the_steps(path):
     sizes = [record_bytes(Engine(simulation, last), 6) for last in (1_000, 100_000, 10**9)]
     assert len(set(sizes)) == 1
     assert sizes[0] <= _RECORD_BYTES
-    rows = []
-    for segment in Engine(simulation, STEPS).segments():
-        rows.append(segment.rows)
-        assert segment.record.x.shape[0] <= _MOST_ROWS
-    assert sum(rows) == STEPS + 1
-    # a large system gets fewer rows, not more memory
-    engine = Engine(simulation, 10**6)
-    engine.simulation = SimpleNamespace(atoms=200_000, policy=simulation.policy)
-    assert record_bytes(engine, 11) <= _RECORD_BYTES * 1.1
-
-
-def test_a_short_run_takes_little_room(path):
-    simulation = build(load(path))
-    engine = Engine(simulation, 3)
+    segments = list(Engine(simulation, STEPS).segments())
+    assert all(segment.record.x.shape[0] <= _MOST_ROWS for segment in segments)
+    assert sum(segment.rows for segment in segments) == STEPS + 1
+    # a large system gets fewer rows, not more memory; and a short run little room
+    engine, short = Engine(simulation, 10**6), Engine(simulation, 3)
     # where room is cheap runs of all lengths have the same, so that they are one program
-    assert engine._room(6) == Engine(simulation, 100)._room(6)
-    assert record_bytes(engine, 6) < 5e6
-    engine.simulation = SimpleNamespace(atoms=50_000, policy=simulation.policy)
-    assert 4 <= engine._room(6) <= 8
+    assert short._room(6) == Engine(simulation, 100)._room(6)
+    assert record_bytes(short, 6) < 5e6
+    for one, atoms in ((engine, 200_000), (short, 50_000)):
+        one.simulation = SimpleNamespace(atoms=atoms, policy=simulation.policy)
+    assert record_bytes(engine, 11) <= _RECORD_BYTES * 1.1
+    assert 4 <= short._room(6) <= 8
 
 
 def test_no_steps_at_all_is_one_evaluation(path, tmp_path):

@@ -65,16 +65,17 @@ def assert_same(whole, other):
     assert log == again
 
 
-def stopped_at(system, out, stop, monkeypatch, steps=STEPS):
+def stopped_at(system, out, stop, monkeypatch, **options):
     """A run that ends with an exception at the first report from step stop on."""
     monkeypatch.setattr(RunFolder, "checkpoint_due", lambda self: True)
 
     def progress(step, steps, info):
-        if info["phase"] == "run" and step >= stop:
+        if step >= stop:
             raise Stop
 
+    options = options or {"out": out, "steps": STEPS, "save_every": 10}
     with pytest.raises(Stop):
-        run(system, out=out, steps=steps, save_every=10, progress=progress)
+        run(system, progress=progress, **options)
 
 
 @pytest.mark.slow
@@ -91,55 +92,34 @@ def test_a_killed_run_resumes(path, whole, tmp_path):
     assert_same(whole, (result, RunFolder.open(out)))
 
 
-@pytest.mark.parametrize("stop", [40, 100])
-def test_a_stopped_run_resumes(path, whole, tmp_path, monkeypatch, stop):
-    stopped_at(load(path), tmp_path / "run", stop, monkeypatch)
-    result = run(None, resume=tmp_path / "run")
-    assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
-
-
 def test_a_run_may_be_stopped_again_and_again(path, whole, tmp_path, monkeypatch):
+    """Before its first step, at a checkpoint, between two, and at once after it was resumed."""
     out = tmp_path / "run"
-    stopped_at(load(path), out, 10, monkeypatch)
-    for stop in (35, 70, 71, 110):
-
-        def progress(step, steps, info, stop=stop):
-            if info["phase"] == "run" and step >= stop:
-                raise Stop
-
-        with pytest.raises(Stop):
-            run(None, resume=out, progress=progress)
+    stopped_at(load(path), out, 0, monkeypatch)
+    for stop in (10, 35, 70, 71, 110):
+        stopped_at(None, None, stop, monkeypatch, resume=out)
     result = run(None, resume=out)
     assert_same(whole, (result, RunFolder.open(out)))
 
 
-@pytest.mark.slow
-def test_the_noise_of_a_thermostat_goes_on(tmp_path, monkeypatch):
-    path = write_system(tmp_path, liquid(), dynamics={"kind": "langevin", "friction": 1.0})
-    whole = go(tmp_path / "whole", path, STEPS, save_every=10)
-    stopped_at(load(path), tmp_path / "run", 60, monkeypatch)
-    result = run(None, resume=tmp_path / "run")
-    assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
+LANGEVIN = {"dynamics.kind": "langevin", "dynamics.friction": 1.0}
+BLIND = {"neighbors.skin": 0.05, "neighbors.rebuild.every": 20, "neighbors.rebuild.check": False}
 
 
 @pytest.mark.slow
-def test_lost_pairs_are_counted_across_a_stop(path, tmp_path, monkeypatch):
-    overrides = {"neighbors.skin": 0.05, "neighbors.rebuild.every": 20, "neighbors.rebuild.check": False}
+@pytest.mark.parametrize("overrides", [LANGEVIN, BLIND])
+def test_the_noise_of_a_thermostat_and_the_count_of_lost_pairs_go_on(path, tmp_path, monkeypatch, overrides):
     system = load(path, overrides)
     whole = go(tmp_path / "whole", system, STEPS, save_every=10)
-    assert whole[0].summary["lost_pairs"] > 0
+    assert (whole[0].summary["lost_pairs"] > 0) == (overrides is BLIND)
     stopped_at(system, tmp_path / "run", 70, monkeypatch)
     result = run(None, resume=tmp_path / "run")
     assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
 
 
-def lists_of(folder):
-    return folder.read("epochs")["start"].tolist()
-
-
 @pytest.mark.parametrize("where", ["used up", "in use"])
 def test_a_finished_run_may_be_continued(path, whole, tmp_path, where):
-    start = next(start for start in lists_of(whole[1]) if start > 64)
+    start = next(start for start in whole[1].read("epochs")["start"].tolist() if start > 64)
     last = start - 1 if where == "used up" else start + 2
     go(tmp_path, path, last, save_every=10)
     result = run(None, resume=tmp_path / "run", steps=STEPS)
@@ -148,10 +128,6 @@ def test_a_finished_run_may_be_continued(path, whole, tmp_path, where):
     tables_equal(whole[1], folder, "flips")
     tables_equal(whole[1], folder, "epochs", but=("build_ms",))
     assert result.summary["rebuilds"] == whole[0].summary["rebuilds"]
-
-
-def at_once(step, steps, info):
-    raise Stop
 
 
 def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
@@ -168,16 +144,6 @@ def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
         run("argon/crystal-108", resume=whole[1].path)
     # and nothing of the first one was touched
     assert RunFolder.open(whole[1].path).rows("series") == STEPS + 1
-
-
-def test_a_run_stopped_before_its_first_step_can_be_resumed(path, whole, tmp_path):
-    with pytest.raises(Stop):
-        run(load(path), out=tmp_path / "early", steps=STEPS, save_every=10, progress=at_once)
-    run(None, resume=tmp_path / "early")
-    folder = RunFolder.open(tmp_path / "early")
-    for table in ("series", "flips"):
-        tables_equal(whole[1], folder, table)
-    tables_equal(whole[1], folder, "epochs", but=("build_ms",))
 
 
 def test_resuming_a_finished_run_leaves_it_as_it_is(path, tmp_path):
