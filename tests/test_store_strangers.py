@@ -325,6 +325,14 @@ _ANSWERS = {
 }  # fmt: skip
 
 
+def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
+    from mdnum.verbs.conform import conform
+
+    with pytest.raises(InputError, match="1,000,000,000 random cases"):
+        conform("ase", cases=10**9, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def _audit_state() -> dict:
     from mdnum.audit.base import Chart, CheckResult, finding
     from mdnum.audit.record import AuditState, encoded

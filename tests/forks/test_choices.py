@@ -47,20 +47,9 @@ def test_every_shipped_choice_is_parsed_from_its_name(world: str):
         assert isinstance(choice, Choice)
         assert choice.name == name and parse(name) == choice
         assert choice.describe(world) and "\n" not in choice.describe(world)
-
-
-@pytest.mark.parametrize(
-    "word",
-    [
-        "precision.force=float64", "precision.force=bfloat16", "format=sparse@fixed-point",
-        "reduction=permuted:3", "skin=0.5", "skin=0.5@exact", "rebuild=every:25", "order=3@fixed-point",
-        "builder=jax-md", "relabel=4", "rotate=zyx", "rotate=-x-yz@exact", "translate=0.5", "unwrapped=3",
-        "noise=7", "start=17:0:-2", "ulps=potential.pairs.Ar-Ar.sigma:-3", "start=velocity:+1",
-        "start=3:height:-1", "contact=later:2", "iterations=-1:57:2", "max_iter=+2", "stop=maximum",
-    ],
-)  # fmt: skip
-def test_arguments_are_read_and_written_alike(word: str):
-    assert parse(word).name == word
+    # arguments are read and written alike
+    for word in ("order=3@fixed-point", "rotate=-x-yz@exact", "start=3:height:-1", "iterations=-1:57:2"):
+        assert parse(word).name == word
 
 
 @pytest.mark.parametrize(
@@ -300,7 +289,7 @@ def changes(twin: Twin) -> set[str]:
 def test_a_choice_changes_what_it_names_and_nothing_else(word, file, given, expected):
     system = load(file, world="md")
     twin = made(word, varied(system, given) if given else system)
-    assert twin.difference and changes(twin) == expected
+    assert twin.difference and changes(twin) == expected and parse(word).name == word
     assert parse(word).must_hold == (word in MUST_HOLD or word in {"skin=0.5@fixed-point", "unwrapped=3"})
 
 

@@ -63,15 +63,6 @@ def forks() -> dict[str, list[Fork]]:
     }
 
 
-def test_the_starts_are_liquids():
-    for seed in STARTS:
-        atoms = liquid(seed)
-        assert 80 < atoms.get_temperature() < 110
-        # the peak that a crystal has at its own lattice vectors, 256 there
-        wave = np.exp(2j * np.pi * 4 / EDGE * atoms.positions.sum(axis=1))
-        assert abs(wave.sum()) ** 2 / len(atoms) < 20
-
-
 def test_flips_accelerate_at_a_violent_cutoff_alone(forks):
     """E-foldings that flips were worth, at eight to thirteen starts: violent 1.5 to 21, 4.4 in the median;
     usual 0.06 to 1.9, 0.26 in the median (0.8 with 864 atoms and a fifth of the time step); switched -0.5 to

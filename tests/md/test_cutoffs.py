@@ -62,19 +62,6 @@ def test_energy_and_slope_are_those_of_the_closed_form(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_jumps_are_the_limits_from_inside(kind):
-    at, smoothness = mpmath.mpf(R_CUT), CUTOFFS.parse(kind).smoothness
-    energy, force = model(kind).jumps()
-    slope = mpmath.diff(lambda r: closed_form(kind, r), at, direction=-1)
-    assert energy.shape == force.shape == (1,)
-    assert energy[0] == pytest.approx(float(closed_form(kind, at)), rel=1e-14, abs=1e-30)
-    assert force[0] == pytest.approx(float(-slope), rel=1e-12, abs=1e-12)
-    assert (energy[0] == 0) == (smoothness >= 0)
-    # attractive at the cutoff: a pair that enters brings a pull
-    assert force[0] == 0 if smoothness >= 1 else force[0] < 0
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_constants_of_several_pair_types_do_not_mix(kind):
     sigma, epsilon = jnp.asarray([1.0, 0.8, 0.88]), jnp.asarray([1.0, 1.5, 0.5])
     r_cut = 2.5 * sigma

@@ -227,25 +227,11 @@ def test_the_table_is_the_published_form():
     assert np.abs(np.asarray(charge) - form.density(between)).max() < 1e-8
 
 
-REFUSED = {
-    "a table for Cu, but the structure holds Al": lambda: made_eam(COPPER, ["Cu", "Al"]),
-    "no such potential table": lambda: made_eam(COPPER.with_name("none.alloy")),
-    "known are Si and Si-1989": lambda: manybody.tersoff("Ge"),
-    "known is Si": lambda: manybody.stillinger_weber("Ge"),
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_another_element_and_a_missing_table_are_refused(message):
-    with pytest.raises(InputError, match=message):
-        REFUSED[message]()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda t: t.replace("1 Cu\n", "2 Cu Al\n"), "a table for 2 elements"),
-        (lambda t: t.rsplit("\n", 2)[0], "2 words fewer"),
+        (lambda t: t.rsplit("\n", 2)[0], "3002 numbers"),
         (lambda t: t.replace("5.50679\n29", "6.5\n29"), "its cutoff is 6.5"),
         (lambda t: "nothing\nof\nthe kind\n", "no setfl table"),
         (lambda t: t.replace("29 63.546 3.615 fcc\n", "29 63.546 3.615 fcc\nnan "), "expected 3003"),
@@ -257,8 +243,21 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     with pytest.raises(InputError) as caught:
         made_eam(path)
     text = str(caught.value)
-    assert str(path) in text and "\n" not in text
-    assert message in text or (message == "2 words fewer" and "3002 numbers" in text)
+    assert str(path) in text and "\n" not in text and message in text
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: made_eam(COPPER, ["Cu", "Al"]), "a table for Cu, but the structure holds Al"),
+        (lambda: made_eam(COPPER.with_name("none.alloy")), "no such potential table"),
+        (lambda: manybody.tersoff("Ge"), "known are Si and Si-1989"),
+        (lambda: manybody.stillinger_weber("Ge"), "known is Si"),
+    ],
+)
+def test_another_element_and_a_missing_table_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
 
 
 def test_the_1989_constants_differ_from_those_of_1988():
