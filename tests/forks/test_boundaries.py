@@ -107,7 +107,7 @@ def test_brute_force_over_all_floats_finds_the_same(key, at, width):
 @pytest.mark.parametrize(
     ("make", "key", "low", "high", "steps"),
     # a number of the start, and one of the program
-    [(solid, "velocity.scale", 1.0, 1.01, 30), (meeting, "cutoff.radius", 2.26, 2.30, 12)],
+    [(solid, "velocity.scale", 1.0, 1.01, 30), (meeting, "cutoff.radius", 2.2, 2.3, 12)],
 )
 def test_both_sides_differ_in_a_fresh_process(make, key, low, high, steps):
     system = make()

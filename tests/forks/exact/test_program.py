@@ -14,8 +14,10 @@ from ase import Atoms
 from oracles import cut_energy
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.program import DecisionTape, ExactProgram, first_difference, taped, unsupported
+from mdnum.forks.exact.program import ExactProgram, unsupported
+from mdnum.forks.tape import DecisionTape, first_difference, taped
 from mdnum.rollout.engine import first_state
+from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation, build
 
 pytest.importorskip("flint", reason="exact runs need python-flint")
@@ -195,7 +197,7 @@ def test_species_masses_and_a_tilted_box():
     atoms.set_cell(matrix, scale_atoms=True)
     atoms.set_masses(np.linspace(0.8, 1.3, len(atoms)))
     simulation = build(small_systems.make(atoms, small_systems.KOB_ANDERSEN, {"kind": "hard", "radius": 1.6}))
-    exact, (tape, _, _) = ExactProgram(simulation).run(12), taped(simulation, 12)
+    exact, tape = ExactProgram(simulation).run(12), taped(MdProgram(simulation), 12, lambda segment: None)
     assert first_difference(exact.tape, tape) is None and exact.tape.flips > 5
     np.testing.assert_array_equal(exact.tape.inside(12), tape.inside(12))
 
