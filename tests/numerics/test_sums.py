@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import jax
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
+from rollout.harness import evaluated, liquid, listed, terms_of, write_system
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import zero_bits
@@ -27,6 +29,8 @@ from mdnum.numerics.sums import (
     Twice,
     running_sum_table,
 )
+from mdnum.systems import load
+from mdnum.systems.build import build
 
 DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
 #: A program for each dtype: the widest and the one that XLA widens, and every night those between them.
@@ -466,3 +470,46 @@ def test_the_derivative_of_a_segment_sum_gathers():
 def test_entries_outside_are_refused():
     with pytest.raises(InputError, match=r"outside 0 ... 2"):
         segment_sum(jnp.ones(2), np.array([0, 3]), 3)
+
+
+# --- sums inside the force loop of molecular dynamics ---------------------------------------------------
+
+
+#: All of them in float32; each compiles the force again, so a few in float64.
+NAMES = {"float32": tuple(BY_NAME), "float64": ("sequential", "pairwise", "blocked", "kahan", "exact")}
+SAME_IN_EVERY_ORDER = ("sorted", "exact", "fixed-point")
+
+
+def forces(sim, x, tables):
+    """Force components and (twice) energies, shape (4, atoms)."""
+    result = evaluated(sim.force, x, tables)
+    return np.concatenate([np.asarray(result.force), 2 * np.asarray(result.energy)[None]])
+
+
+def permuted(tables, seed):
+    """The same list with its slots in another order."""
+    shape = tables.index.shape
+    flat = np.asarray(tables.index).reshape(-1, shape[-1])
+    order = np.random.default_rng(seed).permutation(len(flat))
+    return tables._replace(index=jnp.asarray(flat[order].reshape(shape)))
+
+
+# a force is compiled for every reduction
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", NAMES)
+def test_every_order_is_within_its_bound_and_some_do_not_depend_on_the_order_of_neighbors(dtype, tmp_path):
+    sim = build(load(write_system(tmp_path, liquid(), precision={"force": dtype, "accumulate": dtype})))
+    x, _, tables = listed(sim)
+    terms = terms_of(sim, x, tables)
+    assert len(terms) == 5
+    exact = [[sum(Fraction(float(v)) for v in column) for column in of.T] for of in terms]
+    for name in NAMES[dtype]:
+        one = replace(sim, reduction=BY_NAME[name])
+        seen = forces(one, x, tables)
+        for sums, of, true in zip(seen, terms, exact, strict=False):
+            assert of.dtype == sums.dtype == dtype
+            error = [abs(float(Fraction(float(s)) - e)) for s, e in zip(sums, true, strict=True)]
+            assert (np.array(error) <= BY_NAME[name].bound(of)).all(), name
+        same = [np.array_equal(forces(one, x, permuted(tables, seed)), seen) for seed in range(3)]
+        # compensated sums mostly agree too, but nothing says that they must
+        assert name in ("kahan", "neumaier") or same == [name in SAME_IN_EVERY_ORDER] * 3, name
