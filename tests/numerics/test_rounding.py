@@ -149,6 +149,13 @@ def test_a_bound_holds_wherever_atoms_drift(seed, compare, roles, drift):
         assert inside == should or abs(margin) <= bound, told
 
 
+@pytest.mark.parametrize("compare", CONVENTIONS)
+def test_a_pair_at_the_cutoff_is_decided_by_the_convention_in_exact_arithmetic_too(compare):
+    decider = PairDecider((1.5,), compare, "float32")
+    found = exact_margin(decider, Cell.create([6.0] * 3), np.zeros(3), np.array([0.0, 1.5, 0.0]))
+    assert found == (0, compare.endswith("<="))
+
+
 def test_bounds_grow_only_along_free_axes_and_only_where_positions_are_narrowed():
     far = np.full((1, 3, 2), 3004.0)
     for box, roles in itertools.product(("brick", "cluster"), ROLES):

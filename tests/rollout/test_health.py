@@ -104,6 +104,8 @@ def test_the_safe_rule_loses_none_at_the_same_skin(path, tmp_path):
 def test_dangerous_builds_are_counted_as_lammps_counts_them(path, tmp_path, every, delay):
     overrides = {"neighbors.skin": 0.1, "neighbors.rebuild.every": every, "neighbors.rebuild.delay": delay}
     result, folder = go(tmp_path, path, 120, overrides, save_every=1)
+    rule = result.simulation.rule
+    assert (rule.every, rule.delay, rule.check, rule.skin) == (every, delay, True, 0.1)
     _, unwrapped, _ = trajectory(folder)
     builds, dangerous = lammps_schedule(unwrapped, 0.1, every, delay, True)
     epochs = folder.read("epochs")
