@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mdnum.forks.certified import exact_margin
 from mdnum.md.cell import Cell, HostCell, complete, wrap_positions
 from mdnum.md.decide import CONVENTIONS, PairDecider
-from mdnum.numerics.rounding import gamma, neighbor, ordinal, ulp_distance
+from mdnum.numerics.rounding import gamma, neighbor, ordinal, ulp_distance, unit_roundoff
 
 WIDTHS: dict[type, Any] = {np.float64: 64, np.float32: 32, np.float16: 16, ml_dtypes.bfloat16: 32}
 
@@ -53,6 +53,7 @@ def test_both_zeros_are_one_place():
 
 def test_gamma_bounds_a_product_of_roundings():
     for dtype, u in ((np.float64, 2.0**-53), (np.float32, 2.0**-24), (ml_dtypes.bfloat16, 2.0**-8)):
+        assert unit_roundoff(dtype) == u
         for n in (1, 3, 7, 100):
             assert n * u <= gamma(n, dtype) and (1 + Fraction(u)) ** n - 1 <= Fraction(gamma(n, dtype))
 
