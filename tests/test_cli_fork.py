@@ -147,6 +147,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("benign", "ball/drop", "start"), "no ensemble"),
         (("map", "argon/crystal-108", "sigma"), "KEY=LOW:HIGH"),
         (("map", "argon/crystal-108", "sigma=2:1"), "nothing between 2.0 and 1.0"),
+        (("map", "ball/drop", "k=2:1"), "nothing between 2.0 and 1.0"),
         (("processes", "silicon/tersoff-512"), "many-body"),
         (("certify", "silicon/tersoff-512", "--steps", "2"), "Lennard-Jones"),
         (("certify", "ball/zeno"), "more than sums and products"),

@@ -189,6 +189,8 @@ def test_what_is_no_run_is_refused_before_anything_is_written(path, tmp_path):
     assert not (tmp_path / "run").exists()
     with pytest.raises(InputError, match="no system"):
         run(None)
+    with pytest.raises(InputError, match="half the smallest perpendicular"):
+        build(load(path, {"cutoff.radius": 2.4}))
 
 
 @pytest.mark.parametrize("builder", ["host", "jax-md"])

@@ -75,6 +75,13 @@ def test_single_precision_leaves_early_and_double_does_not(flint):
     assert found.steps_per_bit == pytest.approx(np.log(2) / 0.024, rel=0.3)
 
 
+def test_steps_and_systems_that_cannot_be_certified(flint):
+    with pytest.raises(InputError, match="steps = 0"):
+        certify(liquid(), 0)
+    with pytest.raises(InputError, match="864 atoms"):
+        certify(load("argon/liquid-864", world="md"), 10)
+
+
 def test_narrow_balls_leave_and_wide_ones_stay():
     """The steps at which plain rationals say that 16 bits leave (tests of the ball's record)."""
     given = {
