@@ -44,8 +44,8 @@ class Delay:
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
         """From separations at each step, length; NaN after a run was ended."""
-        runs = free, imposed
-        return cls(*(split_of(run, tolerance) for run in runs), *map(_last_seen, runs))
+        splits = (split_of(run, tolerance) for run in (free, imposed))
+        return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
         """Whether the split comes more than so many steps later without the flips; None if not seen."""

@@ -227,7 +227,10 @@ def digest(path: Path) -> str:
 def digest_of_file(file: BinaryIO) -> str:
     """Digest of all bytes of an open file."""
     file.seek(0)
-    return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    found = hashlib.blake2b(digest_size=16)
+    while chunk := file.read(1 << 20):
+        found.update(chunk)
+    return found.hexdigest()
 
 
 def load(root: Path) -> Manifest | None:
