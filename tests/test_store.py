@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import textwrap
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -67,14 +66,8 @@ def state_at(step: int) -> dict[str, object]:
 
 
 def content(folder: RunFolder) -> dict[str, bytes]:
-    names = (
-        "series.parquet",
-        "flips.parquet",
-        "epochs.parquet",
-        "trajectory.traj",
-        "log.txt",
-        "checkpoint.npz",
-    )
+    tables = [f"{name}.parquet" for name in ("series", "flips", "epochs")]
+    names = (*tables, "trajectory.traj", "log.txt", "checkpoint.npz")
     return {name: (folder.path / name).read_bytes() for name in names}
 
 
@@ -107,74 +100,38 @@ def test_what_is_appended_is_read_back_bit_for_bit(whole):
     for step, atoms in enumerate(ase_read(whole.path / "trajectory.traj", index=":")):
         assert atoms.positions.tobytes() == frame(10 * step).positions.tobytes()
         assert atoms.get_momenta().tobytes() == frame(10 * step).get_momenta().tobytes()
+    state, expected = whole.load_checkpoint(), state_at(480)
+    assert state.keys() == expected.keys() and state["key"].dtype == np.uint32
+    for key, value in expected.items():
+        assert np.array_equal(state[key], value) if isinstance(value, np.ndarray) else state[key] == value
 
 
-def test_state_comes_back_bit_for_bit(whole):
-    state = whole.load_checkpoint()
-    expected = state_at(480)
-    assert state.keys() == expected.keys()
-    assert state["positions"].tobytes() == expected["positions"].tobytes()
-    assert state["key"].dtype == np.uint32
-    assert {key: state[key] for key in ("step", "drift", "reasons", "on")} == {
-        key: expected[key] for key in ("step", "drift", "reasons", "on")
-    }
-
-
-@pytest.mark.parametrize("kept", [10, 430])  # ASE moves its offset table at frames 2 and 43
-def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept):
+# ASE moves its offset table at frames 2 and 43
+@pytest.mark.parametrize(("kept", "finished"), [(10, False), (430, False), (300, True)])
+def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept, finished):
     folder = RunFolder.create(tmp_path / "killed")
     write_run(folder, 0, kept)
-    # what a killed run leaves behind after its checkpoint: parts, frames, log lines, a half-written frame
-    folder.append("series", series_rows(kept, kept + 70))
-    folder.append("flips", flip_rows(kept, kept + 70))
-    for stream in folder._streams.values():
-        stream.flush()
-    for step in range(3):
-        folder.append_frame(frame(9_000 + step))
-    folder.log("a line of the part that was lost")
-    folder.close()
-    with open(folder.path / "trajectory.traj", "ab") as file:
-        file.write(b"half a frame")
-    (folder.path / "parts" / ".series-000000000999.parquet.part").write_bytes(b"half a part")
-
+    if finished:
+        folder.finalize()
+    else:
+        # what a killed run leaves behind after its checkpoint: parts, frames, log lines, a half-written frame
+        folder.append("series", series_rows(kept, kept + 70))
+        folder.append("flips", flip_rows(kept, kept + 70))
+        for stream in folder._streams.values():
+            stream.flush()
+        for step in range(3):
+            folder.append_frame(frame(9_000 + step))
+        folder.log("a line of the part that was lost")
+        folder.close()
+        with open(folder.path / "trajectory.traj", "ab") as file:
+            file.write(b"half a frame")
+        (folder.path / "parts" / ".series-000000000999.parquet.part").write_bytes(b"half a part")
     resumed = RunFolder.open(folder.path)
     assert len(resumed.read("series")["step"]) == kept
     assert resumed.resume()["step"] == kept
     write_run(resumed, kept, 480)
     resumed.finalize()
     assert content(resumed) == content(whole)
-
-
-def test_killed_process_resumes_from_its_last_checkpoint(tmp_path, whole):
-    program = textwrap.dedent(
-        f"""
-        import os, signal, sys
-        sys.path.insert(0, {os.path.dirname(__file__)!r})
-        from test_store import *
-        folder = RunFolder.create({str(tmp_path / "killed")!r})
-        write_run(folder, 0, 150)
-        folder.append("series", series_rows(150, 155))
-        os.kill(os.getpid(), signal.SIGKILL)
-        """
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == -9, done.stderr
-    folder = RunFolder.open(tmp_path / "killed")
-    assert folder.resume()["step"] == 150
-    write_run(folder, 150, 480)
-    folder.finalize()
-    assert content(folder) == content(whole)
-
-
-def test_finished_run_can_be_carried_on(tmp_path, whole):
-    folder = RunFolder.create(tmp_path / "longer")
-    write_run(folder, 0, 300)
-    folder.finalize()
-    folder = RunFolder.open(folder.path)
-    folder.resume()
-    write_run(folder, 300, 480)
-    folder.finalize()
-    assert content(folder) == content(whole)
 
 
 def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
@@ -225,14 +182,25 @@ def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, 
     np.testing.assert_array_equal(reopened.read("epochs")["epoch"], np.arange(4))
 
 
-def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path):
+def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("mdnum.store.folder.time.monotonic", lambda: clock[0])
     folder = RunFolder.create(tmp_path / "run")
     assert folder.checkpoint({"step": 0})
     folder.append("series", series_rows(0, 5))
     assert not folder.checkpoint({"step": 5})
     assert folder.load_checkpoint()["step"] == 0
+    clock[0] = 2.5
+    assert folder.checkpoint_due()
+    # one that takes long comes seldom; making the state counts too
+    clock[0] = 3.5
+    folder.checkpoint({"step": 5}, force=True)
+    for now, due in ((43.0, False), (60.0, True)):
+        clock[0] = now
+        assert folder.checkpoint_due() == due
+    assert folder.checkpoint({"step": 6}) and not folder.checkpoint({"step": 7})
     folder.finalize()
-    assert folder.load_checkpoint()["step"] == 5
+    assert folder.load_checkpoint()["step"] == 7
 
 
 def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
@@ -266,12 +234,6 @@ def test_empty_run_has_the_tables_of_its_world_with_columns(tmp_path, world):
     again.resume()
     again.finalize()
     assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
-
-
-def test_every_table_belongs_to_a_world():
-    always = {name for names in TABLES.values() for name in names}
-    # a comparison has these where its world has them
-    assert set(COLUMNS) - always == {"ambiguous_pairs", "around", "neighborhood"} and always <= set(COLUMNS)
 
 
 def test_a_run_of_the_other_world_is_overwritten_whole(tmp_path):
@@ -348,8 +310,13 @@ def test_changed_folder_is_not_resumed(tmp_path):
         RunFolder.open(folder.path).resume()
 
 
-def test_broken_files_are_named(tmp_path):
+def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
     folder = RunFolder.create(tmp_path / "run")
+    held = {"a": np.float64(0.1), "b": np.arange(3), "c": float("nan"), "d": (np.bool_(True), None)}
+    folder.write_summary(held)
+    assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
+                                                                     "d": [True, None]}  # fmt: skip
+    assert folder.provenance == {}
     with pytest.raises(FolderError, match="no checkpoint to resume from"):
         folder.load_checkpoint()
     (folder.path / "checkpoint.npz").write_bytes(b"PK nonsense")
@@ -360,61 +327,28 @@ def test_broken_files_are_named(tmp_path):
         _ = folder.summary
 
 
-def test_json_holds_what_json_has(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
-    folder.write_summary(
-        {"a": np.float64(0.1), "b": np.arange(3), "c": float("nan"), "d": (np.bool_(True), None)}
-    )
-    assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
-                                                                     "d": [True, None]}  # fmt: skip
-    assert folder.provenance == {}
-
-
-def test_full_disk_is_one_clear_line_and_leaves_the_last_checkpoint(tmp_path, monkeypatch):
-    folder = RunFolder.create(tmp_path / "run")
-    write_run(folder, 0, 20)
-    folder.append("series", series_rows(20, 30))
-
-    def full(*args):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(atomic.os, "fsync", full)
-        with pytest.raises(
-            FolderError, match=r"the disk is full. Free some space, then continue with --resume."
-        ):
-            folder.checkpoint(state_at(30), force=True)
-    assert not list(folder.path.rglob("*.part"))
-    folder.close()
-    assert RunFolder.open(folder.path).resume()["step"] == 20
-
-
 def test_full_disk_in_the_middle_of_a_frame_keeps_the_frames_before(tmp_path, monkeypatch):
+    from ase.io.trajectory import TrajectoryWriter
+
     folder = RunFolder.create(tmp_path / "run")
     folder.append_frame(frame(0))
     folder.append_frame(frame(1))
-
-    from ase.io.trajectory import TrajectoryWriter
 
     def full(self, atoms):
         self.backend.write(positions=atoms.positions)
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    path = folder.path / "trajectory.traj"
     with monkeypatch.context() as patch:
         patch.setattr(TrajectoryWriter, "write", full)
         with pytest.raises(FolderError, match="disk is full"):
             folder.append_frame(frame(2))
-    assert len(ase_read(folder.path / "trajectory.traj", index=":")) == 2
+    assert len(ase_read(path, index=":")) == 2
     folder.append_frame(frame(2))
-    images = ase_read(folder.path / "trajectory.traj", index=":")
-    assert [image.positions.tobytes() for image in images] == [
-        frame(step).positions.tobytes() for step in range(3)
-    ]
-
-
-def test_trajectory_shorter_than_its_checkpoint_is_refused(tmp_path):
-    file = frames.FrameFile(tmp_path / "trajectory.traj")
-    file.append(frame(0))
+    for step, image in enumerate(ase_read(path, index=":")):
+        assert image.positions.tobytes() == frame(step).positions.tobytes()
+    # one that is shorter than its checkpoint is refused
+    file = frames.FrameFile(path)
     count, table, size = file.mark()
     with pytest.raises(FolderError, match="shorter than its checkpoint"):
         file.truncate((count, table, size + 100))
@@ -423,20 +357,3 @@ def test_trajectory_shorter_than_its_checkpoint_is_refused(tmp_path):
 def test_store_does_not_import_jax():
     code = "import sys, mdnum.store; assert not {'jax', 'jax_md'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-def test_a_checkpoint_that_takes_long_comes_seldom(tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr("mdnum.store.folder.time.monotonic", lambda: clock[0])
-    folder = RunFolder.create(tmp_path / "run")
-    folder.checkpoint({"step": np.zeros(1)}, force=True)
-    clock[0] = 2.5
-    assert folder.checkpoint_due()
-    # making the state counts too
-    clock[0] = 3.5
-    folder.checkpoint({"step": np.ones(1)}, force=True)
-    clock[0] = 43.0
-    assert not folder.checkpoint_due()
-    clock[0] = 60.0
-    assert folder.checkpoint_due()
-    folder.close()

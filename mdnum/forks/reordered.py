@@ -8,7 +8,7 @@ ordered-sparse list holds each pair once: an atom's terms with later atoms are o
 atoms another.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_formats.py, jax-md 0.2.29). One thing more belongs to XLA: it adds an own row of
+for bit (tests/forks/test_choices.py, jax-md 0.2.29). One thing more belongs to XLA: it adds an own row of
 more than 32 slots in windows of 32, which is left out here.
 """
 

@@ -7,7 +7,7 @@ with A are found by bisection and delta debugging, as Verrou finds the instructi
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +17,13 @@ from jaxtyping import Float, Int
 from mdnum.deadline import fewest
 from mdnum.errors import InputError
 from mdnum.forks.pair import Fork
+from mdnum.forks.tape import taped
 from mdnum.md.cell import HostCell
 from mdnum.numerics.verdicts import split_of
 from mdnum.rollout.compared import Apart, ReferenceFrame
 from mdnum.rollout.engine import Engine, Segment
-from mdnum.rollout.epoch import Pin, Pins
-from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.lockstep import apart
-from mdnum.rollout.program import MdProgram, pair_bound, pair_margin
+from mdnum.rollout.program import pair_bound, pair_margin
 from mdnum.rollout.tracks import Track
 
 #: How far around the pair atoms are shown, in its cutoffs.
@@ -92,50 +91,6 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 
 @dataclass(frozen=True)
-class DecidedPairs:
-    """What a run decided about some pairs.
-
-    Attributes:
-        atoms: of the run.
-        first: keys i * atoms + j, i < j, of those inside at its first step.
-        changes: steps at which each of them flipped, by key, ascending.
-    """
-
-    atoms: int
-    first: frozenset[int]
-    changes: dict[int, tuple[int, ...]]
-
-    @classmethod
-    def of(
-        cls, program: MdProgram, keys: Iterable[int], last: int,
-        watch: Callable[[Segment], None] | None = None,
-    ) -> DecidedPairs:  # fmt: skip
-        """Follow a run to a last step; `watch` is called with every segment."""
-        simulation = program.simulation
-        recorder = PairRecorder(simulation)
-        changes: dict[int, list[int]] = {key: [] for key in keys}
-        first: frozenset[int] | None = None
-        for segment in Engine(simulation, last, start=program.begin).segments():
-            if first is None:
-                first = frozenset(changes).intersection(decided_pairs(simulation, segment, 0).tolist())
-            ledger = recorder.flips(segment)
-            named = ledger.subject[:, 0].astype(np.int64) * simulation.atoms + ledger.subject[:, 1]
-            for step, key in zip(ledger.step.tolist(), named.tolist(), strict=True):
-                if key in changes:
-                    changes[key].append(step)
-            if watch is not None:
-                watch(segment)
-        every = {key: tuple(steps) for key, steps in changes.items()}
-        return cls(simulation.atoms, first or frozenset(), every)
-
-    def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """These pairs' decisions, to be imposed over a window of steps."""
-        return Pins(
-            [Pin(*divmod(key, self.atoms), first, last, self.changes[key], key in self.first) for key in keys]
-        )
-
-
-@dataclass(frozen=True)
 class Pinned:
     """B with some decisions overridden by A's.
 
@@ -190,7 +145,7 @@ def pinned(
     for pair in pairs:
         _check_pair(pair, a.size)
     keys = [min(pair) * a.size + max(pair) for pair in pairs]
-    imposed = DecidedPairs.of(a, keys, last_step).pins(keys, *window)
+    imposed = taped(a, last_step, lambda segment: None).pins(keys, *window)
     leader = Track(a.simulation, last_step, a.begin, flips=False)
     follower = Track(b.simulation, last_step, b.begin, flips=False, pins=imposed)
     cell = Apart(a.simulation.cell)
@@ -314,7 +269,7 @@ def minimal_cause(
     # pairs that differ before the split, in the order in which they first do
     differing = (flip for flip in fork.flips if flip.differs and flip.step < split)
     keys = list(dict.fromkeys(flip.i * atoms + flip.j for flip in differing))
-    search = _Search(fork, keys, int(_BEYOND * split) + 1, tests, progress)
+    search = _Search(fork, int(_BEYOND * split) + 1, tests, progress)
     i, j = fork.decision.subject
     best, code = [i * atoms + j], "alone"
     if not search.holds(best):
@@ -333,7 +288,6 @@ class _Search:
     def __init__(
         self,
         fork: Fork,
-        keys: Sequence[int],
         horizon: int,
         allowed: int,
         progress: Callable[[int, int], None] | None,
@@ -344,7 +298,7 @@ class _Search:
         self._cell = HostCell(fork.twin.a.simulation.cell)
         self._every = max(1, horizon // _SAMPLES)
         self._positions: dict[int, np.ndarray] = {}
-        self._decided = DecidedPairs.of(fork.twin.a, keys, horizon, self._keep)
+        self._tape = taped(fork.twin.a, horizon, self._keep)
 
     def spent(self) -> bool:
         """Whether no more runs are allowed."""
@@ -371,7 +325,7 @@ class _Search:
     def _stays(self, keys: Sequence[int]) -> bool:
         b, tolerance = self.fork.twin.b, self.fork.tolerance
         reached = -1
-        pins = self._decided.pins(keys, 0, self.horizon)
+        pins = self._tape.pins(keys, 0, self.horizon)
         for segment in Engine(b.simulation, self.horizon, start=b.begin, pins=pins).segments():
             for row in range(segment.rows):
                 step = segment.first + row

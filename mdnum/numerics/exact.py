@@ -8,27 +8,20 @@ other is run operation by operation instead: rounded behind each, or enclosed by
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-_INTEGER = {
-    np.dtype(np.float64): jnp.int64,
-    np.dtype(np.float32): jnp.int32,
-    np.dtype(np.float16): jnp.int16,
-    np.dtype(ml_dtypes.bfloat16): jnp.int16,
-}
-
 
 def integer_of(dtype):
     """The signed integer type as wide as a float dtype."""
-    return _INTEGER[np.dtype(dtype)]
+    return jnp.dtype(f"int{8 * np.dtype(dtype).itemsize}")
 
 
 def zero_bits(dtype) -> jax.Array:
@@ -196,6 +189,10 @@ def enclosed(function: Callable[..., jax.Array], arguments: int) -> Callable[...
     return lambda *balls: interpreted(program, balls, rule, enter)[0]
 
 
+def _method(name: str) -> Callable[..., Any]:
+    return lambda a, *more, **_: getattr(a, name)(*more)
+
+
 def _compare(yes: Callable[[Any, Any], bool], no: Callable[[Any, Any], bool]) -> Callable[..., bool | None]:
     return lambda a, b, **_: True if yes(a, b) else False if no(a, b) else None
 
@@ -215,26 +212,15 @@ _IN_BALLS: dict[str, Callable[..., Any]] = {
     "div": lambda a, b, **_: a / b,
     "neg": lambda a, **_: -a,
     "abs": lambda a, **_: abs(a),
-    "sqrt": lambda a, **_: a.sqrt(),
-    "rsqrt": lambda a, **_: a.rsqrt(),
-    "exp": lambda a, **_: a.exp(),
-    "log": lambda a, **_: a.log(),
-    "sin": lambda a, **_: a.sin(),
-    "cos": lambda a, **_: a.cos(),
-    "tanh": lambda a, **_: a.tanh(),
+    **{name: _method(name) for name in ("sqrt", "rsqrt", "exp", "log", "sin", "cos", "tanh", "max", "min")},
     "square": lambda a, **_: a * a,
     "pow": lambda a, b, **_: a**b,
     "integer_pow": lambda a, *, y, **_: a**y,
-    "max": lambda a, b, **_: a.max(b),
-    "min": lambda a, b, **_: a.min(b),
-    "convert_element_type": lambda a, **_: a,
-    "broadcast_in_dim": lambda a, **_: a,
-    "copy": lambda a, **_: a,
-    "stop_gradient": lambda a, **_: a,
+    **dict.fromkeys(("convert_element_type", "broadcast_in_dim", "copy", "stop_gradient"), lambda a, **_: a),
     "select_n": _select,
     "and": _both,
-    "gt": _compare(lambda a, b: a > b, lambda a, b: a <= b),
-    "ge": _compare(lambda a, b: a >= b, lambda a, b: a < b),
-    "lt": _compare(lambda a, b: a < b, lambda a, b: a >= b),
-    "le": _compare(lambda a, b: a <= b, lambda a, b: a > b),
+    "gt": _compare(operator.gt, operator.le),
+    "ge": _compare(operator.ge, operator.lt),
+    "lt": _compare(operator.lt, operator.ge),
+    "le": _compare(operator.le, operator.gt),
 }

@@ -47,6 +47,11 @@ class FloatFormat:
         return 1 - self.emin
 
     @property
+    def top(self) -> int:
+        """The exponent field of infinity."""
+        return 2**self.exponent - 1
+
+    @property
     def largest(self) -> float:
         """The largest finite number."""
         return 2.0**self.emax * (2.0 - 2.0 ** (1 - self.significand))

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt64
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import integer_of
+from mdnum.numerics.formats import FloatFormat, format_of
 from mdnum.numerics.rounding import gamma, unit_roundoff
 from mdnum.numerics.sums import (
     Add,
@@ -38,35 +37,18 @@ _LIMB = 32
 _MASK = 2**_LIMB - 1
 
 
-class _Format(NamedTuple):
-    """Significand bits with the implicit one, and the exponent field of infinity."""
-
-    digits: int
-    top: int
-
-    @classmethod
-    def of(cls, dtype) -> _Format:
-        info = ml_dtypes.finfo(np.dtype(dtype))
-        return cls(info.nmant + 1, 2**info.nexp - 1)
-
-    @property
-    def limbs(self) -> int:
-        # two more than the largest term needs: one for its parts, one for 2^31 terms and the sign
-        return (self.top + self.digits) // _LIMB + 3
-
-
-def _parts(terms: Float[Array, "n columns"], form: _Format) -> tuple[jax.Array, list[jax.Array]]:
+def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Array, list[jax.Array]]:
     """Every term as signed pieces of 32 bits: the limb of the lowest piece, and the pieces."""
     bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
     magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
-    exponent, fraction = magnitude >> (form.digits - 1), magnitude & ((1 << (form.digits - 1)) - 1)
-    digits = jnp.where(exponent > 0, fraction | (1 << (form.digits - 1)), fraction)
+    exponent, fraction = magnitude >> (form.significand - 1), magnitude & ((1 << (form.significand - 1)) - 1)
+    digits = jnp.where(exponent > 0, fraction | (1 << (form.significand - 1)), fraction)
     # as a multiple of the smallest subnormal the term is digits * 2^shift
     shift = jnp.maximum(exponent, 1) - 1
     limb, shift = shift // _LIMB, shift % _LIMB
     low = (digits & _MASK) << shift
     pieces = [low & _MASK, low >> _LIMB]
-    if form.digits > _LIMB:
+    if form.significand > _LIMB:
         high = (digits >> _LIMB) << shift
         pieces = [pieces[0], pieces[1] + (high & _MASK), high >> _LIMB]
     sign = jnp.where(bits < 0, -1, 1)
@@ -83,7 +65,7 @@ def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"],
     return lax.scan(step, jnp.zeros_like(limbs[0]), limbs)
 
 
-def _rounded(limbs: Int[Array, "limbs columns"], form: _Format) -> UInt64[Array, "columns"]:
+def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Array, "columns"]:
     """Bits of the float nearest to a non-negative number, ties to even."""
     count = limbs.shape[0]
     filled = limbs != 0
@@ -102,15 +84,15 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: _Format) -> UInt64[Array,
     more = below | (((low << shift) & jnp.uint64(_MASK)) != 0)
     length = _LIMB * (place + 1) - leading
     # a number no longer than the significand is exact, subnormal or not, and its bits are the number itself
-    digits = jnp.clip(length, 1, form.digits)
-    excess = jnp.maximum(length - form.digits, 0).astype(jnp.uint64)
+    digits = jnp.clip(length, 1, form.significand)
+    excess = jnp.maximum(length - form.significand, 0).astype(jnp.uint64)
     cut = (64 - digits).astype(jnp.uint64)
     kept, rest = window >> cut, window & ((jnp.uint64(1) << cut) - jnp.uint64(1))
     half = jnp.uint64(1) << (cut - jnp.uint64(1))
     up = (rest > half) | ((rest == half) & (more | (kept & jnp.uint64(1) == 1)))
     up = up & (excess > 0)
-    bits = (excess << (form.digits - 1)) + kept + up.astype(jnp.uint64)
-    infinity = jnp.uint64(form.top << (form.digits - 1))
+    bits = (excess << (form.significand - 1)) + kept + up.astype(jnp.uint64)
+    infinity = jnp.uint64(form.top << (form.significand - 1))
     return jnp.where(jnp.any(filled, axis=0), jnp.minimum(bits, infinity), jnp.uint64(0))
 
 
@@ -125,11 +107,12 @@ class Exact(Reduction):
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Integer additions only."""
         dtype, shape = terms.dtype, terms.shape[1:]
-        form = _Format.of(dtype)
+        form = format_of(np.dtype(dtype).name)
         flat = terms.reshape(terms.shape[0], -1)
         place, pieces = _parts(flat, form)
         columns = jnp.broadcast_to(jnp.arange(flat.shape[1]), flat.shape)
-        limbs = jnp.zeros((form.limbs, flat.shape[1]), jnp.int64)
+        # two more than the largest term needs: one for its parts, one for 2^31 terms and the sign
+        limbs = jnp.zeros(((form.top + form.significand) // _LIMB + 3, flat.shape[1]), jnp.int64)
         for k, piece in enumerate(pieces):
             limbs = limbs.at[place + k, columns].add(piece, mode="drop")
         out, _ = _carried(limbs)

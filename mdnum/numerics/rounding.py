@@ -14,18 +14,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import DTypeLike
 
-_SIGNED = {
-    np.dtype(np.float64): np.int64,
-    np.dtype(np.float32): np.int32,
-    np.dtype(np.float16): np.int16,
-    np.dtype(ml_dtypes.bfloat16): np.int16,
-}
-
 
 def unit_roundoff(dtype: DTypeLike) -> float:
     """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
     # ml_dtypes' finfo knows bfloat16 too
     return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
+
+
+def _signed(dtype: np.dtype) -> np.dtype:
+    return np.dtype(f"int{8 * dtype.itemsize}")
 
 
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
@@ -34,7 +31,7 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
     Adjacent finite floats have adjacent ordinals, so differences count ulps. NaN has no meaningful ordinal.
     """
     x = np.asarray(x)
-    integer = _SIGNED[x.dtype]
+    integer = _signed(x.dtype)
     bits = x.view(integer).astype(np.int64)
     lowest = np.int64(np.iinfo(integer).min)
     return np.where(bits < 0, lowest - bits, bits)
@@ -56,7 +53,7 @@ def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
     """The float that lies the given number of ulps above x (below, where negative)."""
     x = np.asarray(x, dtype)
-    integer = _SIGNED[x.dtype]
+    integer = _signed(x.dtype)
     place = ordinal(x) + ulps
     lowest = np.int64(np.iinfo(integer).min)
     # the branch not taken must not overflow

@@ -499,29 +499,3 @@ def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Addition]:
             bool(new == total and terms[k] != 0),
         )
         total = new
-
-
-@dataclass(frozen=True, eq=False)
-class Tap(Reduction):
-    """A reduction that keeps the terms it was given, for a look at a sum inside a compiled program.
-
-    Put it where a reduction goes (in the force of molecular dynamics, say), run once, and read `seen`: one
-    array of shape (n, ...) for every sum that was made, in the order in which the program makes them. Not
-    for long runs: everything is kept.
-
-    Attributes:
-        inner: the order of the sum.
-        seen: the terms of every sum.
-    """
-
-    inner: Reduction
-    seen: list[Float[np.ndarray, "n ..."]] = field(default_factory=list)
-
-    def sum_of(self, terms, add):
-        """As the inner reduction; the terms are handed to the host on the way."""
-        jax.debug.callback(lambda t: self.seen.append(np.array(t)), terms, ordered=True)
-        return self.inner(terms)
-
-    def bound(self, terms):
-        """As the inner reduction."""
-        return self.inner.bound(terms)

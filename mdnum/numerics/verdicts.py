@@ -44,13 +44,8 @@ class Delay:
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
         """From separations at each step, length; NaN after a run was ended."""
-        found = []
-        for separation in (free, imposed):
-            beyond = separation > tolerance
-            seen = np.flatnonzero(np.isfinite(separation))
-            found.append((int(beyond.argmax()) if beyond.any() else None, int(seen[-1]) if len(seen) else -1))
-        (split, until), (other, other_until) = found
-        return cls(split, other, until, other_until)
+        splits = (split_of(run, tolerance) for run in (free, imposed))
+        return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
         """Whether the split comes more than so many steps later without the flips; None if not seen."""
@@ -221,6 +216,12 @@ def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | 
     return int(beyond.argmax()) if beyond.any() else None
 
 
+def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
+    """The last step at which a separation is known; -1 where it never is."""
+    seen = np.flatnonzero(np.isfinite(separation))
+    return int(seen[-1]) if len(seen) else -1
+
+
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """The rate at which a separation grows before it saturates.
 
@@ -264,8 +265,8 @@ def expected(
         tolerance: of the split, length.
         exponent: the Lyapunov exponent per step, where it is known: it needs no fit.
     """
-    seen = np.flatnonzero(np.isfinite(separation))
-    if not len(seen) or not separation[seen[-1]] > 0:
+    seen = _last_seen(separation)
+    if seen < 0 or not separation[seen] > 0:
         return None
     rate = exponent
     if rate is None:
@@ -280,7 +281,7 @@ def expected(
         rate = fit.rate
     if not rate > 0:
         return None
-    return max(0.0, float(np.log(tolerance / separation[seen[-1]])) / rate)
+    return max(0.0, float(np.log(tolerance / separation[seen])) / rate)
 
 
 @dataclass(frozen=True)
@@ -399,9 +400,8 @@ def _kept(
     rate: float | None,
 ) -> ForkVerdict:
     """The verdict where the runs do not split under the first run's decisions."""
-    some = np.isfinite(imposed)
-    seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
-    reach = float(np.nanmax(imposed)) if some.any() else 0.0
+    seen = max(0, _last_seen(imposed))
+    reach = float(np.nanmax(imposed, initial=0.0))
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
     values = {"split": free, "until": seen, "reach": reach, "below": below}
     kept: Reason = ("kept" if reach > 0 else "kept_bits", values)
@@ -513,10 +513,10 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
             name = "B" if arithmetic == decisions else SERIES[arithmetic, decisions, reference]
             if name not in series:
                 continue
-            seen = np.flatnonzero(np.isfinite(series[name]))
-            if len(seen):
+            until = _last_seen(series[name])
+            if until >= 0:
                 split = split_of(series[name], tolerance)
-                cells.append(SplitCell(arithmetic, decisions, reference, split, int(seen[-1])))
+                cells.append(SplitCell(arithmetic, decisions, reference, split, until))
     return tuple(cells)
 
 

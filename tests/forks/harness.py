@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+from rollout.harness import CRYSTAL, moved
 
 from mdnum.ball.problem import BallProblem
 from mdnum.ball.program import BallProgram
@@ -15,8 +15,6 @@ from mdnum.forks.choices import parse, twin_of
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
-
-CRYSTAL = "argon/crystal-108"
 
 
 @cache
@@ -28,12 +26,6 @@ def crystal(**overrides: Any) -> Simulation:
 @cache
 def crystal_system(**overrides: Any) -> System:
     return load(CRYSTAL, {key.replace("__", "."): value for key, value in overrides.items()}, world="md")
-
-
-def moved(simulation: Simulation, size: float) -> Simulation:
-    """Every atom displaced at random by about `size`."""
-    noise = np.random.default_rng(0).standard_normal(simulation.positions.shape)
-    return replace(simulation, positions=simulation.positions + size * noise)
 
 
 def pair(a: Simulation, b: Simulation, difference: str = "start", **frame: Any) -> Twin:

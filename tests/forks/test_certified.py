@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from forks.harness import crystal, pair
+from rollout.harness import history
 
 from mdnum.forks import Fork, fork
 from mdnum.forks.certified import certified, protection, wider
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import decided_pairs
 from mdnum.systems.build import Simulation
 
 STEPS = 180
@@ -29,10 +28,7 @@ def warm(**overrides: str | float) -> Simulation:
 
 def every_pair(simulation: Simulation):
     """Of each step: positions, and which of all pairs i < j the program had inside."""
-    for segment in Engine(simulation, STEPS).segments():
-        for row in range(segment.rows):
-            keys = decided_pairs(simulation, segment, row)
-            yield segment.first + row, segment.unsorted("x", row), set(keys.tolist())
+    return zip(range(STEPS + 1), *history(simulation, STEPS), strict=True)
 
 
 def squared(simulation: Simulation, x: np.ndarray, dtype: str) -> tuple[np.ndarray, np.ndarray]:
@@ -87,8 +83,17 @@ def test_the_nearest_pair_protects_until_the_runs_could_have_moved_it(found):
 
 def test_two_runs_of_one_program_are_protected_by_their_bounds_alone(found):
     a = found.twin.a.simulation
-    dates = certified(fork(pair(a, a), STEPS, counterfactual=False))
+    same = fork(pair(a, a), STEPS, counterfactual=False)
+    dates = certified(same)
     assert dates.protected == STEPS and dates.shadow is None and dates.shadow_step is None
+
+    # what decides inside its energy function is not certified
+    class ManyBody(Simulation):
+        pairwise = False
+
+    other = ManyBody(**{name: getattr(a, name) for name in a.__dataclass_fields__})
+    dates = certified(replace(same, twin=pair(other, other)))
+    assert dates.horizon == {} and dates.protected is None and dates.shadow is None
 
 
 def test_the_wider_program_is_the_shadow(found):
@@ -101,13 +106,3 @@ def test_the_wider_program_is_the_shadow(found):
     assert wider(pair(b, warm(precision__force="float32"))) is None
     for other in (a, replace(b, positions=b.positions + 1e-9), later):
         assert wider(pair(a, other)) is None
-
-
-def test_what_decides_inside_its_energy_function_is_not_certified(found):
-    class ManyBody(Simulation):
-        pairwise = False
-
-    a = found.twin.a.simulation
-    other = ManyBody(**{name: getattr(a, name) for name in a.__dataclass_fields__})
-    dates = certified(replace(found, twin=pair(other, other)))
-    assert dates.horizon == {} and dates.protected is None and dates.shadow is None

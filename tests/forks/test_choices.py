@@ -9,21 +9,28 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_systems
 from forks.harness import CRYSTAL, crystal_system, made
+from forks.harness import made as twin_of
+from rollout.harness import evaluated, listed, terms_of
 
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
 from mdnum.forks.choices import CHOICES, Choice, parse, shipped, unavailable
+from mdnum.forks.choices.arithmetic import FORMATS
 from mdnum.forks.choices.start import exact_images
 from mdnum.forks.pair import screen
-from mdnum.forks.reordered import ShuffledBuilder
+from mdnum.forks.reordered import ReorderedSimulation, ShuffledBuilder
 from mdnum.forks.worlds import flat, varied
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.integrators import Langevin
+from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
 from mdnum.md.neighbors import BUILDERS
 from mdnum.numerics import reductions
+from mdnum.numerics.sums import Halves, Sequential, Twice
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
@@ -47,26 +54,15 @@ def test_every_shipped_choice_is_parsed_from_its_name(world: str):
         assert isinstance(choice, Choice)
         assert choice.name == name and parse(name) == choice
         assert choice.describe(world) and "\n" not in choice.describe(world)
-
-
-@pytest.mark.parametrize(
-    "word",
-    [
-        "precision.force=float64", "precision.force=bfloat16", "format=sparse@fixed-point",
-        "reduction=permuted:3", "skin=0.5", "skin=0.5@exact", "rebuild=every:25", "order=3@fixed-point",
-        "builder=jax-md", "relabel=4", "rotate=zyx", "rotate=-x-yz@exact", "translate=0.5", "unwrapped=3",
-        "noise=7", "start=17:0:-2", "ulps=potential.pairs.Ar-Ar.sigma:-3", "start=velocity:+1",
-        "start=3:height:-1", "contact=later:2", "iterations=-1:57:2", "max_iter=+2", "stop=maximum",
-    ],
-)  # fmt: skip
-def test_arguments_are_read_and_written_alike(word: str):
-    assert parse(word).name == word
+    # arguments are read and written alike
+    for word in ("order=3@fixed-point", "rotate=-x-yz@exact", "start=3:height:-1", "iterations=-1:57:2"):
+        assert parse(word).name == word
 
 
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("reductoin", "Did you mean"),
+        ("skn", "Did you mean skin"),
         ("nonsense", "lists all"),
         ("vmap", "fork processes"),
         ("precision.mass", "no role 'mass'; there are state, force, decision, accumulate"),
@@ -122,6 +118,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, message: s
         ("silicon/tersoff-512", "format", "a format of its own"),
         (CRYSTAL, "rebuild=half-skin", "already"),
         (CRYSTAL, "skin=0.3", "already"),
+        (CRYSTAL, "skin=9", "half the smallest perpendicular"),
         (CRYSTAL, "builder=host", "already"),
         (CRYSTAL, "start=108:0:1", "no atom 108 among 108"),
         (CRYSTAL, "start=1:height:1", "no coordinate height"),
@@ -139,18 +136,6 @@ def test_a_choice_that_does_not_apply_has_a_reason(name: str, word: str, reason:
     assert reason in (unavailable(choice, system) or "")
     with pytest.raises(InputError, match="does not apply to"):
         made(word, system)
-
-
-@pytest.mark.parametrize("word", ["translate=0.25", "translate=lattice", "unwrapped"])
-def test_a_cluster_has_no_images(crystal: System, word: str):
-    atoms = crystal.atoms.copy()
-    atoms.pbc = False
-    assert unavailable(parse(word), replace(crystal, atoms=atoms)) == "no axis is periodic"
-
-
-def test_a_skin_that_the_box_cannot_hold_is_refused_by_the_box(crystal: System):
-    with pytest.raises(InputError, match="half the smallest perpendicular"):
-        made("skin=9", crystal)
 
 
 # --- a choice of another package ----------------------------------------------------------------------------
@@ -311,7 +296,7 @@ def changes(twin: Twin) -> set[str]:
 def test_a_choice_changes_what_it_names_and_nothing_else(word, file, given, expected):
     system = load(file, world="md")
     twin = made(word, varied(system, given) if given else system)
-    assert twin.difference and changes(twin) == expected
+    assert twin.difference and changes(twin) == expected and parse(word).name == word
     assert parse(word).must_hold == (word in MUST_HOLD or word in {"skin=0.5@fixed-point", "unwrapped=3"})
 
 
@@ -334,12 +319,6 @@ def test_one_coordinate_of_the_start_moves_by_an_ulp_of_the_state(crystal: Syste
         assert b[axis, atom] - a[axis, atom] == ulps * np.spacing(a[axis, atom])
         if word == "start":
             assert a[axis, atom] > 0.9 * a.max()
-
-
-def test_a_shift_changes_the_energy_and_no_force(crystal: System):
-    twin = made("energy-shift", crystal)
-    a, b = (one.simulation.evaluate() for one in (twin.a, twin.b))
-    assert np.array_equal(a.forces, b.forces) and abs(a.energy - b.energy) > 1
 
 
 def test_a_shuffled_list_holds_the_same_pairs_in_another_order(crystal: System):
@@ -385,6 +364,11 @@ def test_images_are_exact_near_the_start(crystal: System, word: str):
     assert not np.array_equal(np.asarray(a.state.images), np.asarray(b.state.images))
     own, _ = wrap_positions(twin.a.simulation.cell, crystal.atoms.positions)
     assert np.abs(np.asarray(a.state.x).T - own).max() < 1e-14
+    # a cluster has none
+    atoms = crystal.atoms.copy()
+    atoms.pbc = False
+    for other in (word, "translate=0.25"):
+        assert unavailable(parse(other), replace(crystal, atoms=atoms)) == "no axis is periodic"
 
 
 def test_what_has_no_exact_image_is_counted():
@@ -449,3 +433,156 @@ def test_lists_of_another_order_are_not_those_of_the_leader(crystal: System, wor
     """B under A's decisions has B's order of pairs: with A's lists it would be A."""
     found = fork(made(word, crystal), 30, repeats=0)
     assert found.dates.first_bit == first_bit and (np.nanmax(found.series["B|A"]) > 0) == (word == "order")
+
+
+# --- jax-md's neighbor formats are orders of each atom's terms ------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    """A liquid's worth of disorder, 108 atoms."""
+    dynamics = {"kind": "nve", "timestep": 0.004, "temperature": 1.0, "seed": 3}
+    cutoff = {"kind": "hard", "radius": 2.0}
+    system = small_systems.make(
+        small_systems.crystal(3, 0.1), small_systems.LENNARD_JONES, cutoff, dynamics=dynamics
+    )
+    return build(system)
+
+
+@pytest.fixture(scope="module")
+def rows(simulation: Simulation) -> np.ndarray:
+    """Neighbors within the list radius, one row per atom, sorted, padded at the end."""
+    return np.sort(listed(simulation)[1].unsorted(), axis=1)
+
+
+def forces_of_jax_md(simulation: Simulation, rows: np.ndarray, format: Any):
+    """A function from a list's indices to jax-md's forces, minus the gradient of its energy; and the list."""
+    jax_md = upstream()
+    metric = jax_md.space.canonicalize_displacement_or_metric(
+        displacement(np.asarray(simulation.cell.matrix))
+    )
+    energy = jax_md.smap.pair_neighbor_list(lennard_jones, metric)
+    x = jnp.asarray(wrap_positions(simulation.cell, simulation.positions)[0])
+    held: Any = as_neighbor_list(rows, np.asarray(x), format)
+
+    @jax.jit
+    def forces(idx):
+        return -jax.grad(lambda at: energy(at, replace(held, idx=idx)))(x)
+
+    return forces, np.asarray(held.idx)
+
+
+def lennard_jones(dr, **_):
+    """With a hard cutoff; distance 0 is padding."""
+    inside = (dr > 0) & (dr < 2.0)
+    s6 = (1 / jnp.where(inside, dr, 1.0)) ** 6
+    return jnp.where(inside, 4 * (s6 * s6 - s6), 0.0)
+
+
+def in_order(terms, start=None) -> np.ndarray:
+    total = np.zeros(3) if start is None else start
+    for term in terms:
+        total = total + term
+    return total
+
+
+def in_windows(terms: list[np.ndarray], slots: int, width: int = 32) -> np.ndarray:
+    """How XLA on a CPU adds along an axis: whole windows, the axis in the middle of them."""
+    windows = -(-slots // width)
+    before = (windows * width - slots) // 2
+    padded = [np.zeros(3)] * before + terms
+    return in_order([in_order(padded[width * w : width * (w + 1)]) for w in range(windows)])
+
+
+def modeled(rows: np.ndarray, terms: dict[tuple[int, int], np.ndarray], format: str) -> np.ndarray:
+    """The forces if a format were nothing but an order of the terms."""
+    atoms = len(rows)
+    force = np.empty((atoms, 3))
+    named_by = [np.flatnonzero((rows == i).any(axis=1)).tolist() for i in range(atoms)]
+    zero = np.zeros(3)
+    for i, naming in enumerate(named_by):
+        own = [j for j in rows[i].tolist() if j < atoms]
+        if format == "ordered-sparse":
+            later, earlier = [j for j in naming if j > i], [j for j in own if j < i]
+            force[i] = in_order(terms[i, j] for j in later) + in_order(terms[i, j] for j in earlier)
+        elif format == "sparse":
+            force[i] = in_order(0.5 * terms[i, j] for j in own) + in_order(0.5 * terms[i, j] for j in naming)
+        else:
+            # padding may stand between the neighbors of a row, and windows count it
+            row = [0.5 * terms[i, j] if j < atoms else zero for j in rows[i].tolist()]
+            force[i] = in_order((0.5 * terms[i, j] for j in naming), in_windows(row, rows.shape[1]))
+    return force
+
+
+@pytest.mark.slow
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+def test_the_forces_of_each_format_of_jax_md_are_sums_in_one_order(simulation, rows):
+    once, pairs = forces_of_jax_md(simulation, rows, "ordered-sparse")
+    # the terms, by the program's own arithmetic: each pair alone in the list
+    atoms, terms = len(rows), {}
+    for k in np.flatnonzero(pairs[0] < atoms).tolist():
+        alone = np.full_like(pairs, atoms)
+        alone[:, k] = pairs[:, k]
+        force = np.asarray(once(jnp.asarray(alone)))
+        i, j = pairs[:, k].tolist()
+        assert np.array_equal(force[i], -force[j])
+        terms[i, j], terms[j, i] = force[i], force[j]
+    assert rows.shape[1] > 32
+    mixed = np.stack([np.random.default_rng(i).permutation(row) for i, row in enumerate(rows)])
+    seen = {}
+    for kind, order in (("sorted", rows), ("mixed", mixed)):
+        for format in FORMATS:
+            forces, idx = forces_of_jax_md(simulation, order, format)
+            seen[kind, format] = np.asarray(forces(jnp.asarray(idx)))
+            # a list on the host is packed to the front; a dense one stays as it is
+            assert np.array_equal(seen[kind, format], modeled(order, terms, format)), (kind, format)
+    different = {force.tobytes() for force in seen.values()}
+    assert len(different) == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_choice_adds_in_the_order_of_the_format(simulation, rows, format):
+    made = ReorderedSimulation.of(simulation, format)
+    assert made.reduction == {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}[format]
+    x, table, tables = listed(made)
+    seen, atoms = terms_of(made, x, tables), len(table.order)
+    terms = {}
+    for slot, column in zip(*np.nonzero(table.index < atoms), strict=True):
+        pair = int(table.order[column]), int(table.order[table.index[slot, column]])
+        terms[pair] = np.array([seen[axis][slot, column] for axis in range(3)])
+    assert all(np.array_equal(term, -terms[j, i]) for (i, j), term in terms.items())
+    real = [[j for j in row if j < atoms] for row in rows.tolist()]
+    if format == "ordered-sparse":
+        expected = modeled(rows, terms, format)
+    elif format == "sparse":
+        # in sorted rows both halves of the sum are one order
+        plain = np.array([in_order(terms[i, j] for j in row) for i, row in enumerate(real)])
+        assert np.array_equal(modeled(rows, terms, "sparse"), plain)
+        # backwards, because forwards the loop streams, and XLA then contracts a product and a sum into one
+        made = replace(made, reduction=Sequential("reversed"))
+        expected = np.array([in_order(terms[i, j] for j in row[::-1]) for i, row in enumerate(real)])
+    else:
+        halves = [[0.5 * terms[i, j] for j in row] for i, row in enumerate(real)]
+        expected = np.array([in_order(row, in_order(row)) for row in halves])
+    force = np.empty((atoms, 3))
+    force[table.order] = np.asarray(evaluated(made.force, x, tables).force).T
+    assert np.array_equal(force, expected)
+
+
+def test_a_list_in_another_format_holds_the_same_pairs(simulation):
+    plain = listed(simulation)[1]
+    for word in FORMATS:
+        twin = twin_of(f"format={word}", simulation.system)
+        table = listed(twin.b.simulation)[1]
+        held, before = (np.sort(one.unsorted(), axis=1)[:, : plain.occupancy] for one in (table, plain))
+        assert np.array_equal(held, before)
+        assert table.pairs == plain.pairs and table.slots % 8 == 0
+        assert twin.a.simulation.lists != twin.b.simulation.lists
+        # by label, padding last in each half
+        labels = np.append(table.order, len(table.order))[table.index]
+        for half in np.split(labels, 2 if word == "ordered-sparse" else 1):
+            assert (np.diff(half, axis=0) >= 0).all()
+    pairwise = varied(simulation.system, {"precision.reduction": "pairwise"})
+    assert unavailable(parse("format=sparse"), pairwise)

@@ -77,8 +77,6 @@ def test_equal_runs_never_part(folders):
 
 def test_dates_are_those_of_the_runs_followed_again(folders):
     found = compare_folders(folders["plain"], folders["float32"])
-    keys = [key for key, _, _ in found.differences]
-    assert "precision.force" in keys
     again = fork(twin_of(found), STEPS, split=10.0, repeats=0, counterfactual=False)
     assert found.first_bit == again.dates.first_bit == 0
     assert found.fork == again.dates.fork
@@ -88,27 +86,26 @@ def test_dates_are_those_of_the_runs_followed_again(folders):
         assert found.decisions[0].margin == again.decision.margin
 
 
-def test_more_than_one_difference_is_said(folders):
-    found = compare_folders(folders["plain"], folders["two"])
-    assert {"precision.force", "neighbors.skin"} <= {key for key, _, _ in found.differences}
-    assert found.causes == ("neighbors.skin", "precision")
-
-
-def test_choices_and_numbers_are_differences_and_no_other_systems(folders):
-    shifted = compare_folders(folders["plain"], folders["shifted"])
-    assert shifted.causes == ("cutoff.kind",) and shifted.same_structure
-    ulp = compare_folders(folders["plain"], folders["ulp"])
-    assert [key for key, _, _ in ulp.differences] == ["potential.epsilon"]
-    assert ulp.causes == ("potential.epsilon",)
-    # three roles of one dtype are one choice
-    assert compare_folders(folders["plain"], folders["float32"]).causes == ("precision",)
-
-
-def test_other_starts_are_said_and_are_a_difference(folders):
-    found = compare_folders(folders["plain"], folders["warm"])
-    assert not found.same_structure and found.first_bit == 0
-    assert {"dynamics.temperature", "start"} < set(found.causes)
-    assert [key for key, _, _ in found.differences if key.startswith("start")] == ["start: velocities"]
+@pytest.mark.parametrize(
+    ("name", "keys", "causes"),
+    [
+        ("shifted", {"cutoff.kind"}, {"cutoff.kind"}),
+        ("ulp", {"potential.epsilon"}, {"potential.epsilon"}),
+        ("two", {"precision.force", "neighbors.skin"}, {"neighbors.skin", "precision"}),
+        # three roles of one dtype are one choice
+        ("float32", {"precision.state", "precision.force", "precision.decision"}, {"precision"}),
+        (
+            "warm",
+            {"dynamics.temperature", "structure.velocities", "start: velocities"},
+            {"dynamics.temperature", "structure.velocities", "start"},
+        ),
+    ],
+)
+def test_choices_numbers_and_starts_are_differences_and_no_other_systems(folders, name, keys, causes):
+    found = compare_folders(folders["plain"], folders[name])
+    assert {key for key, _, _ in found.differences} == keys and set(found.causes) == causes
+    assert found.same_structure == ("start" not in causes)
+    assert found.same_structure or found.first_bit == 0
 
 
 def test_other_systems_are_refused_by_what_differs(folders, tmp_path):

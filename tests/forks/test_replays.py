@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from forks.harness import crystal, followed, moved
+from forks.harness import crystal, followed
+from rollout.harness import furthest, history, moved, nearest
 
 from mdnum.errors import InputError
 from mdnum.forks import Fork
 from mdnum.forks.replays import disagreements, minimal_cause, parse_pin, pinned
 from mdnum.rollout.compared import ReferenceFrame
-from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import Pin, Pins
 
 
@@ -20,12 +20,6 @@ from mdnum.rollout.epoch import Pin, Pins
 def found() -> Fork:
     """Two crystals 1e-7 apart whose split hangs on the decision at the fork."""
     return followed(1e-7, 2200, split=0.03, repeats=0, counterfactual=False)
-
-
-@pytest.fixture(scope="module")
-def quick() -> Fork:
-    """Two crystals 1e-6 apart, whose split hangs on several decisions."""
-    return followed(1e-6, 900, split=0.03, repeats=0, counterfactual=False)
 
 
 def test_the_decision_at_the_fork_alone(found):
@@ -44,25 +38,26 @@ def test_the_decision_at_the_fork_alone(found):
 
 def test_spells_are_the_steps_at_which_the_distances_disagree(found):
     """Every pair that was decided differently, judged by the positions of two runs of their own."""
-    inside = []
     pairs = sorted({(flip.i, flip.j) for flip in found.flips})
-    i, j = np.array(pairs).T
-    for simulation in (crystal(), moved(crystal(), 1e-7)):
-        box = np.diag(simulation.cell.matrix)
-        rows = [
-            segment.unsorted("x", row).astype(np.float64)
-            for segment in Engine(simulation, found.steps).segments()
-            for row in range(segment.rows)
-        ]
-        d = np.stack([x[i] - x[j] for x in rows])
-        d -= box * np.rint(d / box)
-        inside.append(np.sum(d**2, axis=2) < simulation.r_cut**2)
-    assert len(pairs) > 1 and len(inside[0]) == found.steps + 1
-    differ = inside[0] != inside[1]
+    a, b = (inside(simulation, found.steps, pairs) for simulation in (crystal(), moved(crystal(), 1e-7)))
+    differ = a != b
+    assert len(pairs) > 1 and len(differ) == found.steps + 1
     for k, (i, j) in enumerate(pairs):
-        changes = (np.flatnonzero(np.diff(differ[:, k])) + 1).tolist()
+        changes = changed(differ[:, k])
         expected = [*changes, None] if differ[-1, k] else changes
         assert disagreements(found, i, j) == list(zip(expected[::2], expected[1::2], strict=True))
+
+
+def inside(simulation, last, pairs) -> np.ndarray:
+    """Whether the distance of each pair is below the cutoff at each step."""
+    x, _ = history(simulation, last)
+    i, j = np.array(pairs).T
+    return np.sum(nearest(simulation, x[:, i] - x[:, j]) ** 2, axis=2) < simulation.r_cut**2
+
+
+def changed(decided: np.ndarray) -> tuple[int, ...]:
+    """Steps at which it is another than at the step before."""
+    return tuple((np.flatnonzero(np.diff(decided)) + 1).tolist())
 
 
 def test_a_named_pair_over_the_whole_run_removes_the_split(found):
@@ -100,6 +95,8 @@ def test_what_cannot_be_pinned_is_refused(found):
             pinned(found, [bad])
     with pytest.raises(InputError, match="do not fork"):
         pinned(replace(found, decision=None))
+    with pytest.raises(InputError, match="did not split"):
+        minimal_cause(followed(1e-7, 37, repeats=0, counterfactual=False))
     labels = ReferenceFrame(np.roll(np.arange(108), 1), np.arange(3), np.ones(3), np.zeros(3))
     other = replace(found.twin, b=replace(found.twin.b, frame=labels))
     with pytest.raises(InputError, match="other labels"):
@@ -109,50 +106,26 @@ def test_what_cannot_be_pinned_is_refused(found):
 # --- minimal causes -----------------------------------------------------------------------------------
 
 
-def apart(simulation, one, other) -> float:
-    box = np.diag(np.asarray(simulation.cell.matrix))
-    d = one - other
-    d -= box * np.round(d / box)
-    return float(np.linalg.norm(d, axis=1).max())
-
-
-def last_positions(simulation, last, pins=None):
-    *_, segment = Engine(simulation, last, pins=pins).segments()
-    return segment.unsorted("x", segment.rows - 1)
-
-
 def test_one_decision_of_four_thousand_did_it(found):
     cause = minimal_cause(found)
     assert cause.code == "alone" and cause.proven and cause.tests == 1
     assert cause.pairs == (found.decision.subject,) and cause.candidates > 100
-    # once more by hand: A's flips of this pair, from A's record alone
-    a, b = crystal(), moved(crystal(), 1e-7)
+    # once more by hand: A's flips of this pair, from A's positions alone
+    a, b, last = crystal(), moved(crystal(), 1e-7), cause.horizon
     (pair,) = cause.pairs
-    box, inside = np.diag(np.asarray(a.cell.matrix)), []
-    for segment in Engine(a, cause.horizon).segments():
-        for row in range(segment.rows):
-            x = segment.unsorted("x", row)
-            d = x[pair[1]] - x[pair[0]]
-            d -= box * np.round(d / box)
-            inside.append(bool(d @ d < a.r_cut**2))
-    changes = tuple(np.flatnonzero(np.diff(np.array(inside, int))) + 1)
-    pin = Pin(*pair, 0, cause.horizon, tuple(int(step) for step in changes), inside[0])
-    end = last_positions(a, cause.horizon)
-    assert apart(a, last_positions(b, cause.horizon), end) > 0.02
-    assert apart(a, last_positions(b, cause.horizon, Pins([pin])), end) < 1e-5
+    own = inside(a, last, [pair])[:, 0]
+    pin = Pin(*pair, 0, last, changed(own), bool(own[0]))
+    end = history(a, last)[0][-1]
+    assert furthest(a, history(b, last)[0][-1], end) > 0.02
+    assert furthest(a, history(b, last, pins=Pins([pin]))[0][-1], end) < 1e-5
 
 
-def test_several_decisions_none_of_which_can_be_left_out(quick):
+def test_several_decisions_none_of_which_can_be_left_out():
+    """Two crystals 1e-6 apart, whose split hangs on several decisions."""
+    quick = followed(1e-6, 900, split=0.03, repeats=0, counterfactual=False)
     cause = minimal_cause(quick)
     assert cause.pairs is not None and cause.code == "proven"
     assert 1 < len(cause.pairs) < 20 and cause.tests <= 80
-
-
-def test_within_few_runs_a_set_is_enough_but_not_proven_smallest(quick):
+    # within few runs a set is enough, but not proven smallest
     cause = minimal_cause(quick, tests=6)
     assert cause.tests == 6 and cause.code == "unproven" and cause.pairs is not None
-
-
-def test_what_did_not_split_has_no_cause():
-    with pytest.raises(InputError, match="did not split"):
-        minimal_cause(followed(1e-7, 37, repeats=0, counterfactual=False))

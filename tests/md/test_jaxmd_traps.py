@@ -400,22 +400,3 @@ def test_importing_the_adaptor_does_not_import_jax_md():
     script = "import sys, mdnum.md.jaxmd, mdnum.md.manybody; print('jax_md' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
-
-
-def test_the_switch_of_jax_md_is_ours(md):
-    from mdnum.md.cutoffs import CUTOFFS
-    from mdnum.md.potentials import CutPotential, LennardJones
-
-    r = jnp.linspace(0.95, 2.5999, 100)
-    constants = [jaxmd.scalar(value) for value in (1.1, 0.7, 2.6, 2.2)]
-    sigma, epsilon, cutoff, onset = constants
-
-    @jax.jit
-    def both(r):
-        cut = CutPotential(
-            LennardJones(sigma[None], epsilon[None]), CUTOFFS.parse("switched"), cutoff[None], onset[None]
-        )
-        theirs = md.energy.multiplicative_isotropic_cutoff(md.energy.lennard_jones, onset, cutoff)
-        return cut.evaluate(r * r, None, cut.at_cutoff())[0], theirs(r, sigma=sigma, epsilon=epsilon)
-
-    assert np.allclose(*both(r), rtol=1e-12, atol=1e-14)

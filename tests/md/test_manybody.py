@@ -227,25 +227,11 @@ def test_the_table_is_the_published_form():
     assert np.abs(np.asarray(charge) - form.density(between)).max() < 1e-8
 
 
-REFUSED = {
-    "a table for Cu, but the structure holds Al": lambda: made_eam(COPPER, ["Cu", "Al"]),
-    "no such potential table": lambda: made_eam(COPPER.with_name("none.alloy")),
-    "known are Si and Si-1989": lambda: manybody.tersoff("Ge"),
-    "known is Si": lambda: manybody.stillinger_weber("Ge"),
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_another_element_and_a_missing_table_are_refused(message):
-    with pytest.raises(InputError, match=message):
-        REFUSED[message]()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda t: t.replace("1 Cu\n", "2 Cu Al\n"), "a table for 2 elements"),
-        (lambda t: t.rsplit("\n", 2)[0], "2 words fewer"),
+        (lambda t: t.rsplit("\n", 2)[0], "3002 numbers"),
         (lambda t: t.replace("5.50679\n29", "6.5\n29"), "its cutoff is 6.5"),
         (lambda t: "nothing\nof\nthe kind\n", "no setfl table"),
         (lambda t: t.replace("29 63.546 3.615 fcc\n", "29 63.546 3.615 fcc\nnan "), "expected 3003"),
@@ -257,8 +243,21 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     with pytest.raises(InputError) as caught:
         made_eam(path)
     text = str(caught.value)
-    assert str(path) in text and "\n" not in text
-    assert message in text or (message == "2 words fewer" and "3002 numbers" in text)
+    assert str(path) in text and "\n" not in text and message in text
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: made_eam(COPPER, ["Cu", "Al"]), "a table for Cu, but the structure holds Al"),
+        (lambda: made_eam(COPPER.with_name("none.alloy")), "no such potential table"),
+        (lambda: manybody.tersoff("Ge"), "known are Si and Si-1989"),
+        (lambda: manybody.stillinger_weber("Ge"), "known is Si"),
+    ],
+)
+def test_another_element_and_a_missing_table_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
 
 
 def test_the_1989_constants_differ_from_those_of_1988():
@@ -270,6 +269,20 @@ def test_the_1989_constants_differ_from_those_of_1988():
     assert newer.lambda3 == 0.0 and older.lambda3 > 0 and newer.sources != older.sources
 
 
+def argon_of_jax_md(displacement):
+    """Argon off its lattice, and jax-md's energy function of it."""
+    from jax_md import energy as jax_md_energy
+
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
+    atoms.rattle(0.2, seed=5)
+    given = {"sigma": 3.405, "epsilon": 0.0103, "r_onset": 5.0 / 3.405, "r_cutoff": 6.5 / 3.405}
+    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
+        displacement, 1.0, neighbor_list_fn=lambda *_, **__: None,
+        **{name: jaxmd.scalar(value) for name, value in given.items()},
+    )  # fmt: skip
+    return atoms, energy_fn
+
+
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
     "format",
@@ -277,24 +290,13 @@ def test_the_1989_constants_differ_from_those_of_1988():
 )
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones
-    from jax_md import energy as jax_md_energy
 
-    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
-    atoms.rattle(0.2, seed=5)
-    atoms.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.1, 1, 0], [0.05, -0.1, 1]]), scale_atoms=True)
-    cell = jnp.asarray(atoms.cell.array)
-    constants = {"sigma": 3.405, "epsilon": 0.0103}
-    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
-        jaxmd.displacement(cell),
-        1.0,
-        r_onset=jaxmd.scalar(5.0 / 3.405),
-        r_cutoff=jaxmd.scalar(6.5 / 3.405),
-        neighbor_list_fn=lambda *_, **__: None,
-        **{name: jaxmd.scalar(value) for name, value in constants.items()},
-    )
+    bent = 3 * 5.26 * np.array([[1, 0, 0], [0.1, 1, 0], [0.05, -0.1, 1]])
+    atoms, energy_fn = argon_of_jax_md(jaxmd.displacement(jnp.asarray(bent)))
+    atoms.set_cell(bent, scale_atoms=True)
     potential = manybody.from_jax_md(energy_fn, 6.5, format)
     energy, forces, stress = evaluate(potential, atoms)
-    atoms.calc = LennardJones(rc=6.5, ro=5.0, smooth=True, **constants)
+    atoms.calc = LennardJones(sigma=3.405, epsilon=0.0103, rc=6.5, ro=5.0, smooth=True)
     assert abs(energy - atoms.get_potential_energy()) <= 1e-13 * abs(energy)
     np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
@@ -305,17 +307,9 @@ def test_any_jax_md_energy_function_runs_in_every_format(format):
 
 @pytest.mark.jax_md
 def test_an_energy_function_that_ignores_the_cell_is_found_out():
-    from jax_md import energy as jax_md_energy
     from jax_md import space
 
-    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
-    atoms.rattle(0.2, seed=5)
-    own_box, _ = space.periodic(jaxmd.scalar(3 * 5.26))
-    constants = {"sigma": 3.405, "epsilon": 0.0103, "r_onset": 1.5, "r_cutoff": 1.9}
-    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
-        own_box, 1.0, **{name: jaxmd.scalar(value) for name, value in constants.items()},
-        neighbor_list_fn=lambda *_, **__: None,
-    )  # fmt: skip
+    atoms, energy_fn = argon_of_jax_md(space.periodic(jaxmd.scalar(3 * 5.26))[0])
     potential = manybody.from_jax_md(energy_fn, 6.5, "dense", name="boxed")
     neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions)
     with pytest.raises(InputError, match="boxed: the energy function ignores the cell"):

@@ -8,11 +8,15 @@ import numpy as np
 import oracles
 import pytest
 from oracles import COMPARISONS, all_pairs
-from rollout.harness import liquid, write_system
+from rollout.harness import evaluated, liquid, listed, nearest, write_system
 
-from mdnum.md.cell import wrap_positions
+from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
+from mdnum.md.decide import PairDecider
+from mdnum.md.pairforce import MdState, PairDynamics
 from mdnum.numerics import count_set, set_bits
+from mdnum.numerics.exact import zero_bits
+from mdnum.rollout.engine import Engine, first_state
 from mdnum.systems import load
 from mdnum.systems.build import build
 
@@ -101,36 +105,27 @@ def tables(kind):
     }
 
 
-#: Their formulas are in test_cutoffs: here a program is compiled for each.
-MARKS = {"quintic": (), "hard": pytest.mark.slow, "switched": pytest.mark.slow}
+ALWAYS, SLAB, NEVER = (True, True, True), (True, False, True), (False, False, False)
+#: Formulas are in test_cutoffs: here a program is compiled for each kind and box.
+CASES = [
+    ("quintic", ALWAYS, "host", ()),
+    *((kind, ALWAYS, "host", pytest.mark.slow) for kind in ("hard", "switched")),
+    *((kind, ALWAYS, "host", pytest.mark.nightly) for kind in ("shifted", "force-shifted", "cosine")),
+    ("quintic", SLAB, "host", pytest.mark.slow),
+    ("quintic", NEVER, "host", pytest.mark.slow),
+    ("switched", SLAB, "jax-md", (pytest.mark.slow, pytest.mark.jax_md)),
+]
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=MARKS.get(k, pytest.mark.nightly)) for k in CUTOFFS])
-def test_a_mixture_in_a_tilted_box(tmp_path, kind):
-    atoms = mixture(tilt=True)
-    compare(build(load(write_system(tmp_path, atoms, **tables(kind)))), kind, atoms)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k == "quintic" else pytest.mark.nightly) for k in CUTOFFS]
-)
-@pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
-def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
-    atoms = liquid(rattle=0.05)
-    atoms.pbc = pbc
-    onset = {"onset": ONSET * 1.9} if CUTOFFS.parse(kind).switches else {}
-    path = write_system(tmp_path, atoms, cutoff={"kind": kind, "radius": 1.9, **onset})
-    compare(build(load(path)), kind, atoms)
-
-
-@pytest.mark.slow
-@pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
-def test_the_list_of_jax_md_gives_the_same(tmp_path):
-    atoms = mixture(tilt=True, pbc=(True, False, True))
-    path = write_system(tmp_path, atoms, **tables("switched"), neighbors={"builder": "jax-md"})
-    compare(build(load(path)), "switched", atoms)
+@pytest.mark.parametrize(
+    ("kind", "pbc", "builder"), [pytest.param(*case, marks=marks) for *case, marks in CASES]
+)
+def test_a_mixture_in_a_tilted_box(tmp_path, kind, pbc, builder):
+    assert {kind for kind, *_ in CASES} == set(CUTOFFS)
+    atoms = mixture(tilt=True, pbc=pbc)
+    path = write_system(tmp_path, atoms, **tables(kind), neighbors={"builder": builder})
+    compare(build(load(path)), kind, atoms)
 
 
 def test_stress_is_the_derivative_of_the_energy_by_strain(tmp_path):
@@ -151,15 +146,8 @@ def test_stress_is_the_derivative_of_the_energy_by_strain(tmp_path):
 
 def forces_over(simulation, positions, skin=0.2):
     """One evaluation over a list with a skin: forces, decisions, and the list."""
-    wrapped, _ = wrap_positions(simulation.cell, positions)
-    table = simulation.verlet_list(skin).build(wrapped, simulation.cell)
-    x = jnp.asarray(wrapped[table.order].T)
-    return with_decisions(simulation.force, x, simulation.tables(table)), table
-
-
-@jax.jit
-def with_decisions(force, x, tables):
-    return force(x, tables, decisions=True)
+    x, table, tables = listed(simulation, skin, positions)
+    return evaluated(simulation.force, x, tables), table
 
 
 def counted(simulation, positions):
@@ -238,3 +226,109 @@ def test_two_atoms_on_one_spot_are_seen_and_not_hidden_by_padding(tmp_path):
     singular, _ = forces_over(simulation, on_top)
     assert not np.isfinite(float(jnp.sum(singular.energy)))
     assert float(singular.decisions.nearest) == 4.0
+
+
+# --- a step, as forks and gradients make it -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    """The crystal, its dynamics over a list, and where it starts."""
+    simulation = build("argon/crystal-108")
+    start = first_state(simulation)
+    table = simulation.verlet_list().build(start.reference, simulation.cell)
+    masses = jnp.asarray(simulation.masses[table.order])
+    dynamics = PairDynamics(simulation.force, simulation.integrator, masses, simulation.tables(table))
+    state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
+    return simulation, dynamics, state
+
+
+def test_told_its_own_decisions_a_step_is_that_of_the_rollout(stepper):
+    simulation, dynamics, state = stepper
+    advance = jax.jit(lambda s: dynamics.step(s, dynamics.decide(s)))
+    for _ in range(40):
+        state = advance(state)
+    (segment,) = list(Engine(simulation, 40).segments())
+    # two compiled programs of one arithmetic: the contraction of a*b + c may differ in the last bit
+    assert np.allclose(np.asarray(state.x), segment.rows_of("x")[40], rtol=0, atol=1e-13)
+    decided = np.asarray(dynamics.decide(state))
+    assert np.array_equal(decided, segment.rows_of("bits")[40])
+    # margins have the sign of the decision
+    inside = np.asarray(dynamics.margins(state)).reshape(-1, 8, state.x.shape[1]) > 0
+    assert np.array_equal(np.packbits(inside, axis=1, bitorder="little")[:, 0], decided)
+
+
+def test_a_flipped_decision_takes_its_term_out_of_both_sums(stepper):
+    simulation, dynamics, state = stepper
+    own = evaluated(dynamics.force, state.x, dynamics.tables)
+    same = evaluated(dynamics.force, state.x, dynamics.tables, given=own.decisions.bits)
+    assert np.array_equal(np.asarray(own.force), np.asarray(same.force))
+    bits, index = np.array(own.decisions.bits), np.asarray(dynamics.tables.index).reshape(-1, 108)
+    slot = next(k for k in range(index.shape[0]) if (bits[k // 8, 0] >> (k % 8)) & 1)
+    other = int(index[slot, 0])
+    back = int(np.flatnonzero(index[:, other] == 0)[0])
+    for k, atom in ((slot, 0), (back, other)):
+        bits[k // 8, atom] ^= np.uint8(1 << (k % 8))
+    told = evaluated(dynamics.force, state.x, dynamics.tables, given=jnp.asarray(bits))
+    d = nearest(simulation, np.asarray(state.x)[:, other] - np.asarray(state.x)[:, 0])
+    r2 = float(d @ d)
+    pull = d * 24 * (r2**-4 - 2 * r2**-7)
+    change = np.asarray(told.force) - np.asarray(own.force)
+    assert np.sum(told.energy) - np.sum(own.energy) == pytest.approx(-4 * (r2**-6 - r2**-3), abs=1e-11)
+    assert np.allclose(change[:, 0], -pull, rtol=0, atol=1e-11)
+    assert np.allclose(change[:, other], pull, rtol=0, atol=1e-11)
+    assert not np.delete(change, [0, other], axis=1).any()
+    # what it would have decided itself is still told
+    assert np.array_equal(np.asarray(told.decisions.bits), np.asarray(own.decisions.bits))
+
+
+# --- the decision in jit and on the host: one arithmetic, one answer ------------------------------------
+
+
+def displacements(dtype, count=20_000, r_cut=2.5):
+    """Random vectors, half of them within a few ulps of the cutoff."""
+    rng = np.random.default_rng(9)
+    d = rng.normal(size=(count, 3))
+    length = r_cut * (1 + np.finfo(dtype).eps * rng.integers(-4, 5, count))
+    length[::2] = rng.uniform(0.5, 4.0, len(length[::2]))
+    return (d / np.linalg.norm(d, axis=1)[:, None] * length[:, None]).astype(dtype).T
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("compare", COMPARISONS)
+def test_jit_and_host_compute_one_quantity_and_one_decision(dtype, compare):
+    decider = PairDecider((2.5,), compare, np.dtype(dtype).name)
+    dx, dy, dz = displacements(dtype)
+    on_host = decider.host_quantity(dx, dy, dz)
+    assert on_host.dtype == dtype
+
+    @jax.jit
+    def in_jit(x, y, z, zero):
+        quantity = decider.quantity(x, y, z, zero)
+        return quantity, decider.inside(quantity, decider.values()[0])
+
+    quantity, inside = in_jit(*map(jnp.asarray, (dx, dy, dz)), zero_bits(dtype))
+    assert np.array_equal(np.asarray(quantity), on_host)
+    threshold = decider.thresholds[0]
+    assert np.array_equal(np.asarray(inside), threshold.decide(on_host.astype(np.float64)))
+    margin = threshold.margin(on_host.astype(np.float64))
+    assert np.array_equal(margin >= 0 if compare.endswith("<=") else margin > 0, np.asarray(inside))
+    assert threshold.space == decider.space == compare.split()[0]
+    # the sample sits on both sides
+    assert 0.2 < np.mean(np.asarray(inside)) < 0.8
+
+
+def test_thresholds_are_the_numbers_the_program_compares_with():
+    radius = 2.1 / 1.3
+    assert PairDecider((radius,), "r2 <").thresholds[0].value == radius * radius
+    assert PairDecider((radius,), "r <").thresholds[0].value == radius
+    narrow = np.float32(radius)
+    assert PairDecider((radius,), "r2 <", "float32").thresholds[0].value == float(narrow * narrow)
+    several = PairDecider((2.5, 2.0, 2.2), "r2 <=")
+    assert [t.value for t in several.thresholds] == [6.25, 4.0, 2.2 * 2.2]
+    assert np.array_equal(several.values(), [6.25, 4.0, 2.2 * 2.2])
+
+
+def test_an_unknown_convention_is_refused():
+    with pytest.raises(InputError, match="r3 <"):
+        PairDecider((1.0,), "r3 <")

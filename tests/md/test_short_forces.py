@@ -9,8 +9,9 @@ import ml_dtypes
 import numpy as np
 import pytest
 import small_systems
+from rollout.harness import listed
 
-from mdnum.md.cell import HostCell, wrap_positions
+from mdnum.md.cell import HostCell
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import rounded, zero_bits
 from mdnum.systems.build import Simulation, build
@@ -66,10 +67,8 @@ def _evaluated(force, x, tables):
 
 
 def evaluated(sim: Simulation):
-    wrapped, _ = wrap_positions(sim.cell, sim.positions)
-    table = sim.verlet_list().build(wrapped, sim.cell)
-    x = jnp.asarray(wrapped[table.order].T)
-    return _evaluated(sim.force, x, sim.tables(table)), wrapped[table.order], table
+    x, table, tables = listed(sim)
+    return _evaluated(sim.force, x, tables), np.asarray(x).T, table
 
 
 @pytest.mark.parametrize(

@@ -138,23 +138,7 @@ def test_the_algebra_of_a_ledger(history):
     rows = list(zip(ledger.step.tolist(), *ledger.subject.T.tolist(), strict=True))
     assert rows == sorted(rows)
     assert np.array_equal(ledger.ambiguous, [abs(m) <= 0.5 for m in ledger.margin])
-
-
-@given(HISTORIES, st.data())
-def test_a_complete_ledger_alternates_and_one_that_misses_a_flip_in_between_does_not(history, data):
-    ledger = ledger_of(history)
     assert broken_alternations(ledger) == 0
-    # a flip with an earlier and a later one of the same subject: dropping it leaves two alike in a row
-    subjects, counts = np.unique(ledger.subject[:, 0], return_counts=True)
-    inner = [
-        row
-        for subject in subjects[counts > 2]
-        for row in np.flatnonzero(ledger.subject[:, 0] == subject)[1:-1].tolist()
-    ]
-    if inner:
-        keep = np.arange(len(ledger)) != data.draw(st.sampled_from(inner))
-        columns = (ledger.step, ledger.subject, ledger.entered, ledger.margin, ledger.bound, ledger.jump)
-        assert broken_alternations(Ledger("pair", *(column[keep] for column in columns))) == 1
 
 
 def test_the_first_label_decides_before_the_second():

@@ -219,21 +219,18 @@ def test_factors_that_are_not_exact_are_refused(scale):
 # --- which dtype a role has, and what is refused ----------------------------------------------------------
 
 
-def test_every_role_can_have_its_own_dtype():
+def test_every_role_can_have_its_own_dtype_and_no_other():
     policy = RolePrecision("float16", "bfloat16", "float32", "float64", "float16")
     seen = [policy.dtype(role) for role in ("state", "arithmetic", "decision", "accumulate", "loss")]
     assert seen == [np.float16, ml_dtypes.bfloat16, np.float32, np.float64, np.float16]
-    assert RolePrecision().dtype("state") == np.float64
-    assert RolePrecision.all("bfloat16").dtype("loss") == ml_dtypes.bfloat16
-
-
-def test_what_no_float_is_called_is_refused():
-    with pytest.raises(InputError, match=r"precision\.decision.*'half'.*known are.*bfloat16"):
-        RolePrecision(decision="half")
-    with pytest.raises(InputError, match=r"precision\.rounding.*'up'.*nearest, stochastic"):
-        RolePrecision(rounding="up")
-    with pytest.raises(InputError, match=r"precision\.seed"):
-        RolePrecision(seed=-1)
+    assert RolePrecision.all("bfloat16") == RolePrecision(*["bfloat16"] * 5)
+    for wrong, message in (
+        ({"decision": "half"}, r"precision\.decision.*'half'.*known are.*bfloat16"),
+        ({"rounding": "up"}, r"precision\.rounding.*'up'.*nearest, stochastic"),
+        ({"seed": -1}, r"precision\.seed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            RolePrecision(**wrong)
 
 
 def test_sixteen_bits_are_for_pair_forces_alone():

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mdnum.forks.certified import exact_margin
 from mdnum.md.cell import Cell, HostCell, complete, wrap_positions
 from mdnum.md.decide import CONVENTIONS, PairDecider
 from mdnum.numerics.rounding import gamma, neighbor, ordinal, ulp_distance, unit_roundoff
@@ -50,23 +51,11 @@ def test_both_zeros_are_one_place():
         assert neighbor(-tiny, 1, dtype) == 0
 
 
-def test_unit_roundoff_is_the_largest_error_of_one_rounding():
-    assert unit_roundoff(np.float64) == 2.0**-53
-    assert unit_roundoff(np.float32) == 2.0**-24
-    assert unit_roundoff(ml_dtypes.bfloat16) == 2.0**-8
-    for dtype in (np.float64, np.float32):
-        u = unit_roundoff(dtype)
-        # half way rounds to even, a little more goes up: nothing is further than u away
-        assert dtype(1) + dtype(u) == 1
-        assert dtype(1) + dtype(u * 1.001) > 1 or dtype is np.float64
-        assert np.nextafter(dtype(1), dtype(2)) == dtype(1 + 2 * u)
-
-
 def test_gamma_bounds_a_product_of_roundings():
-    u = 2.0**-53
-    for n in (1, 3, 7, 100):
-        assert (1 + Fraction(u)) ** n - 1 <= Fraction(gamma(n))
-        assert gamma(n) >= n * u
+    for dtype, u in ((np.float64, 2.0**-53), (np.float32, 2.0**-24), (ml_dtypes.bfloat16, 2.0**-8)):
+        assert unit_roundoff(dtype) == u
+        for n in (1, 3, 7, 100):
+            assert n * u <= gamma(n, dtype) and (1 + Fraction(u)) ** n - 1 <= Fraction(gamma(n, dtype))
 
 
 # --- the bound of a margin --------------------------------------------------------------------------------
@@ -153,8 +142,19 @@ def test_a_bound_holds_wherever_atoms_drift(seed, compare, roles, drift):
         told = cell.pbc, roles, compare, float(margin), float(exact), bound
         if square < Fraction(1.001 * RADIUS) ** 2:
             assert abs(margin - exact) <= bound, told
+            without, decided = exact_margin(decider, cell, start[k], end[k])
+            assert abs(without - exact) < Fraction(1, 1 << 190), told
+            # the sign of the exact margin is the exact decision
+            assert decided == (exact >= 0 if compare.endswith("<=") else exact > 0), told
         inside, should = (x >= 0 if compare.endswith("<=") else x > 0 for x in (margin, exact))
         assert inside == should or abs(margin) <= bound, told
+
+
+@pytest.mark.parametrize("compare", CONVENTIONS)
+def test_a_pair_at_the_cutoff_is_decided_by_the_convention_in_exact_arithmetic_too(compare):
+    decider = PairDecider((1.5,), compare, "float32")
+    found = exact_margin(decider, Cell.create([6.0] * 3), np.zeros(3), np.array([0.0, 1.5, 0.0]))
+    assert found == (0, compare.endswith("<="))
 
 
 def test_bounds_grow_only_along_free_axes_and_only_where_positions_are_narrowed():

@@ -1,4 +1,4 @@
-"""Dates, growth rates and verdicts of made-up separations whose answers are known."""
+"""Verdicts on made-up separations whose answers are known; every sequence of coins; and what a split owes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum.numerics import verdicts
-from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, expected, growth, split_of
+from mdnum.numerics.verdicts import (
+    ERROR,
+    FEWEST,
+    REPEATS,
+    Dates,
+    Delay,
+    ForkVerdict,
+    count,
+    expected,
+    growth,
+    looks,
+    shares,
+    split_of,
+    table,
+)
 from mdnum.verbs.fork_verdict import TEXTS
+
+RATE, TOLERANCE, STEPS = 0.02, 0.1, 3000
 
 
 def judge(*given, **options) -> ForkVerdict:
@@ -24,135 +40,191 @@ def grown(rate: float, steps: int, start: float = 1e-15, top: float = 3.0) -> np
     return np.minimum(start * np.exp(rate * np.arange(steps)), top)
 
 
+FREE = grown(RATE, STEPS)
+SPLIT = split_of(FREE, TOLERANCE) or 0
+#: The same by one e-folding of steps, 50, and by more of them later.
+LITTLE, LATE = (np.concatenate([np.full(steps, 1e-15), FREE])[:STEPS] for steps in (40, 300))
+DATES = Dates(0, 400, SPLIT)
+
+
 @given(st.floats(0.01, 0.2), st.floats(-16, -10))
 def test_the_rate_of_an_exponential_is_found(rate, start):
-    separation = grown(rate, 4000, 10.0**start)
-    fit = growth(separation, 0.1)
+    fit = growth(grown(rate, 4000, 10.0**start), TOLERANCE)
     assert fit.rate == pytest.approx(rate, rel=1e-9)
     assert fit.r_squared > 1 - 1e-12
     assert fit.steps_to(1e-15, 1.0) == pytest.approx(np.log(1e15) / rate, rel=1e-6)
 
 
 def test_without_growth_there_is_no_prediction():
-    fit = growth(np.full(300, 1e-9), 0.1)
+    fit = growth(np.full(300, 1e-9), TOLERANCE)
     assert fit.steps_to(1e-9, 1.0) is None or abs(fit.rate) < 1e-12
-    assert np.isnan(growth(np.zeros(300), 0.1).rate)
+    assert np.isnan(growth(np.zeros(300), TOLERANCE).rate)
+    # the first steps are a power law, and predict nothing
+    power = 1e-9 * np.arange(61.0) ** 2
+    assert expected(power, TOLERANCE) is None
+    assert expected(power, TOLERANCE, exponent=0.0036) == pytest.approx(np.log(0.1 / 3.6e-6) / 0.0036)
+    assert "no_growth" in dict(judge(Dates(0, 5, None), power, None, TOLERANCE).reasons)
+    # an exponential says how long it would take
+    left = SPLIT - 899
+    reasons = dict(judge(Dates(0, 400, None), FREE[:900], None, TOLERANCE).reasons)
+    assert reasons["growing"]["steps"] in (left - 1, left)
 
 
-@pytest.fixture
-def free():
-    return grown(0.02, 3000)
-
-
-def dates(free, fork=400):
-    return Dates(0, fork, split_of(free, 0.1))
-
-
-def test_same_and_no_fork(free):
-    assert judge(Dates(None, None, None), np.zeros(50), None, 0.1).word == "same"
-    assert judge(Dates(0, None, None), free[:100], None, 0.1).word == "no fork"
-
-
-def test_a_horizon_too_short_says_how_long_it_would_take(free):
-    verdict = judge(Dates(0, 400, None), free[:900], None, 0.1)
-    assert verdict.word == "open"
-    left = split_of(free, 0.1) - 899
-    assert dict(verdict.reasons)["growing"]["steps"] in (left - 1, left)
-
-
-def test_a_cause_is_a_split_that_does_not_come(free):
-    verdict = judge(dates(free), free, np.full(3000, 1e-9), 0.1)
-    assert verdict.word == "cause" and verdict.e_foldings == float("inf")
-
-
-def test_a_cause_needs_steps_after_the_split(free):
-    end = split_of(free, 0.1) + 20
-    assert judge(dates(free), free[:end], np.full(end, 1e-9), 0.1).word == "open"
-
-
-def later(free, *gains):
-    """Repeats whose flips are worth so many steps."""
-    split = split_of(free, 0.1)
-    return [Delay(split - 7, split - 7 + gain, 2999, 2999) for gain in gains]
-
-
-def test_two_repeats_tell_nothing(free):
-    """However little they scatter."""
-    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, imposed, 0.1, later(free, 300, 301))
-    assert verdict.word == "undecided" and verdict.wanted == 3
-    assert judge(dates(free), free, imposed, 0.1, later(free, 300, 301), most=2).wanted == 0
-
-
-def test_accelerated_is_later_in_most_repeats(free):
-    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, imposed, 0.1, later(free, *5 * [60]))
-    assert verdict.word == "accelerated" and verdict.wanted == 0
-    assert verdict.e_foldings == pytest.approx(300 * 0.02, rel=1e-6)
-    assert verdict.threshold == pytest.approx(50)
-    # one of six not: it is looked at again after eleven, and after sixteen
-    gains = [60, 60, 60, 60, 40]
-    assert judge(dates(free), free, imposed, 0.1, later(free, *gains)).wanted == 5
-    assert judge(dates(free), free, imposed, 0.1, later(free, *gains, *5 * [60])).word == "accelerated"
-    verdict = judge(dates(free), free, imposed, 0.1, later(free, *gains, 40, *4 * [60]))
-    assert verdict.word == "undecided" and verdict.wanted == 5
-    verdict = judge(dates(free), free, imposed, 0.1, later(free, *gains, 40, *4 * [60], *5 * [40]))
-    assert verdict.word == "undecided" and verdict.wanted == 0
-    assert (verdict.count.later, verdict.count.not_later) == (9, 7)
-
-
-def test_a_bystander_is_not_later_in_most_repeats(free):
-    for gain in (0, -40, 40):
-        assert judge(dates(free), free, free, 0.1, later(free, *5 * [gain])).word == "bystander"
-    # less than one e-folding, which is 50 steps here, beyond any scatter
-    imposed = np.concatenate([np.full(40, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, imposed, 0.1, later(free, *5 * [40]))
-    assert verdict.word == "bystander" and verdict.e_foldings == pytest.approx(0.8)
-
-
-def test_without_repeats_nothing_is_said_of_a_delay(free):
-    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    for run in (imposed, free):
-        verdict = judge(dates(free), free, run, 0.1, most=0)
-        assert verdict.word == "undecided" and verdict.wanted == 0
-
-
-def test_what_was_not_seen_counts_for_neither(free):
-    imposed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    unseen = [Delay(1600, None, 2999, 1640)] * 5
-    verdict = judge(dates(free), free, imposed, 0.1, unseen)
-    assert verdict.word == "undecided" and (verdict.count.later, verdict.count.not_later) == (1, 0)
-    seen_to_be_later = [Delay(1600, None, 2999, 1700)] * 5
-    assert judge(dates(free), free, imposed, 0.1, seen_to_be_later).word == "accelerated"
-
-
-def test_close_to_the_tolerance_is_no_cause(free):
-    verdict = judge(dates(free), free, np.full(3000, 0.05), 0.1)
-    assert verdict.word == "open"
-    assert [code for code, _ in verdict.reasons] == ["kept", "within"]
-
-
-def test_a_split_before_the_fork_is_no_flips_doing(free):
-    verdict = judge(dates(free, fork=2500), free, free, 0.1)
-    assert verdict.word == "bystander"
-    assert verdict.reasons[0][0] == "had_split"
-
-
-def test_first_steps_predict_nothing():
-    step = np.arange(61.0)
-    assert expected(1e-9 * step**2, 0.1) is None
-    assert expected(1e-9 * step**2, 0.1, exponent=0.0036) == pytest.approx(np.log(0.1 / 3.6e-6) / 0.0036)
-    verdict = judge(Dates(0, 5, None), 1e-9 * step**2, None, 0.1)
-    assert "no_growth" in dict(verdict.reasons)
+@pytest.mark.parametrize(
+    ("dates", "free", "imposed", "word", "codes"),
+    [
+        (Dates(None, None, None), np.zeros(50), None, "same", {"same"}),
+        (Dates(0, None, None), FREE[:100], None, "no fork", {"no_fork"}),
+        # a split that does not come, one that was not followed for long enough, one within the tolerance
+        (DATES, FREE, np.full(STEPS, 1e-9), "cause", {"kept", "rests"}),
+        (DATES, FREE[: SPLIT + 20], np.full(SPLIT + 20, 1e-9), "open", {"kept", "short"}),
+        (DATES, FREE, np.full(STEPS, 0.05), "open", {"kept", "within"}),
+        # before the fork, and under the other's decisions alone
+        (Dates(0, 2500, SPLIT), FREE, FREE, "bystander", {"had_split"}),
+        (Dates(0, 400, None), FREE[:900], FREE[-900:], "open", {"outlook", "together"}),
+    ],
+)
+def test_words_that_need_no_repeats(dates, free, imposed, word, codes):
+    verdict = judge(dates, free, imposed, TOLERANCE)
+    assert verdict.word == word and codes <= set(dict(verdict.reasons)) and verdict.wanted == 0
+    assert verdict.e_foldings == (float("inf") if word == "cause" else None)
 
 
 def test_an_end_of_one_run_is_a_fork_by_itself():
     ended = {"run": "B", "word": "runaway", "step": 0, "other": "A"}
-    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended=ended)
+    verdict = judge(Dates(0, 0, None), np.zeros(1), None, TOLERANCE, ended=ended)
     assert verdict.word == "open" and verdict.reasons == (("ended", {**ended, "steps": 0}),)
 
 
-def test_a_split_under_the_others_decisions_alone_is_told(free):
-    verdict = judge(Dates(0, 400, None), free[:900], free[-900:], 0.1)
-    assert verdict.word == "open" and verdict.imposed == 0
-    assert dict(verdict.reasons)["together"] == {"step": 0}
+def later(*gains: int) -> list[Delay]:
+    """Repeats whose flips are worth so many steps."""
+    return [Delay(SPLIT - 7, SPLIT - 7 + gain, STEPS - 1, STEPS - 1) for gain in gains]
+
+
+#: One of six not later: it is looked at again after eleven, and after sixteen.
+SIX = (60, 60, 60, 60, 40)
+ELEVEN = (*SIX, 40, 60, 60, 60, 60)
+
+
+@pytest.mark.parametrize(
+    ("imposed", "repeats", "most", "word", "wanted"),
+    [
+        # two tell nothing, however little they scatter
+        (LATE, later(300, 301), REPEATS, "undecided", 3),
+        (LATE, later(300, 301), 2, "undecided", 0),
+        (LATE, later(*5 * [60]), REPEATS, "accelerated", 0),
+        (LATE, later(*SIX), REPEATS, "undecided", 5),
+        (LATE, later(*SIX, *5 * [60]), REPEATS, "accelerated", 0),
+        (LATE, later(*ELEVEN), REPEATS, "undecided", 5),
+        (LATE, later(*ELEVEN, *5 * [40]), REPEATS, "undecided", 0),
+        *((FREE, later(*5 * [gain]), REPEATS, "bystander", 0) for gain in (0, -40, 40)),
+        # less than one e-folding, beyond any scatter
+        (LITTLE, later(*5 * [40]), REPEATS, "bystander", 0),
+        (LATE, [], 0, "undecided", 0),
+        (FREE, [], 0, "undecided", 0),
+        # what was not seen counts for neither; seen to be later it counts
+        (LATE, [Delay(1600, None, 2999, 1640)] * 5, REPEATS, "undecided", 5),
+        (LATE, [Delay(1600, None, 2999, 1700)] * 5, REPEATS, "accelerated", 0),
+    ],
+)
+def test_words_that_rest_on_repeats(imposed, repeats, most, word, wanted):
+    verdict = judge(DATES, FREE, imposed, TOLERANCE, repeats, most)
+    assert (verdict.word, verdict.wanted) == (word, wanted)
+    assert verdict.threshold == pytest.approx(50)
+    steps = {id(LATE): 300, id(LITTLE): 40, id(FREE): 0}[id(imposed)]
+    assert verdict.e_foldings == pytest.approx(steps * RATE, rel=1e-6)
+    sure = [(one.imposed or one.imposed_until + 1) - one.free for one in repeats if one.free is not None]
+    assert verdict.count.later == sum(gain > 50 for gain in [steps, *sure])
+    unseen = sum(one.imposed is None and gain <= 50 for one, gain in zip(repeats, sure, strict=True))
+    assert verdict.count.not_later == 1 + len(repeats) - verdict.count.later - unseen
+
+
+# --- the sequential sign test ---------------------------------------------------------------------------
+
+
+def words(coins: np.ndarray, most: int) -> list[bool | None]:
+    """What the rule says of rows of coins, each True for a pair that is delayed, drawn as it wants them."""
+    said = []
+    for row in coins:
+        pairs = tuple(Delay(100, 160 if heads else 100, 500, 500) for heads in row)
+        found = count(pairs[:1], 50.0, most)
+        while found.wanted:
+            found = count(pairs[: found.pairs + found.wanted], 50.0, most)
+        said.append(found.delayed)
+    return said
+
+
+@pytest.mark.parametrize("pairs", [5, 6, 7, 11])
+def test_fair_coins_are_taken_for_delayed_in_a_twentieth_of_all_sequences_at_most(pairs):
+    """Looked at as often as the rule looks, by going through all of them."""
+    every = (np.arange(2**pairs)[:, None] >> np.arange(pairs)) & 1
+    said = words(every.astype(bool), pairs)
+    for word in (True, False):
+        assert 0.015 < said.count(word) / len(said) <= ERROR
+
+
+def test_at_the_default_the_error_is_nearly_spent_and_a_clear_majority_is_found():
+    tosses = np.random.default_rng(0).random((1500, 1 + REPEATS))
+    # 0.0487; three standard errors of 1,500 draws
+    assert abs(words(tosses < 0.5, 1 + REPEATS).count(True) / len(tosses) - 0.0487) < 0.0167
+    said = words(tosses[:300] < 0.9, 1 + REPEATS)
+    assert said.count(True) > 285 and said.count(False) == 0
+    # five of five by coins: 1/32; four of four: 1/16
+    assert FEWEST == 4 and looks(4) == () and looks(5) == ((5, 5),)
+
+
+UNTIL = st.integers(0, 300)
+
+
+@given(st.integers(1, 400), st.integers(1, 400), UNTIL, UNTIL, st.floats(0, 100))
+def test_what_is_said_of_a_part_holds_of_the_whole(free, imposed, free_until, imposed_until, steps):
+    """A split beyond what was followed is not seen; what is said all the same is true of it."""
+    one, other = np.where(np.arange(401) < free, 0.0, 1.0), np.where(np.arange(401) < imposed, 0.0, 1.0)
+    one[free_until + 1 :], other[imposed_until + 1 :] = np.nan, np.nan
+    seen = Delay.of(one, other, TOLERANCE)
+    assert (seen.free_until, seen.imposed_until) == (free_until, imposed_until)
+    said = seen.beyond(steps)
+    assert said is None or said == (imposed - free > steps)
+    assert said is not None or seen.free is None or seen.imposed is None
+
+
+# --- what a split owes to the decisions and what to the arithmetic --------------------------------------
+
+
+def splits_at(step: int, until: int = STEPS) -> np.ndarray:
+    """Grows at RATE and is beyond the tolerance from this step on; nothing after another one."""
+    values = TOLERANCE * np.exp(RATE * (np.arange(STEPS) - step + 0.5))
+    return np.where(np.arange(STEPS) <= until, values, np.nan)
+
+
+def test_each_cell_and_each_share_is_what_its_name_says():
+    series = {
+        "B": splits_at(1000), "B|A": splits_at(1400), "B|A from B": splits_at(1100),
+        "A|B from A": splits_at(950), "A|B": splits_at(9000, 2500),
+    }  # fmt: skip
+    rows = table(series, TOLERANCE)
+    cells = {(cell.arithmetic, cell.decisions, cell.reference): (cell.split, cell.until) for cell in rows}
+    assert cells == {
+        ("A", "A", "A"): (None, 2999), ("B", "B", "A"): (1000, 2999), ("B", "A", "A"): (1400, 2999),
+        ("A", "B", "A"): (950, 2999), ("A", "A", "B"): (1000, 2999), ("B", "B", "B"): (None, 2999),
+        ("B", "A", "B"): (1100, 2999), ("A", "B", "B"): (None, 2500),
+    }  # fmt: skip
+    assert [cell.same for cell in rows].count(True) == 2
+    # B under A's decisions differs from A in its arithmetic alone: what is taken away are the decisions
+    assert [(one.what, one.reference, one.steps, one.at_least) for one in shares(rows, RATE)] == [
+        ("decisions", "A", 400, False), ("decisions", "B", 1500, True),
+        ("arithmetic", "A", -50, False), ("arithmetic", "B", 100, False),
+    ]  # fmt: skip
+    assert [one.e_foldings for one in shares(rows, RATE)] == pytest.approx([8.0, 30.0, -1.0, 2.0])
+
+
+def test_what_was_not_run_or_did_not_split_has_no_share():
+    # a run that ended before the split says nothing
+    series = {"B": splits_at(1000), "B|A": splits_at(9000, 700), "B|A from B": splits_at(1001)}
+    (found,) = shares(table(series, TOLERANCE), float("nan"))
+    assert (found.what, found.reference, found.steps, found.e_foldings) == ("arithmetic", "B", 1, None)
+    for series, cells in (
+        ({"B": splits_at(9000), "B|A": splits_at(9000)}, 5), ({"B": splits_at(1000)}, 4)
+    ):  # fmt: skip
+        rows = table(series, TOLERANCE)
+        assert len(rows) == cells and shares(rows, RATE) == ()

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import ase.io
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from ase import Atoms
 from ase.build import bulk
 from oracles import recomputed_flips
 
+from mdnum.md.cell import wrap_positions
+from mdnum.numerics.reductions import Exact
+from mdnum.numerics.sums import Reduction
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.flips import decided_pairs
 from mdnum.rollout.run import RunResult, run
 from mdnum.store import RunFolder
+from mdnum.systems.build import Simulation
 from mdnum.systems.load import System, load
+
+CRYSTAL = "argon/crystal-108"
 
 # tables of a system file; a test changes what it is about
 BASE: dict[str, dict[str, Any]] = {
@@ -67,14 +79,72 @@ def liquid(
 
 def shaken(system: System, seed: int, temperature: float = 1.0, rattle: float = 0.05) -> System:
     """The system with other positions and velocities (masses 1, units lj): the same compiled program."""
-    from dataclasses import replace
-
     rng = np.random.default_rng(seed)
     atoms = system.atoms.copy()
     atoms.positions += rng.normal(0, rattle, atoms.positions.shape)
     velocities = rng.normal(0, np.sqrt(temperature), atoms.positions.shape)
     atoms.set_velocities(velocities - velocities.mean(axis=0))
     return replace(system, atoms=atoms)
+
+
+def moved(simulation: Simulation, size: float) -> Simulation:
+    """Every atom displaced at random by about `size`."""
+    noise = np.random.default_rng(0).standard_normal(simulation.positions.shape)
+    return replace(simulation, positions=simulation.positions + size * noise)
+
+
+def history(simulation: Simulation, last: int, **options: Any) -> tuple[np.ndarray, list[set[int]]]:
+    """Of every step the positions in the user's order, and the keys of the pairs inside."""
+    x, pairs = [], []
+    for segment in Engine(simulation, last, **options).segments():
+        for row in range(segment.rows):
+            x.append(segment.unsorted("x", row))
+            pairs.append(set(decided_pairs(simulation, segment, row).tolist()))
+    return np.array(x, np.float64), pairs
+
+
+def nearest(simulation: Simulation, d: np.ndarray) -> np.ndarray:
+    """Displacements less lattice vectors, in a box along the axes."""
+    box = np.diag(np.asarray(simulation.cell.matrix))
+    return d - box * np.round(d / box)
+
+
+def furthest(simulation: Simulation, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distance of the atom that is furthest from where it is in other positions, of shape (..., atoms, 3)."""
+    return np.linalg.norm(nearest(simulation, one - other), axis=-1).max(axis=-1)
+
+
+def listed(simulation: Simulation, skin: float | None = None, positions: np.ndarray | None = None):
+    """Wrapped positions in the order of a list, shape (3, atoms), the list, and its tables."""
+    given = simulation.positions if positions is None else positions
+    wrapped, _ = wrap_positions(simulation.cell, given)
+    table = simulation.verlet_list(skin).build(wrapped, simulation.cell)
+    return jnp.asarray(wrapped[table.order].T), table, simulation.tables(table)
+
+
+@eqx.filter_jit
+def evaluated(force, x, tables, **options):
+    """The force and the decisions over a list."""
+    return force(x, tables, decisions=True, **options)
+
+
+@dataclass(frozen=True, eq=False)
+class Tap(Reduction):
+    """The exact sum, which keeps the terms of every sum that a compiled program makes, in their order."""
+
+    seen: list[np.ndarray] = field(default_factory=list)
+
+    def sum_of(self, terms, add):
+        jax.debug.callback(lambda t: self.seen.append(np.array(t)), terms, ordered=True)
+        return Exact()(terms)
+
+
+def terms_of(simulation: Simulation, x, tables) -> list[np.ndarray]:
+    """The terms of every sum of a force: three components, the energy and the virial."""
+    tap = Tap()
+    jax.block_until_ready(evaluated(replace(simulation, reduction=tap).force, x, tables))
+    jax.effects_barrier()
+    return tap.seen
 
 
 def go(
@@ -105,9 +175,8 @@ def radii(simulation) -> Any:
     return lambda i, j: table[index[i], index[j]]
 
 
-def assert_ledger_is_complete(result: RunResult, folder: RunFolder, save_every: int = 1) -> int:
+def assert_ledger_is_complete(result: RunResult, folder: RunFolder) -> int:
     """flips.parquet and the counts in series.parquet equal a recomputation from the frames; returns flips."""
-    assert save_every == 1
     simulation = result.simulation
     spec = simulation.system.spec
     compare = "r <" if spec.cutoff is None else spec.cutoff.compare

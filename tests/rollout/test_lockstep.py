@@ -3,54 +3,56 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from rollout.harness import CRYSTAL, furthest, history, moved
 
-from mdnum.md.neighbors import RebuildRule
-from mdnum.rollout.compared import ReferenceFrame
+from mdnum.md.cell import Cell, HostCell
+from mdnum.md.neighbors import PairTable, RebuildRule
+from mdnum.rollout.compared import Apart, ReferenceFrame, differ, in_user_order
 from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import decided_pairs, true_pairs
+from mdnum.rollout.epoch import Pin, Pins
+from mdnum.rollout.flips import true_pairs
 from mdnum.rollout.lockstep import lockstep
+from mdnum.rollout.program import pair_margin
 from mdnum.rollout.tracks import Handed
 from mdnum.systems.build import Simulation, build
 
 FLOAT32 = {f"precision.{role}": "float32" for role in ("force", "decision", "accumulate")}
 LANGEVIN = {"dynamics.kind": "langevin", "dynamics.friction": 1.0}
+#: Of every run here: the rows of a record are part of the program.
+STEPS = 120
 
 
-def shifted(simulation: Simulation, size: float) -> Simulation:
-    noise = np.random.default_rng(0).standard_normal(simulation.positions.shape)
-    return replace(simulation, positions=simulation.positions + size * noise)
+@pytest.fixture(scope="module")
+def crystal() -> Simulation:
+    return build(CRYSTAL)
 
 
-def alone(simulation: Simulation, last: int):
-    """Positions in the user's order and keys of the pairs inside, of every step."""
-    x, pairs = [], []
-    for segment in Engine(simulation, last).segments():
-        for row in range(segment.rows):
-            x.append(segment.unsorted("x", row))
-            pairs.append(set(decided_pairs(simulation, segment, row).tolist()))
-    return np.array(x, np.float64), pairs
+@pytest.fixture(scope="module")
+def alone(crystal) -> list[tuple[np.ndarray, list[set[int]]]]:
+    """The crystal, and one whose atoms are elsewhere, each by itself."""
+    return [history(one, STEPS) for one in (crystal, moved(crystal, 1e-2))]
 
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
-        ("argon/crystal-108", {}),
-        ("argon/crystal-108", {"neighbors.skin": 0.1}),
+        (CRYSTAL, {}),
+        (CRYSTAL, {"neighbors.skin": 0.1}),
         # all at once, and every night one by one
         pytest.param("binary/kob-andersen-1000", FLOAT32 | LANGEVIN, marks=pytest.mark.slow),
         pytest.param("binary/kob-andersen-1000", {}, marks=pytest.mark.nightly),
-        pytest.param("argon/crystal-108", FLOAT32, marks=pytest.mark.nightly),
+        pytest.param(CRYSTAL, FLOAT32, marks=pytest.mark.nightly),
         pytest.param("argon/langevin-500", {}, marks=pytest.mark.nightly),
     ],
 )
 def test_handed_its_own_decisions_a_run_is_bit_identical(name, overrides):
     simulation = build(name, overrides)
     handed = Handed(simulation, simulation)
-    for segment in Engine(simulation, 120).segments():
+    for segment in Engine(simulation, STEPS).segments():
         rows, note = handed.follow(segment)
         for row in range(segment.rows):
             np.testing.assert_array_equal(rows.x[row].T, segment.unsorted("x", row))
@@ -58,115 +60,68 @@ def test_handed_its_own_decisions_a_run_is_bit_identical(name, overrides):
         assert not note.count.any()
 
 
-def test_with_lists_of_its_own_it_acts_on_the_same_pairs():
-    leader = build("argon/crystal-108")
-    other = build("argon/crystal-108", {"neighbors.skin": 0.5})
-    handed = Handed(other, leader)
-    apart, overridden = 0.0, 0
-    for segment in Engine(leader, 120).segments():
-        rows, note = handed.follow(segment)
-        for row in range(segment.rows):
-            apart = max(apart, np.abs(rows.x[row].T - segment.unsorted("x", row)).max())
-        overridden += int(note.count.sum())
+def test_with_lists_of_its_own_it_acts_on_the_same_pairs(crystal, alone):
+    handed = Handed(build(CRYSTAL, {"neighbors.skin": 0.5}), crystal)
+    followed = [handed.follow(segment) for segment in Engine(crystal, STEPS).segments()]
+    x = np.concatenate([rows.x for rows, _ in followed]).transpose(0, 2, 1)
     # another order of summation, and nothing else
-    assert 0 < apart < 1e-12
-    assert overridden == 0
+    assert 0 < np.abs(x - alone[0][0]).max() < 1e-12
+    assert not any(note.count.any() for _, note in followed)
 
 
-def test_cross_flips_are_the_differences_of_the_pair_sets():
-    a = build("argon/crystal-108")
-    b = shifted(a, 1e-4)
-    last = 120
-    x_a, pairs_a = alone(a, last)
-    x_b, pairs_b = alone(b, last)
+def test_cross_flips_are_the_differences_of_the_pair_sets(crystal, alone):
+    a, b = crystal, moved(crystal, 1e-2)
+    (x_a, pairs_a), (x_b, pairs_b) = alone
+    runs = {"A": (a, x_a, pairs_a), "B": (b, x_b, pairs_b)}
     differ = [one ^ other for one, other in zip(pairs_a, pairs_b, strict=True)]
-    assert sum(map(len, differ)) > 50
-
+    assert sum(map(len, differ)) > 50 and differ[0], "from the start on, too"
     known: set[int] = set()
-    step = 0
-    for stretch in lockstep(a, b, last):
-        flips = {}
-        for flip in stretch.flips:
-            flips.setdefault(flip.step, []).append(flip)
-        for row in range(stretch.rows):
-            for flip in flips.get(stretch.first + row, ()):
+    for stretch in lockstep(a, b, STEPS):
+        assert list(stretch.flips[:3]) + list(stretch.flips[3:]) == list(stretch.flips)
+        steps = [(flip.step, flip.i, flip.j, flip.run) for flip in stretch.flips]
+        assert steps == sorted(steps)
+        for row, step in enumerate(range(stretch.first, stretch.first + stretch.rows)):
+            for flip in (flip for flip in stretch.flips if flip.step == step):
                 key = flip.i * a.atoms + flip.j
                 known ^= {key}
                 assert flip.differs == (key in known)
-            assert known == differ[step]
-            assert stretch.cross[row] == len(known)
-            d = x_a[step] - x_b[step]
-            box = np.diag(np.asarray(a.cell.matrix))
-            d -= box * np.round(d / box)
-            assert stretch.separation["B"][row] == pytest.approx(np.linalg.norm(d, axis=1).max(), rel=1e-12)
-            step += 1
-    assert step == last + 1
+                # it is a flip of the run that is named
+                own, x, inside = runs[flip.run]
+                if step:
+                    assert flip.entered == (key in inside[step]) != (key in inside[step - 1])
+                    assert flip.margin == pair_margin(own, x[step], flip.i, flip.j)
+            assert known == differ[step] and stretch.cross[row] == len(known)
+    assert step == STEPS
 
 
-def test_every_run_is_compared_with_the_one_that_its_name_says():
-    a = build("argon/crystal-108")
-    b = shifted(a, 1e-4)
-    last = 120
-    free = {"A": alone(a, last)[0], "B": alone(b, last)[0]}
+def test_every_run_is_compared_with_the_one_that_its_name_says(crystal, alone):
+    a, b = crystal, moved(crystal, 1e-2)
+    free = {"A": alone[0][0], "B": alone[1][0]}
     mixed = {}
     for name, own, leader in (("B|A", b, a), ("A|B", a, b)):
         told = Handed(own, leader)
-        rows = [told.follow(segment)[0].x for segment in Engine(leader, last).segments()]
+        rows = [told.follow(segment)[0].x for segment in Engine(leader, STEPS).segments()]
         mixed[name] = np.concatenate(rows).transpose(0, 2, 1)
-    stretches = list(lockstep(a, b, last, back=True))
+    stretches = list(lockstep(a, b, STEPS, back=True))
     for name, one, other in (
         ("B", free["B"], free["A"]), ("B|A", mixed["B|A"], free["A"]), ("A|B", mixed["A|B"], free["B"]),
         ("A|B from A", mixed["A|B"], free["A"]), ("B|A from B", mixed["B|A"], free["B"]),
     ):  # fmt: skip
-        d = one - other
-        box = np.diag(np.asarray(a.cell.matrix))
-        d -= box * np.round(d / box)
         got = np.concatenate([stretch.separation[name] for stretch in stretches])
-        np.testing.assert_allclose(got, np.linalg.norm(d, axis=2).max(axis=1), rtol=1e-12)
+        np.testing.assert_allclose(got, furthest(a, one, other), rtol=1e-12)
     assert stretches[0].separation["A|B from A"][0] == 0, "the same start"
-
-
-@pytest.mark.slow
-def test_the_flips_of_a_cold_crystal_cause_what_they_are_blamed_for():
-    a = build("argon/crystal-108")
-    b = shifted(a, 1e-6)
-    free, handed = [], []
-    for stretch in lockstep(a, b, 1500):
-        free.append(stretch.separation["B"])
-        handed.append(stretch.separation["B|A"])
-    assert np.concatenate(free)[-1] > 1e-2
-    assert np.concatenate(handed).max() < 1e-5
-    # with the cutoff between two shells there is nothing to flip
-    between = build("argon/crystal-108", {"cutoff.radius": 1.35, "neighbors.skin": 4 ** (1 / 3) + 0.3 - 1.35})
-    stretches = list(lockstep(between, shifted(between, 1e-6), 1500))
-    assert not any(stretch.flips for stretch in stretches)
-    assert max(stretch.separation["B"].max() for stretch in stretches) < 1e-5
-
-
-def test_the_same_run_twice_never_parts():
-    a = build("argon/crystal-108")
-    for stretch in lockstep(a, build("argon/crystal-108"), 120):
-        assert not stretch.bits.any() and not stretch.flips and not stretch.cross.any()
-        assert (stretch.separation["B"] == 0).all() and (stretch.separation["B|A"] == 0).all()
 
 
 def test_one_wrong_decision_is_found():
     """A list that is not rebuilt loses pairs: the step and the pairs are those of a fresh search."""
-    a = build("argon/crystal-108", {"dynamics.temperature": 2.0})
+    a = build(CRYSTAL, {"dynamics.temperature": 2.0})
     b = replace(a, rule=RebuildRule(0.3, 100, 0, False))
-    missed = None
-    for segment in Engine(b, 120).segments():
-        for row in range(segment.rows):
-            acted = decided_pairs(b, segment, row)
-            lost = np.setdiff1d(true_pairs(b, segment.unsorted("x", row)), acted)
-            if missed is None and len(lost):
-                missed = segment.first + row, set(lost.tolist())
-    assert missed is not None
+    lost = [set(true_pairs(b, x).tolist()) - acted for x, acted in zip(*history(b, STEPS), strict=True)]
+    step = next(step for step, pairs in enumerate(lost) if pairs)
     first = next(
-        flip for stretch in lockstep(a, b, 120, handed=False) for flip in stretch.flips if flip.differs
+        flip for stretch in lockstep(a, b, STEPS, handed=False) for flip in stretch.flips if flip.differs
     )
-    assert first.step == missed[0]
-    assert first.i * a.atoms + first.j in missed[1]
+    assert first.step == step and first.i * a.atoms + first.j in lost[step]
 
 
 def test_a_frame_undoes_labels_axes_and_shifts():
@@ -186,9 +141,119 @@ def test_a_frame_undoes_labels_axes_and_shifts():
     np.testing.assert_array_equal(keys, wanted)
 
 
-def test_a_run_that_fails_on_one_side_ends_the_comparison():
-    a = build("argon/crystal-108")
-    b = replace(a, integrator=replace(a.integrator, timestep=jnp.asarray(1e6)))
-    stretches = list(lockstep(a, b, 120, handed=False))
-    assert stretches[-1].failed["B"] in ("blow-up", "runaway")
-    assert stretches[-1].failed["A"] == ""
+# --- single decisions imposed on a run that makes all others itself ---------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", [CRYSTAL, pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly)]
+)
+def test_pinned_to_its_own_decisions_a_run_is_bit_identical(name):
+    simulation = build(name)
+    x, inside = history(simulation, STEPS)
+    flipped = [before ^ after for before, after in pairwise(inside)]
+    chosen = sorted(set().union(*flipped))[:200:4]
+    assert len(chosen) > 10
+    pins = []
+    for key in chosen:
+        changes = tuple(step for step, keys in enumerate(flipped, 1) if key in keys)
+        pins.append(Pin(*divmod(key, simulation.atoms), 0, STEPS, changes, key in inside[0]))
+    np.testing.assert_array_equal(x, history(simulation, STEPS, pins=Pins(pins))[0])
+
+
+def test_one_inverted_decision_is_the_only_thing_that_differs_and_is_found(crystal, alone):
+    """The planted fault: a pair inside is told to be outside for one step."""
+    plain, inside = alone[0]
+    i, j = divmod(sorted(inside[40])[17], crystal.atoms)
+    planted, _ = history(crystal, STEPS, pins=Pins([Pin(i, j, 40, 40, (), False)]))
+    # forces of step 40 make the positions of step 41
+    np.testing.assert_array_equal(planted[:41], plain[:41])
+    differ = np.flatnonzero(np.any(planted[41] != plain[41], axis=1))
+    np.testing.assert_array_equal(differ, [i, j])
+
+
+# --- compiled comparisons of rows have the bits of the numpy that says what they mean -------------------
+
+
+BOXES = {
+    "cube": (np.diag([5.0, 5.0, 5.0]), (True, True, True)),
+    "brick, one face open": (np.diag([4.0, 5.0, 6.0]), (True, False, True)),
+    "tilted": (np.array([[5.0, 0, 0], [0.7, 4.5, 0], [-0.3, 0.4, 4.8]]), (True, True, True)),
+    "tilted, one face open": (np.array([[5.0, 0, 0], [0.7, 4.5, 0], [0, 0, 4.8]]), (True, True, False)),
+    "open": (np.diag([5.0, 5.0, 5.0]), (False, False, False)),
+}
+
+
+def rows(seed: int, count: int = 9, atoms: int = 31) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1.0, 6.0, (count, 3, atoms))
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_distances_have_the_bits_of_nearest_images(box):
+    matrix, pbc = BOXES[box]
+    cell = Cell.create(matrix, np.array(pbc))
+    a, b = rows(1), rows(2)
+    b[4] = a[4]
+    b[5, 1, 3] = np.nan
+    d = HostCell(cell).displacement(a.transpose(0, 2, 1), b.transpose(0, 2, 1))
+    with np.errstate(invalid="ignore"):
+        wanted = np.sqrt((d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).max(axis=1))
+    found = Apart(cell)(a, b)
+    np.testing.assert_array_equal(found, wanted)
+    assert found[4] == 0 and np.isnan(found[5])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_atoms_are_put_in_the_users_order(dtype):
+    values, order = rows(3).astype(dtype), np.random.default_rng(4).permutation(31)
+    found = in_user_order(values, order)
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found[:, :, order], values)
+
+
+def test_rows_differ_where_a_number_does():
+    a = rows(5)
+    b = a.copy()
+    b[2, 1, 30] = np.nextafter(b[2, 1, 30], 9)
+    a[3, 0, 0] = b[3, 0, 0] = np.nan
+    # zeros of either sign are one number
+    a[4, 0, 0], b[4, 0, 0] = 0.0, -0.0
+    also = np.zeros(9, bool)
+    also[7] = True
+    assert np.flatnonzero(differ(a, b)).tolist() == [2, 3]
+    assert np.flatnonzero(differ(a, b, also)).tolist() == [2, 3, 7]
+    assert not also[2]
+
+
+def test_overridden_decisions_are_counted_once_with_their_distances():
+    rng = np.random.default_rng(6)
+    count, atoms, slots = 5, 31, 16
+    matrix, pbc = BOXES["tilted"]
+    cell, species = Cell.create(matrix, np.array(pbc)), rng.integers(0, 2, atoms)
+    r_cut = np.array([[1.0, 1.2], [1.2, 1.5]])
+    # a full list: every pair of sorted atoms within seven of one another, from both ends
+    index = np.full((slots, atoms), atoms, np.int32)
+    for k in range(atoms):
+        others = [n for n in range(k - 7, k + 8) if n != k and 0 <= n < atoms]
+        index[: len(others), k] = others
+    table = PairTable(index, rng.permutation(atoms), 1.0, slots, 0.0)
+    own = np.zeros((count, slots // 8, atoms), np.uint8)
+    told, wanted = own.copy(), [[] for _ in range(count)]
+    x = rows(7, count, atoms).astype(np.float32)
+    for row in range(1, count):
+        for _ in range(4 * row):
+            k = int(rng.integers(0, atoms - 7))
+            n = k + int(rng.integers(1, 8))
+            for one, other in ((k, n), (n, k)):
+                slot = int(np.flatnonzero(index[:, one] == other)[0])
+                told[row, slot // 8, one] ^= np.uint8(1 << slot % 8)
+            wanted[row] = sorted(set(wanted[row]) ^ {(k, n)})
+    counts, furthest = Apart(cell).overridden(own, told, table, x, species, r_cut)
+    assert counts.tolist() == [len(pairs) for pairs in wanted] and counts[4] > 6
+    for row, pairs in enumerate(wanted):
+        off = [0.0]
+        for pair in pairs:
+            k, n = sorted(pair, key=lambda one: table.order[one])
+            d = HostCell(cell).displacement(x[row, :, [k]], x[row, :, [n]])
+            distance = np.sqrt(sum(c[0] * c[0] for c in d))
+            off.append(abs(distance - r_cut[species[table.order[k]], species[table.order[n]]]))
+        assert furthest[row] == max(off)

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rollout.harness import frames_of, go, liquid, tables_equal, write_system
+from ase import Atoms
+from rollout.harness import assert_ledger_is_complete, frames_of, go, liquid, tables_equal, write_system
 
-from mdnum.errors import FolderError, InputError
-from mdnum.rollout.run import run
+from mdnum.errors import FolderError, InputError, NumericalError
+from mdnum.rollout.run import RunResult, run
 from mdnum.store import RunFolder
 from mdnum.systems import load
+from mdnum.systems.build import build
 
 # as many rows of a record as in test_ledger: the same program
 STEPS = 120
@@ -65,16 +67,17 @@ def assert_same(whole, other):
     assert log == again
 
 
-def stopped_at(system, out, stop, monkeypatch, steps=STEPS):
+def stopped_at(system, out, stop, monkeypatch, **options):
     """A run that ends with an exception at the first report from step stop on."""
     monkeypatch.setattr(RunFolder, "checkpoint_due", lambda self: True)
 
     def progress(step, steps, info):
-        if info["phase"] == "run" and step >= stop:
+        if step >= stop:
             raise Stop
 
+    options = options or {"out": out, "steps": STEPS, "save_every": 10}
     with pytest.raises(Stop):
-        run(system, out=out, steps=steps, save_every=10, progress=progress)
+        run(system, progress=progress, **options)
 
 
 @pytest.mark.slow
@@ -91,55 +94,34 @@ def test_a_killed_run_resumes(path, whole, tmp_path):
     assert_same(whole, (result, RunFolder.open(out)))
 
 
-@pytest.mark.parametrize("stop", [40, 100])
-def test_a_stopped_run_resumes(path, whole, tmp_path, monkeypatch, stop):
-    stopped_at(load(path), tmp_path / "run", stop, monkeypatch)
-    result = run(None, resume=tmp_path / "run")
-    assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
-
-
 def test_a_run_may_be_stopped_again_and_again(path, whole, tmp_path, monkeypatch):
+    """Before its first step, at a checkpoint, between two, and at once after it was resumed."""
     out = tmp_path / "run"
-    stopped_at(load(path), out, 10, monkeypatch)
-    for stop in (35, 70, 71, 110):
-
-        def progress(step, steps, info, stop=stop):
-            if info["phase"] == "run" and step >= stop:
-                raise Stop
-
-        with pytest.raises(Stop):
-            run(None, resume=out, progress=progress)
+    stopped_at(load(path), out, 0, monkeypatch)
+    for stop in (10, 35, 70, 71, 110):
+        stopped_at(None, None, stop, monkeypatch, resume=out)
     result = run(None, resume=out)
     assert_same(whole, (result, RunFolder.open(out)))
 
 
-@pytest.mark.slow
-def test_the_noise_of_a_thermostat_goes_on(tmp_path, monkeypatch):
-    path = write_system(tmp_path, liquid(), dynamics={"kind": "langevin", "friction": 1.0})
-    whole = go(tmp_path / "whole", path, STEPS, save_every=10)
-    stopped_at(load(path), tmp_path / "run", 60, monkeypatch)
-    result = run(None, resume=tmp_path / "run")
-    assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
+LANGEVIN = {"dynamics.kind": "langevin", "dynamics.friction": 1.0}
+BLIND = {"neighbors.skin": 0.05, "neighbors.rebuild.every": 20, "neighbors.rebuild.check": False}
 
 
 @pytest.mark.slow
-def test_lost_pairs_are_counted_across_a_stop(path, tmp_path, monkeypatch):
-    overrides = {"neighbors.skin": 0.05, "neighbors.rebuild.every": 20, "neighbors.rebuild.check": False}
+@pytest.mark.parametrize("overrides", [LANGEVIN, BLIND])
+def test_the_noise_of_a_thermostat_and_the_count_of_lost_pairs_go_on(path, tmp_path, monkeypatch, overrides):
     system = load(path, overrides)
     whole = go(tmp_path / "whole", system, STEPS, save_every=10)
-    assert whole[0].summary["lost_pairs"] > 0
+    assert (whole[0].summary["lost_pairs"] > 0) == (overrides is BLIND)
     stopped_at(system, tmp_path / "run", 70, monkeypatch)
     result = run(None, resume=tmp_path / "run")
     assert_same(whole, (result, RunFolder.open(tmp_path / "run")))
 
 
-def lists_of(folder):
-    return folder.read("epochs")["start"].tolist()
-
-
 @pytest.mark.parametrize("where", ["used up", "in use"])
 def test_a_finished_run_may_be_continued(path, whole, tmp_path, where):
-    start = next(start for start in lists_of(whole[1]) if start > 64)
+    start = next(start for start in whole[1].read("epochs")["start"].tolist() if start > 64)
     last = start - 1 if where == "used up" else start + 2
     go(tmp_path, path, last, save_every=10)
     result = run(None, resume=tmp_path / "run", steps=STEPS)
@@ -148,10 +130,6 @@ def test_a_finished_run_may_be_continued(path, whole, tmp_path, where):
     tables_equal(whole[1], folder, "flips")
     tables_equal(whole[1], folder, "epochs", but=("build_ms",))
     assert result.summary["rebuilds"] == whole[0].summary["rebuilds"]
-
-
-def at_once(step, steps, info):
-    raise Stop
 
 
 def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
@@ -170,16 +148,6 @@ def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
     assert RunFolder.open(whole[1].path).rows("series") == STEPS + 1
 
 
-def test_a_run_stopped_before_its_first_step_can_be_resumed(path, whole, tmp_path):
-    with pytest.raises(Stop):
-        run(load(path), out=tmp_path / "early", steps=STEPS, save_every=10, progress=at_once)
-    run(None, resume=tmp_path / "early")
-    folder = RunFolder.open(tmp_path / "early")
-    for table in ("series", "flips"):
-        tables_equal(whole[1], folder, table)
-    tables_equal(whole[1], folder, "epochs", but=("build_ms",))
-
-
 def test_resuming_a_finished_run_leaves_it_as_it_is(path, tmp_path):
     go(tmp_path, path, 70)
     folder = tmp_path / "run"
@@ -187,3 +155,58 @@ def test_resuming_a_finished_run_leaves_it_as_it_is(path, tmp_path):
     again = run(None, resume=folder)
     assert again.summary["steps"] == 70
     assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
+
+
+# --- a run that cannot go on says where and why, and keeps everything up to there -----------------------
+
+
+@pytest.mark.parametrize("timestep", [0.05, 3.0, 1e9])
+def test_a_step_that_is_far_too_long_blows_up_and_says_where(path, tmp_path, timestep):
+    system = load(path, {"dynamics.timestep": timestep})
+    with pytest.raises(NumericalError, match=r"step \d+") as caught:
+        run(system, out=tmp_path / "run", steps=100, save_every=1)
+    folder = RunFolder.open(tmp_path / "run")
+    assert caught.value.folder == folder.path
+    message, summary, series = str(caught.value), folder.summary, folder.read("series")
+    assert "closest pair is" in message and "timestep" in message
+    assert summary["status"] == "failed" and summary["error"] in message
+    kept, frames = summary["steps"], frames_of(folder)
+    assert kept < 100 and f"step {kept} " in message
+    assert series["step"].tolist() == list(range(kept + 1))
+    for name in ("potential", "kinetic", "total"):
+        assert np.all(np.isfinite(series[name]))
+    assert len(frames) == kept + 1
+    # what came before is a complete ledger
+    assert_ledger_is_complete(RunResult(folder.path, summary, build(system), (frames[0], frames[-1])), folder)
+    with pytest.raises(FolderError):
+        run(None, resume=folder.path)
+
+
+def test_what_is_no_run_is_refused_before_anything_is_written(path, tmp_path):
+    for bad in ({"steps": -1}, {"steps": 5, "save_every": -2}):
+        with pytest.raises(InputError, match="negative"):
+            run(load(path), out=tmp_path / "run", **bad)
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="no system"):
+        run(None)
+    with pytest.raises(InputError, match="half the smallest perpendicular"):
+        build(load(path, {"cutoff.radius": 2.4}))
+
+
+@pytest.mark.parametrize("builder", ["host", "jax-md"])
+def test_a_box_that_just_fits_is_evaluated(tmp_path, builder):
+    """r_cut of exactly half the width."""
+    atoms = Atoms("Ar2", positions=[[0.5, 1, 1], [2.0, 1, 1]], cell=[4.0] * 3, pbc=True, masses=[1, 1])
+    path = write_system(tmp_path, atoms, cutoff={"radius": 2.0}, neighbors={"skin": 0.0, "builder": builder})
+    assert build(load(path)).evaluate().energy == pytest.approx(4 * (1.5**-12 - 1.5**-6), rel=1e-13)
+
+
+def test_progress_is_told_and_may_stop_a_run(path, tmp_path):
+    told = []
+    result, _ = go(tmp_path, path, 100, progress=lambda step, steps, info: told.append((step, steps, info)))
+    assert told[0][2]["phase"] == "compile"
+    steps = [step for step, _, info in told if info["phase"] == "run"]
+    assert steps == sorted(steps) and steps[-1] == 100
+    assert {total for _, total, _ in told} == {100}
+    assert told[-1][2]["flips"] == result.summary["flips_entered"] + result.summary["flips_left"]
+    assert told[-1][2]["rebuilds"] == result.summary["rebuilds"]

@@ -153,17 +153,19 @@ def _row(
 
 
 def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: Progress):
-    from mdnum.forks.exact import program as exact_arithmetic
-    from mdnum.forks.exact.program import first_difference, with_policy
+    from mdnum.forks.exact.program import ExactProgram, with_policy
+    from mdnum.forks.tape import first_difference, taped
     from mdnum.md.cell import HostCell
     from mdnum.numerics import PrecisionPolicy
+    from mdnum.rollout.compared import ReferenceFrame
+    from mdnum.rollout.engine import FAILURES, Segment
+    from mdnum.rollout.tracks import rows_of
 
     program: Any = program_of(system)
     simulation = program.simulation
     info = {"phase": "in exact arithmetic", "unit": "steps"}
-    exact = exact_arithmetic.ExactProgram(simulation).run(
-        last, progress=lambda done, total: note(done, total, info)
-    )
+    exact = ExactProgram(simulation).run(last, progress=lambda done, total: note(done, total, info))
+    frame = ReferenceFrame.same(simulation.atoms)
     cell = HostCell(simulation.cell)
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
@@ -174,8 +176,17 @@ def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: 
     rows = []
     for done, (name, roles) in enumerate(policies.items()):
         note(done, len(policies), {"phase": name, "unit": "policies"})
-        tape, x, failed = exact_arithmetic.taped(with_policy(simulation, PrecisionPolicy(**roles)), last)
-        decision = first_difference(exact.tape, tape)
+        parts: list[np.ndarray] = []
+        failed = ""
+
+        def watch(segment: Segment, parts: list[np.ndarray] = parts) -> None:
+            nonlocal failed
+            failed = segment.closes if segment.closes in FAILURES else ""
+            parts.append(rows_of(segment, frame, failed).x)
+
+        other = replace(program, simulation=with_policy(simulation, PrecisionPolicy(**roles)))
+        decision = first_difference(exact.tape, taped(other, last, watch))
+        x = np.concatenate(parts)
         common = min(len(exact.x), len(x))
         d = cell.displacement(reduced(exact.x[:common]), np.moveaxis(x[:common], 1, 2))
         separation = np.sqrt(np.max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, axis=1))

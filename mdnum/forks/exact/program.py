@@ -20,16 +20,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
+from mdnum.forks.tape import DecisionTape
 from mdnum.md.cell import complete
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
 from mdnum.numerics import PrecisionPolicy, gamma
-from mdnum.program import Decision
-from mdnum.rollout.compared import ReferenceFrame
-from mdnum.rollout.engine import FAILURES, Engine, first_state
-from mdnum.rollout.flips import PairRecorder, decided_pairs
-from mdnum.rollout.tracks import rows_of
+from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation
 
 #: All pairs are looked at in every step.
@@ -41,97 +38,6 @@ _RESTARTS = 5
 #: Bits carried beyond those that the ball's radius leaves meaningful.
 _GUARD_BITS = 32
 _U = 2.0**-53
-
-
-# --- decisions of a run -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class DecisionTape:
-    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
-
-    Attributes:
-        atoms: number of atoms.
-        steps: the last step that was decided.
-        first: keys i * atoms + j (i < j) of the pairs inside at step 0, sorted.
-        step, key, entered: the flips, sorted by step and key.
-    """
-
-    atoms: int
-    steps: int
-    first: Int[np.ndarray, "pairs"]
-    step: Int[np.ndarray, "flips"]
-    key: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-
-    @property
-    def flips(self) -> int:
-        """Number of flips."""
-        return len(self.step)
-
-    def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
-        """Keys of the pairs inside at a step, sorted."""
-        members = set(self.first.tolist())
-        for _, key, entered in self.rows(step):
-            (members.add if entered else members.discard)(key)
-        return np.array(sorted(members), np.int64)
-
-    def rows(self, last: int) -> list[tuple[int, int, bool]]:
-        """Step, key and direction of the flips up to a step."""
-        columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
-        return list(zip(*columns, strict=True))
-
-
-def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """The first step at which any pair is decided differently; None where there is none in both tapes.
-
-    Raises:
-        ValueError: tapes of different numbers of atoms.
-    """
-    if a.atoms != b.atoms:
-        raise ValueError(f"tapes of {a.atoms} and {b.atoms} atoms")
-    step, differing = 0, np.setxor1d(a.first, b.first)
-    if not len(differing):
-        last = min(a.steps, b.steps)
-        rows = set(a.rows(last)) ^ set(b.rows(last))
-        if not rows:
-            return None
-        step = min(row[0] for row in rows)
-        differing = np.unique([key for at, key, _ in rows if at == step])
-    first, second = (int(np.isin(differing[0], tape.inside(step))) for tape in (a, b))
-    return Decision(
-        channel="pair",
-        step=step,
-        subject=divmod(int(differing[0]), a.atoms),
-        run="A" if first else "B",
-        entered=True,
-        a=first,
-        b=second,
-        margins={},
-        bounds={},
-        separation=float("nan"),
-        also=len(differing) - 1,
-    )
-
-
-def taped(simulation: Simulation, steps: int) -> tuple[DecisionTape, Float[np.ndarray, "rows 3 atoms"], str]:
-    """A real run: every decision, wrapped positions (length), and "blow-up", "runaway" or "" at its end."""
-    recorder, frame = PairRecorder(simulation), ReferenceFrame.same(simulation.atoms)
-    first, failed, last = np.empty(0, np.int64), "", 0
-    x, ledgers = [], []
-    for segment in Engine(simulation, steps).segments():
-        if not x:
-            first = decided_pairs(simulation, segment, 0)
-        ledgers.append(recorder.flips(segment))
-        failed = segment.closes if segment.closes in FAILURES else ""
-        x.append(rows_of(segment, frame, failed).x)
-        last = segment.last
-    step = np.concatenate([ledger.step for ledger in ledgers]).astype(np.int64)
-    i, j = np.concatenate([ledger.subject for ledger in ledgers]).astype(np.int64).T
-    entered, key = np.concatenate([ledger.entered for ledger in ledgers]), i * simulation.atoms + j
-    order = np.lexsort((key, step))
-    tape = DecisionTape(simulation.atoms, last, first, step[order], key[order], entered[order])
-    return tape, np.concatenate(x), failed
 
 
 # --- the exact program --------------------------------------------------------------------------------

@@ -1,0 +1,119 @@
+"""Every pair decision of a run, to be compared with another's or imposed on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from mdnum.program import Decision
+from mdnum.rollout.engine import Engine, Segment
+from mdnum.rollout.epoch import Pin, Pins
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.program import MdProgram
+
+
+@dataclass(frozen=True)
+class DecisionTape:
+    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
+
+    Attributes:
+        atoms: number of atoms.
+        steps: the last step that was decided.
+        first: keys i * atoms + j (i < j) of the pairs inside at step 0, sorted.
+        step, key, entered: the flips, sorted by step and key.
+    """
+
+    atoms: int
+    steps: int
+    first: Int[np.ndarray, "pairs"]
+    step: Int[np.ndarray, "flips"]
+    key: Int[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]
+
+    @property
+    def flips(self) -> int:
+        """Number of flips."""
+        return len(self.step)
+
+    @cached_property
+    def changes(self) -> dict[int, tuple[int, ...]]:
+        """Steps at which pairs that ever do flip, by key, ascending."""
+        order = np.argsort(self.key, kind="stable")
+        keys, begins = np.unique(self.key[order], return_index=True)
+        steps = np.split(self.step[order], begins[1:])
+        return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
+
+    def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
+        """These pairs' decisions, to be imposed over a window of steps."""
+        begins = set(self.first.tolist())
+        return Pins(
+            [
+                Pin(*divmod(key, self.atoms), first, last, self.changes.get(key, ()), key in begins)
+                for key in keys
+            ]
+        )
+
+    def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
+        """Keys of the pairs inside at a step, sorted."""
+        members = set(self.first.tolist())
+        for _, key, entered in self.rows(step):
+            (members.add if entered else members.discard)(key)
+        return np.array(sorted(members), np.int64)
+
+    def rows(self, last: int) -> list[tuple[int, int, bool]]:
+        """Step, key and direction of the flips up to a step."""
+        columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
+        return list(zip(*columns, strict=True))
+
+
+def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
+    """The first step at which any pair is decided differently; None where there is none in both tapes.
+
+    Raises:
+        ValueError: tapes of different numbers of atoms.
+    """
+    if a.atoms != b.atoms:
+        raise ValueError(f"tapes of {a.atoms} and {b.atoms} atoms")
+    step, differing = 0, np.setxor1d(a.first, b.first)
+    if not len(differing):
+        last = min(a.steps, b.steps)
+        rows = set(a.rows(last)) ^ set(b.rows(last))
+        if not rows:
+            return None
+        step = min(row[0] for row in rows)
+        differing = np.unique([key for at, key, _ in rows if at == step])
+    first, second = (int(np.isin(differing[0], tape.inside(step))) for tape in (a, b))
+    return Decision(
+        channel="pair",
+        step=step,
+        subject=divmod(int(differing[0]), a.atoms),
+        run="A" if first else "B",
+        entered=True,
+        a=first,
+        b=second,
+        margins={},
+        bounds={},
+        separation=float("nan"),
+        also=len(differing) - 1,
+    )
+
+
+def taped(program: MdProgram, last: int, watch: Callable[[Segment], None]) -> DecisionTape:
+    """Every decision of a run to a last step; `watch` is called with each of its segments."""
+    simulation = program.simulation
+    recorder, first, ledgers, end = PairRecorder(simulation), np.empty(0, np.int64), [], 0
+    for segment in Engine(simulation, last, start=program.begin).segments():
+        if not ledgers:
+            first = decided_pairs(simulation, segment, 0)
+        ledgers.append(recorder.flips(segment))
+        end = segment.last
+        watch(segment)
+    step = np.concatenate([ledger.step for ledger in ledgers]).astype(np.int64)
+    i, j = np.concatenate([ledger.subject for ledger in ledgers]).astype(np.int64).T
+    entered, key = np.concatenate([ledger.entered for ledger in ledgers]), i * simulation.atoms + j
+    order = np.lexsort((key, step))
+    return DecisionTape(simulation.atoms, end, first, step[order], key[order], entered[order])
