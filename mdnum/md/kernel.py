@@ -365,8 +365,8 @@ def _nearer(margin, nearest):
 
 
 # A call is a job: 64-bit words that outlive it, since a thread may look for work when none is left. How many
-# use it, the next block, blocks done and blocks; addresses of the frame, the loop over a slot and the padded
-# columns; threads that there are, and arguments to XLA; then the nearest margin of each block, and the columns.
+# use it, the next block, blocks done and blocks; addresses of frame, loop over a slot, and padded columns;
+# threads that there are, and arguments to XLA; then the nearest margin of each block, and the columns.
 _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _ROWS, _PADDED, _THREADS, _ASKED, _NEAREST = (*range(9), 16)
 
 
