@@ -55,19 +55,18 @@ def over_pairs(
     columns: Float[Array, "columns atoms"],
     tables: Tables,
     *,
-    told: UInt8[Array, "words atoms"] | None = None,
-    pinned: UInt8[Array, "words atoms"] | None = None,
+    flags: Sequence[UInt8[Array, "words atoms"]] = (),
     margins: str | None = None,
 ) -> PairSums | None:
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
     Args:
-        pair: of scalars: the atom's columns, its neighbor's, and for each of `told` and `pinned` that is
-            given whether its bit is set. Returns the terms to add and, with `margins`, the margin. May close
-            over arrays of one number. In a slot of padding the neighbor's columns are NaN.
+        pair: of scalars: the atom's columns, its neighbor's, and the bit of each of the flags. Returns the
+            terms to add and, with `margins`, the margin. May close over arrays of one number. In a slot of
+            padding the neighbor's columns are NaN.
         columns: float64 numbers of each atom, in the order of the tables.
         tables: the list, of one pair type.
-        told, pinned: bits of every slot.
+        flags: bits of every slot, packed as decisions.
         margins: ">" or ">=": how the margin of a pair that is decided to be inside compares with 0.
 
     Returns:
@@ -76,7 +75,6 @@ def over_pairs(
     Error: a rounding error for each operation; sums one after the other.
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
-    flags = [bits for bits in (told, pinned) if bits is not None]
     try:
         written = _written(pair, columns.shape[0], len(flags), margins is not None)
     except _NotKnown:
@@ -88,7 +86,7 @@ def over_pairs(
     ]
     call = jax.ffi.ffi_call(_registered(written.loop), shapes, vmap_method="sequential")
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
-    bits = jnp.stack(flags) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
+    bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
     equal = np.full(1, margins == ">=")
     sums, decided, nearest = call(index, columns, bits, written.constants, equal)
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
@@ -190,6 +188,14 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
         if not any(isinstance(value, _Value) for value in inputs):
             # the same for all pairs: made once, outside
             return bound(equation, inputs)
+        if name == "integer_pow":
+            power = abs(equation.params["y"])
+            line = text(inputs[0])
+            for _ in range(power - 1):
+                line = put(f"fmul double {line}, {text(inputs[0])}").name
+            return [
+                put(f"fdiv double 0x3FF0000000000000, {line}") if equation.params["y"] < 0 else _Value(line)
+            ]
         same = name == "convert_element_type" and made.dtype == equation.invars[0].aval.dtype
         if same or name in _SHAPES:
             return [inputs[0]]
@@ -223,6 +229,7 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
     return _Written(loop, jnp.stack(known) if known else jnp.zeros(0), terms)
 
 
+_ONE = "0x3FF0000000000000"
 _ACCESS = ", !llvm.access.group !0"
 # what is read and written in one turn has nothing to do with another: the loop may be one of vectors
 _LOOP = """

@@ -131,14 +131,14 @@ class PairForce(eqx.Module):
                 are its own all the same, so that the two can be compared.
             where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
-        if self._double(tables):
+        if self.in_one_loop(tables):
             made = _in_one_loop(self, positions, tables, given, where, decisions=decisions)
             if made is not None:
                 return made
         return self.in_blocks(positions, tables, given, where, decisions=decisions)
 
-    def _double(self, tables: Tables) -> bool:
-        """Whether it is what `kernel.over_pairs` sums: plain double precision on a CPU, one type of pairs."""
+    def in_one_loop(self, tables: Tables) -> bool:
+        """Whether `kernel.over_pairs` may sum over the list: double precision, one type of pairs, a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         plain = wide and self.reduction == Sequential() and tables.types is None
@@ -155,7 +155,7 @@ class PairForce(eqx.Module):
             energy, slope = law.evaluate(r2, types, at)
             energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
             pull = slope + slope
-            return *(pull * exactly(c) for c in d), energy, pull * r2
+            return tuple(map(exactly, (*(pull * exactly(c) for c in d), energy, pull * r2)))
 
         return terms
 
@@ -252,8 +252,9 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
         return *terms_of(d, r2, inside, None), threshold - quantity if decisions else None
 
     margins = (">=" if decider.compare.endswith("<=") else ">") if decisions else None
+    flags = [one for one in (given, where) if one is not None]
     columns = positions.astype(np.float64)
-    made = kernel.over_pairs(pair, columns, tables, told=given, pinned=where, margins=margins)
+    made = kernel.over_pairs(pair, columns, tables, flags=flags, margins=margins)
     return None if made is None else _forces(tuple(made.sums), made.decisions)
 
 
