@@ -146,10 +146,10 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
         d = [b - a for a, b in zip(own, other, strict=True)]
         return *cell.minimum_image(*d[:3]), *d[3:]
 
-    def pair(own, other, inside):
+    def pair(own, other, types, inside):
         # padding is nowhere
         d = [jnp.where(inside, c, 0) for c in differences(own, other)]
-        return terms(d[:3], d[3:], inside, None)
+        return terms(d[:3], d[3:], inside, types)
 
     made = kernel.over_pairs(pair, columns, tables, flags=(bits,)) if in_one_loop else None
     if made is not None:

@@ -61,11 +61,12 @@ def over_pairs(
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
     Args:
-        pair: of scalars: the atom's columns, its neighbor's, and the bit of each of the flags. Returns the
-            terms to add and, with `margins`, the margin. May close over arrays of one number. In a slot of
-            padding the neighbor's columns are NaN.
+        pair: of scalars: the atom's columns, its neighbor's, the pair's type (None where there is only one),
+            and the bit of each of the flags. Returns the terms to add and, with `margins`, the margin. May
+            close over numbers, and arrays with one for each type. In a slot of padding the neighbor's
+            columns are NaN.
         columns: float64 numbers of each atom, in the order of the tables.
-        tables: the list, of one pair type.
+        tables: the list.
         flags: bits of every slot, packed as decisions.
         margins: ">" or ">=": how the margin of a pair that is decided to be inside compares with 0.
 
@@ -76,7 +77,7 @@ def over_pairs(
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
     try:
-        written = _written(pair, columns.shape[0], len(flags), margins is not None)
+        written = _written(pair, columns.shape[0], len(flags), margins is not None, tables.types is not None)
     except _NotKnown:
         return None
     shapes = [
@@ -88,7 +89,8 @@ def over_pairs(
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
     bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
     equal = np.full(1, margins == ">=")
-    sums, decided, nearest = call(index, columns, bits, written.constants, equal)
+    kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)
+    sums, decided, nearest = call(index, columns, bits, written.constants, equal, kinds)
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
 
 
@@ -136,6 +138,7 @@ _OPERATIONS = {
     "sqrt": "call double @llvm.sqrt.f64(double {})",
     "round": "call double @llvm.rint.f64(double {})",
     "select_n": "select i1 {0}, {kind} {2}, {kind} {1}",
+    "eq": "fcmp oeq double {}, {}",
     "gt": "fcmp ogt double {}, {}",
     "ge": "fcmp oge double {}, {}",
     "lt": "fcmp olt double {}, {}",
@@ -149,16 +152,25 @@ _OPERATIONS = {
 _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
-def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margins: bool) -> _Written:
+def _number(value: Any) -> str:
+    """A constant in LLVM's language."""
+    return f"0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}"
+
+
+def _written(
+    pair: Callable[..., Sequence[Any]], columns: int, flags: int, margins: bool, types: bool
+) -> _Written:
     """The loop over a slot of the atoms of a block, as a function `rows`.
 
     It is given how many atoms there are, the constants, and where rows of numbers of the atoms begin: their
-    own columns, the neighbor's columns and flags, room for the margin, and the sums.
+    own columns, the neighbor's columns, types, flags, room for the margin, and the sums.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
-    program = jax.make_jaxpr(pair)([number] * columns, [number] * columns, *[truth] * flags)
+    kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
+    program = jax.make_jaxpr(pair)([number] * columns, [number] * columns, kind, *[truth] * flags)
     terms = len(program.out_avals) - margins
-    rows = columns + columns + flags + margins + terms
+    numbers = columns + columns + types
+    rows = numbers + flags + margins + terms
     constants: dict[int, Any] = {}
     lines: list[str] = []
 
@@ -168,7 +180,7 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
         if np.size(value) != 1:
             raise _NotKnown("an array")
         if not isinstance(value, jax.core.Tracer | jax.Array):
-            return f"0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}"
+            return _number(value)
         constants.setdefault(id(value), value)
         return f"%c{list(constants).index(id(value))}"
 
@@ -188,14 +200,20 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
         if not any(isinstance(value, _Value) for value in inputs):
             # the same for all pairs: made once, outside
             return bound(equation, inputs)
+        if name == "dynamic_slice" and np.ndim(inputs[0]) == 1 and equation.params["slice_sizes"] == (1,):
+            # the constant of the pair's type
+            of, which = inputs[0], text(inputs[1])
+            chosen = text(of[0])
+            for k in range(1, len(of)):
+                other = put(f"fcmp oeq double {which}, {_number(k)}", "i1").name
+                chosen = put(f"select i1 {other}, double {text(of[k])}, double {chosen}").name
+            return [_Value(chosen)]
         if name == "integer_pow":
-            power = abs(equation.params["y"])
-            line = text(inputs[0])
-            for _ in range(power - 1):
-                line = put(f"fmul double {line}, {text(inputs[0])}").name
-            return [
-                put(f"fdiv double 0x3FF0000000000000, {line}") if equation.params["y"] < 0 else _Value(line)
-            ]
+            power, base = equation.params["y"], text(inputs[0])
+            product = base
+            for _ in range(abs(power) - 1):
+                product = put(f"fmul double {product}, {base}").name
+            return [put(f"fdiv double {_number(1)}, {product}") if power < 0 else _Value(product)]
         same = name == "convert_element_type" and made.dtype == equation.invars[0].aval.dtype
         if same or name in _SHAPES:
             return [inputs[0]]
@@ -205,11 +223,9 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
         kind = "i1" if made.dtype == np.bool_ else "double"
         return [put(_OPERATIONS[name].format(*map(text, inputs), kind=kind), kind)]
 
-    numbers = [load(row) for row in range(2 * columns)]
-    bits = [
-        put(f"fcmp une double {load(2 * columns + k).name}, 0x0000000000000000", "i1") for k in range(flags)
-    ]
-    results = list(map(text, interpreted(program, [*numbers, *bits], rule)))
+    given = [load(row) for row in range(numbers)]
+    given += [put(f"fcmp une double {load(numbers + k).name}, {_number(0)}", "i1") for k in range(flags)]
+    results = list(map(text, interpreted(program, given, rule)))
     if margins:
         store(results.pop(), rows - terms - 1)
     for row, term in enumerate(results, rows - terms):
@@ -229,7 +245,6 @@ def _written(pair: Callable[..., Sequence[Any]], columns: int, flags: int, margi
     return _Written(loop, jnp.stack(known) if known else jnp.zeros(0), terms)
 
 
-_ONE = "0x3FF0000000000000"
 _ACCESS = ", !llvm.access.group !0"
 # what is read and written in one turn has nothing to do with another: the loop may be one of vectors
 _LOOP = """
@@ -349,6 +364,12 @@ def _gathered(index, column, out):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
+def _widened(values, out):
+    for k in range(values.shape[0]):
+        out[k] = values[k]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _unpacked(bits, shift, out):
     for k in range(bits.shape[0]):
         out[k] = (bits[k] >> shift) & 1
@@ -398,6 +419,9 @@ def _work(job):
     constants, _ = _buffer(operands, 3)
     at, _ = _buffer(operands, 4)
     equal = numba.carray(_pointer(at), (1,), np.bool_)[0]
+    at, size = _buffer(operands, 5)
+    types_of = numba.carray(_pointer(at), (size[0], atoms), np.uint8)
+    typed = int(size[0] > 0)
     at, size = _buffer(results, 0)
     terms = size[0]
     sums = numba.carray(_pointer(at), (terms, atoms), np.float64)
@@ -406,7 +430,7 @@ def _work(job):
     bits = numba.carray(_pointer(at), (size[0], atoms), np.uint8)
     nearest = numba.carray(_pointer(job + 8 * _NEAREST), (blocks,), np.float64)
 
-    near, closest = np.empty((columns + flags + int(margins), _BLOCK)), np.empty(_BLOCK)
+    near, closest = np.empty((columns + typed + flags + int(margins), _BLOCK)), np.empty(_BLOCK)
     pointers = np.empty(columns + len(near) + terms, np.intp)
     for row in range(len(near)):
         pointers[columns + row] = near[row].ctypes.data
@@ -422,8 +446,10 @@ def _work(job):
             word, shift = slot // 8, np.uint8(slot % 8)
             for row in range(columns):
                 _gathered(index[slot, start:end], padded[row], near[row])
+            if typed:
+                _widened(types_of[slot, start:end], near[columns])
             for row in range(flags):
-                _unpacked(told[row, word, start:end], shift, near[columns + row])
+                _unpacked(told[row, word, start:end], shift, near[columns + typed + row])
             _call(words[_ROWS], (end - start, constants, pointers.ctypes.data))
             if margins:
                 margin = near[-1, : end - start]

@@ -33,10 +33,13 @@ from mdnum.md.decide import (
     unpacked,
 )
 from mdnum.md.integrators import Integrator
-from mdnum.md.potentials import CutPotential
+from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import fence, rounded, zero_bits
 from mdnum.numerics.reductions import Reduction, Sequential
+
+# beyond, choosing each constant of a pair by its type takes longer than gathering it
+_FEW_TYPES = 6
 
 
 class Forces(NamedTuple):
@@ -138,11 +141,11 @@ class PairForce(eqx.Module):
         return self.in_blocks(positions, tables, given, where, decisions=decisions)
 
     def in_one_loop(self, tables: Tables) -> bool:
-        """Whether `kernel.over_pairs` may sum over the list: double precision, one type of pairs, a CPU."""
+        """Whether `kernel.over_pairs` may sum over the list: double precision, few types of pairs, a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
-        plain = wide and self.reduction == Sequential() and tables.types is None
-        return plain and kernel.known()
+        few = tables.types is None or self.model.pair_types <= _FEW_TYPES
+        return wide and few and self.reduction == Sequential() and kernel.known()
 
     def _terms(self) -> Callable[..., tuple[Float[Array, "..."], ...]]:
         """What a pair adds to force, energy and virial, from its displacement, square and decision."""
@@ -237,10 +240,11 @@ def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool):
     """As `PairForce.in_blocks` in one compiled loop; None where that is not known."""
-    cell, decider, threshold = force.cell, force.decider, force.thresholds[0]
+    cell, decider = force.cell, force.decider
     terms_of = force._terms()
 
-    def pair(own, other, *bits):
+    def pair(own, other, types, *bits):
+        threshold = of_type(force.thresholds, types)
         d = cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
         r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         quantity = jnp.sqrt(r2) if decider.space == "r" else r2
@@ -249,7 +253,7 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
         # a slot of padding is nowhere
         d = [jnp.where(inside, c, 0) for c in d]
-        return *terms_of(d, r2, inside, None), threshold - quantity if decisions else None
+        return *terms_of(d, r2, inside, types), threshold - quantity if decisions else None
 
     margins = (">=" if decider.compare.endswith("<=") else ">") if decisions else None
     flags = [one for one in (given, where) if one is not None]
