@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import llvmlite.binding as llvm
 import numba
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, UInt8
 from llvmlite import ir
 from numba import types
@@ -179,7 +180,7 @@ def _written(
             return value.name
         if np.size(value) != 1:
             raise _NotKnown("an array")
-        if not isinstance(value, jax.core.Tracer | jax.Array):
+        if not isinstance(value, Tracer | jax.Array):
             return _number(value)
         constants.setdefault(id(value), value)
         return f"%c{list(constants).index(id(value))}"
@@ -347,7 +348,7 @@ _free = types.ExternalFunction("free", types.void(types.intp))
 @numba.njit(cache=True, nogil=True)
 def _words(address):
     """Memory as 64-bit words, as many as a frame has or fewer."""
-    return numba.carray(_pointer(address), (32,), np.int64)
+    return numba.carray(_pointer(address), (32,), np.int64)  # pyright: ignore
 
 
 @numba.njit(cache=True, nogil=True)
@@ -463,7 +464,7 @@ def _work(job):
 @numba.njit(cache=True, nogil=True)
 def _leave(job):
     """The last one to use a job clears it away."""
-    if _added(job + 8 * _USERS, -1) == 1:
+    if _added(job + 8 * _USERS, -1) == 1:  # pyright: ignore
         _free(job)
 
 

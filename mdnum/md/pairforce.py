@@ -420,7 +420,7 @@ class PairDynamics(eqx.Module):
 
         def margin(j, kinds):
             _, quantity, _, threshold = judge.group(j, kinds)
-            return jnp.where(j < judge.atoms, threshold - quantity, -jnp.inf)
+            return threshold - quantity
 
         groups = [margin(index[g], None if types is None else types[g]) for g in range(index.shape[0])]
         return jnp.stack(groups)
