@@ -81,3 +81,5 @@ def keep_numba_whole() -> None:
         return lambda function: compiler(inspect.unwrap(function))
 
     numba.njit = unwrapping
+    cfunc = numba.cfunc
+    numba.cfunc = lambda *kind, **options: lambda function: cfunc(*kind, **options)(inspect.unwrap(function))

@@ -27,7 +27,8 @@ from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
 from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
-from mdnum.md.decide import Tables, displacements, halves_of, unpacked
+from mdnum.md import kernel
+from mdnum.md.decide import Tables, halves_of, unpacked
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
@@ -80,20 +81,15 @@ def pull_back(
 def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted) -> ForceCotangents:
     dtype = force.policy.dtype("force")
     cell = force.cell.astype(dtype)
-    components = tuple(x.astype(dtype))
-    w = tuple(onto_force.astype(dtype))
+    columns = jnp.concatenate([x.astype(dtype), onto_force.astype(dtype)])
     energy, virial = onto_energy.astype(dtype), onto_virial.astype(dtype)
     model, cut = force.model, force.model.cutoff
     at, back_to_model = jax.vjp(lambda model: model.at_cutoff(), model)
     types_of = model.pair_types
     by_parameter = (model.potential, at) if MODEL in wanted else ()
-    nothing = jnp.zeros(x.shape[1], dtype)
 
-    def block(carry, listed):
-        (j, types), told = listed
-        inside = unpacked(told)
-        d = displacements(components, cell, j)
-        dw = tuple(c.at[j].get(mode="promise_in_bounds") - c for c in w)
+    def terms(d, dw, inside, types) -> list[Array]:
+        """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted."""
         # the argument is masked, not only the result: a padded slot may be at distance zero
         r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
         along = jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
@@ -102,18 +98,18 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         # derivative by r² of what this slot adds to energy and virial
         shared = energy * (0.5 * slope) - virial * (bend * r2 + slope)
         pull, twist = slope + slope, 4 * (bend * along - shared)
-        terms = {"x": [pull * dw[c] + twist * d[c] for c in range(3)]}
+        made = [pull * dw[c] + twist * d[c] for c in range(3)]
         if FORCE in wanted:
-            terms["force"] = [pull * d[c] for c in range(3)]
+            made += [pull * d[c] for c in range(3)]
         if SCALE in wanted:
-            terms["scale"] = [2 * r2 * (shared - bend * along)]
+            made += [2 * r2 * (shared - bend * along)]
         if MODEL in wanted:
             # each slot has parameters of its own, so that no sum over slots stands inside the loop
             own = jax.tree.map(
                 lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (model.potential, at)
             )
 
-            def ended(own, r2=r2):
+            def ended(own):
                 potential, end = own
                 u, s = potential.evaluate(r2)
                 return cut.cut(r2, u, s, end)
@@ -121,35 +117,56 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
             _, back = jax.vjp(ended, own)
             onto_u = jnp.where(inside, 0.5 * energy, 0)
             leaves = jax.tree.leaves(back((onto_u, -jnp.where(inside, along + virial * r2, 0)))[0])
-            terms["model"] = [
+            made += [
                 leaf if types is None else jnp.where(types == kind, leaf, 0)
                 for leaf in leaves
                 for kind in range(types_of)
             ]
-        return {name: _added(carry[name], terms[name]) for name in carry}, None
+        return made
 
-    start = {"x": (nothing,) * 3}
-    if FORCE in wanted:
-        start["force"] = (nothing,) * 3
-    if SCALE in wanted:
-        start["scale"] = (nothing,)
-    if MODEL in wanted:
-        start["model"] = (nothing,) * (types_of * len(jax.tree.leaves(by_parameter)))
-    sums, _ = lax.scan(block, start, (tables.groups(), halves_of(bits)))
-    zero = jnp.zeros((), dtype)
+    sums = list(_summed(terms, columns, cell, tables, bits, force.in_one_loop(tables)))
+    on_x = jnp.stack(sums[:3]).astype(x.dtype)
+    made = jnp.stack(sums[3:6]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x)
+    del sums[: 6 if FORCE in wanted else 3]
+    scale = jnp.sum(sums.pop(0)) if SCALE in wanted else jnp.zeros((), dtype)
     onto_model = jax.tree.map(jnp.zeros_like, model)
     if MODEL in wanted:
-        flat = jnp.stack([jnp.sum(total) for total in sums["model"]]).reshape(-1, types_of)
+        flat = jnp.stack([jnp.sum(total) for total in sums]).reshape(-1, types_of)
         onto_potential, onto_at = jax.tree.unflatten(jax.tree.structure(by_parameter), list(flat))
         (onto_model,) = back_to_model(onto_at)
         direct = jax.tree.map(jnp.add, onto_model.potential, onto_potential)
         onto_model = CutPotential(direct, cut, onto_model.r_cut, onto_model.r_onset)
-    return ForceCotangents(
-        jnp.stack(sums["x"]).astype(x.dtype),
-        onto_model,
-        jnp.sum(sums["scale"][0]) if SCALE in wanted else zero,
-        jnp.stack(sums["force"]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x),
-    )
+    return ForceCotangents(on_x, onto_model, scale, made)
+
+
+def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
+    """Sums over the slots of each atom of what they add, from the differences of two vectors."""
+
+    def differences(own, other):
+        d = [b - a for a, b in zip(own, other, strict=True)]
+        return *cell.minimum_image(*d[:3]), *d[3:]
+
+    def pair(own, other, types, inside):
+        # padding is nowhere
+        d = [jnp.where(inside, c, 0) for c in differences(own, other)]
+        return terms(d[:3], d[3:], inside, types)
+
+    made = kernel.over_pairs(pair, columns, tables, flags=(bits,)) if in_one_loop else None
+    if made is not None:
+        return made.sums
+    own = tuple(columns)
+
+    def block(totals, listed):
+        (j, types), told = listed
+        d = differences(own, [c.at[j].get(mode="promise_in_bounds") for c in own])
+        added = terms(d[:3], d[3:], unpacked(told), types)
+        totals = totals or (jnp.zeros_like(own[0]),) * len(added)
+        return _added(totals, added), None
+
+    index, types = tables.groups()
+    first = jax.eval_shape(lambda: block((), ((index[0], None if types is None else types[0]), bits[0]))[0])
+    start = tuple(jnp.zeros(one.shape, one.dtype) for one in first)
+    return lax.scan(block, start, ((index, types), halves_of(bits)))[0]
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:

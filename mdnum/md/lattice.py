@@ -438,9 +438,10 @@ class LatticeJudge(SlotJudge):
             # the low half is the integer: a product of two halves is one that every processor has
             whole = whole.astype(jnp.int32).astype(jnp.int64)
             squares.append(whole * whole)
-        r2 = squares[0] + squares[1] + squares[2]
+        # padding is as far away as numbers go
+        r2 = jnp.where(j < self.atoms, squares[0] + squares[1] + squares[2], jnp.iinfo(jnp.int64).max)
         limit = of_type(self.value, types)
-        return d, r2, (r2 < limit) & (j < self.atoms), limit
+        return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
         """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
@@ -456,7 +457,9 @@ class LatticeJudge(SlotJudge):
         """The pass's decisions, two groups to a byte."""
         unit = self.lattice.spacing * self.lattice.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
-        return Decisions(packed(halves), (closest.astype(jnp.float64) - 0.5) * unit)
+        # no margin of a listed pair reaches 2^62
+        nearest = jnp.where(closest < 2 ** (2 * REACH_BITS + 2), closest.astype(jnp.float64) - 0.5, jnp.inf)
+        return Decisions(packed(halves), nearest * unit)
 
 
 class LatticeForce(PairForce):

@@ -8,7 +8,8 @@ over the whole (slots, atoms) array takes twice the time at 4,000 atoms and ten 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real, UInt8
 
+from mdnum.md import kernel
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import (
@@ -31,10 +33,13 @@ from mdnum.md.decide import (
     unpacked,
 )
 from mdnum.md.integrators import Integrator
-from mdnum.md.potentials import CutPotential
+from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import fence, rounded, zero_bits
 from mdnum.numerics.reductions import Reduction, Sequential
+
+# beyond, choosing each constant of a pair by its type takes longer than gathering it
+_FEW_TYPES = 6
 
 
 class Forces(NamedTuple):
@@ -129,13 +134,49 @@ class PairForce(eqx.Module):
                 are its own all the same, so that the two can be compared.
             where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
-        judge = self.judge(positions)
+        if self.in_one_loop(tables):
+            made = _in_one_loop(self, positions, tables, given, where, decisions=decisions)
+            if made is not None:
+                return made
+        return self.in_blocks(positions, tables, given, where, decisions=decisions)
+
+    def in_one_loop(self, tables: Tables) -> bool:
+        """Whether `kernel.over_pairs` may sum over the list: double precision, few types of pairs, a CPU."""
+        roles = ("force", "decision", "accumulate")
+        wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
+        few = tables.types is None or self.model.pair_types <= _FEW_TYPES
+        return wide and few and self.reduction == Sequential() and kernel.known()
+
+    def _terms(self) -> Callable[..., tuple[Float[Array, "..."], ...]]:
+        """What a pair adds to force, energy and virial, from its displacement, square and decision."""
+        law, exactly = self.law, self._in_force_dtype
+        at = law.at_cutoff()
+
+        def terms(d, r2, inside, types):
+            # the argument is masked, not only the result: a padded slot may be at distance zero
+            r2 = exactly(jnp.where(inside, r2, jnp.ones((), r2.dtype)))
+            energy, slope = law.evaluate(r2, types, at)
+            energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
+            pull = slope + slope
+            return tuple(map(exactly, (*(pull * exactly(c) for c in d), energy, pull * r2)))
+
+        return terms
+
+    def in_blocks(
+        self,
+        positions: Float[Array, "3 atoms"],
+        tables: Tables,
+        given: UInt8[Array, "words atoms"] | None = None,
+        where: UInt8[Array, "words atoms"] | None = None,
+        *,
+        decisions: bool,
+    ) -> Forces:
+        """As a call, in any precision, order and on any device."""
+        judge, terms_of = self.judge(positions), self._terms()
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
         cell = self.cell.astype(geometry)
         components = tuple(positions.astype(geometry))
-        law, exactly = self.law, self._in_force_dtype
-        at = law.at_cutoff()
 
         def block(carry, listed):
             totals, nearest = carry
@@ -152,13 +193,7 @@ class PairForce(eqx.Module):
                 r2 = quantity
             else:
                 r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-            # the argument is masked, not only the result: a padded slot may be at distance zero
-            r2 = exactly(jnp.where(inside, r2, jnp.ones((), geometry)))
-            energy, slope = law.evaluate(r2, types, at)
-            energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
-            pull = slope + slope
-            products = (*(pull * exactly(c) for c in d), energy, pull * r2)
-            terms = [exactly(q).astype(accumulate) for q in products]
+            terms = [term.astype(accumulate) for term in terms_of(d, r2, inside, types)]
             summed = [
                 self.reduction.within(total, list(term)) for total, term in zip(totals, terms, strict=True)
             ]
@@ -168,16 +203,8 @@ class PairForce(eqx.Module):
         start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
         told, pinned = (None if bits is None else halves_of(bits) for bits in (given, where))
         (totals, nearest), (halves, later) = lax.scan(block, start, (tables.groups(), told, pinned))
-        fx, fy, fz, energy, virial = (
-            self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)
-        )
-        half = jnp.asarray(0.5, accumulate)
-        return Forces(
-            jnp.stack([fx, fy, fz]),
-            half * energy,
-            -jnp.sum(half * virial, dtype=jnp.float64),
-            judge.finish(nearest, halves) if decisions else None,
-        )
+        sums = [self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)]
+        return _forces(sums, judge.finish(nearest, halves) if decisions else None)
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
         """Sum over pairs of r_ij ⊗ F_ij, energy; minus the derivative of the energy by strain."""
@@ -199,6 +226,50 @@ class PairForce(eqx.Module):
 
         totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
         return symmetric(-jnp.sum(total, dtype=jnp.float64) for total in totals)
+
+
+def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
+    """Forces from the sums of `PairForce._terms`, which count every pair at both its ends."""
+    fx, fy, fz, energy, virial = sums
+    half = jnp.asarray(0.5, energy.dtype)
+    return Forces(
+        jnp.stack([fx, fy, fz]), half * energy, -jnp.sum(half * virial, dtype=jnp.float64), decisions
+    )
+
+
+@eqx.filter_custom_jvp
+def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool):
+    """As `PairForce.in_blocks` in one compiled loop; None where that is not known."""
+    cell, decider = force.cell, force.decider
+    terms_of = force._terms()
+
+    def pair(own, other, types, *bits):
+        threshold = of_type(force.thresholds, types)
+        d = cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
+        r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        quantity = jnp.sqrt(r2) if decider.space == "r" else r2
+        inside = decider.inside(quantity, threshold)
+        if bits:
+            inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
+        # a slot of padding is nowhere
+        d = [jnp.where(inside, c, 0) for c in d]
+        return *terms_of(d, r2, inside, types), threshold - quantity if decisions else None
+
+    margins = (">=" if decider.compare.endswith("<=") else ">") if decisions else None
+    flags = [one for one in (given, where) if one is not None]
+    columns = positions.astype(np.float64)
+    made = kernel.over_pairs(pair, columns, tables, flags=flags, margins=margins)
+    return None if made is None else _forces(tuple(made.sums), made.decisions)
+
+
+@_in_one_loop.def_jvp
+def _in_one_loop_jvp(primals, tangents, *, decisions: bool):
+    # values as everywhere; their derivative by the loop that jax can differentiate
+    made = _in_one_loop(*primals, decisions=decisions)
+    if made is None:
+        return None, None
+    _, moved = eqx.filter_jvp(partial(PairForce.in_blocks, decisions=decisions), primals, tangents)
+    return made, moved
 
 
 def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
@@ -349,7 +420,7 @@ class PairDynamics(eqx.Module):
 
         def margin(j, kinds):
             _, quantity, _, threshold = judge.group(j, kinds)
-            return jnp.where(j < judge.atoms, threshold - quantity, -jnp.inf)
+            return threshold - quantity
 
         groups = [margin(index[g], None if types is None else types[g]) for g in range(index.shape[0])]
         return jnp.stack(groups)

@@ -1,0 +1,156 @@
+"""The compiled loop over pairs against sums over all pairs in numpy, and against XLA's own loop."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import all_pairs, cut_energy, margins
+from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
+
+from mdnum.md import kernel
+from mdnum.md.cell import wrap_positions
+from mdnum.systems import build
+
+CUTOFFS = ("hard", "force-shifted", "switched", "quintic")
+
+
+def evaluated(system, **options):
+    """Positions and box, what the loop gives, and what XLA's loop gives, in the user's order."""
+    simulation = build(system)
+    wrapped, _ = wrap_positions(simulation.cell, system.atoms.positions)
+    table = simulation.verlet_list().build(wrapped, simulation.cell)
+    tables, x = simulation.tables(table), jnp.asarray(wrapped[table.order].T)
+    assert simulation.force.in_one_loop(tables)
+    given = [None if bits is None else jnp.asarray(bits(table)) for bits in options.pop("bits", (None, None))]
+    loop = jax.jit(partial(simulation.force, decisions=True))
+    blocks = jax.jit(partial(simulation.force.in_blocks, decisions=True))
+    return (
+        simulation,
+        table,
+        wrapped,
+        loop(x, tables, given=given[0], where=given[1]),
+        blocks(x, tables, *given),
+    )
+
+
+def tilted():
+    atoms = crystal()
+    atoms.set_cell(np.add(atoms.cell[:], [[0, 0, 0], [0.7, 0, 0], [0.3, -0.4, 0]]), scale_atoms=True)
+    atoms.pbc = (True, True, False)
+    return atoms
+
+
+@pytest.mark.parametrize("kind", CUTOFFS)
+@pytest.mark.parametrize("compare, shape", [("r2 <", crystal), ("r <=", tilted)])
+def test_forces_are_those_of_all_pairs(kind, compare, shape):
+    r_cut, r_onset, atoms = 2.3, 2.0, shape()
+    switch = {"onset": r_onset} if kind in ("switched", "quintic") else {}
+    cutoff = {"kind": kind, "radius": r_cut, "compare": compare, **switch}
+    simulation, table, x, made, blocks = evaluated(make(atoms, LENNARD_JONES, cutoff))
+    i, j, d = all_pairs(x, atoms.cell[:], atoms.pbc)
+    inside, margin = margins(d, r_cut, compare)
+    i, j, d = i[inside], j[inside], d[inside]
+    r = np.linalg.norm(d, axis=1)
+
+    def u(r):
+        return 4 * (r**-12 - r**-6)
+
+    def slope(r):
+        return 24 * (r**-7 - 2 * r**-13)
+
+    def energy(r):
+        beyond = np.real(r) > (r_onset if switch else 0)
+        return np.where(beyond, cut_energy(kind, r, r_cut, r_onset, u, slope), u(r))
+
+    pull = (np.imag(energy(r + 1e-30j)) / 1e-30 / r)[:, None] * d
+    force = np.zeros_like(x)
+    np.add.at(force, i, pull)
+    np.add.at(force, j, -pull)
+    np.testing.assert_allclose(made.force.T, force[table.order], atol=1e-12 * np.abs(force).max())
+    assert float(made.energy.sum()) == pytest.approx(float(energy(r).sum()), rel=1e-13)
+    assert float(made.virial) == pytest.approx(-float((pull * d).sum()), rel=1e-12)
+    assert simulation.decider.compare == compare
+    assert {
+        tuple(sorted(pair)) for pair in zip(*table.decided(np.asarray(made.decisions.bits)), strict=True)
+    } == {(int(a), int(b)) for a, b in zip(i, j, strict=True)}
+    assert float(made.decisions.nearest) == np.abs(margin).min()
+    assert np.array_equal(made.decisions.bits, blocks.decisions.bits)
+
+
+@given(seed=st.integers(0, 2**32 - 1), everywhere=st.booleans())
+@settings(max_examples=8)
+def test_it_acts_on_what_it_is_told(seed, everywhere):
+    def told(table):
+        return np.random.default_rng(seed).integers(0, 256, (table.slots // 8, len(table.order)), np.uint8)
+
+    def listed(table):
+        there = (table.index < len(table.order)).reshape(-1, 8, len(table.order))
+        return np.packbits(there, axis=1, bitorder="little")[:, 0]
+
+    bits = (lambda table: told(table) & listed(table), None if everywhere else lambda table: ~told(table))
+    cutoff = {"kind": "hard", "radius": 2.3}
+    _, _, _, made, blocks = evaluated(make(mixture(), KOB_ANDERSEN, cutoff), bits=bits)
+    scale = float(np.abs(blocks.force).max())
+    np.testing.assert_allclose(made.force, blocks.force, atol=1e-13 * scale)
+    np.testing.assert_allclose(made.energy, blocks.energy, atol=1e-13 * float(np.abs(blocks.energy).max()))
+    assert np.array_equal(made.decisions.bits, blocks.decisions.bits)
+
+
+def test_blocks_of_atoms_share_the_work():
+    # more than one block, the last of them short, and a list that is not full everywhere
+    atoms = crystal(repeat=9)[: kernel._BLOCK + 500]
+    simulation, table, _, made, blocks = evaluated(
+        make(atoms, LENNARD_JONES, {"kind": "shifted", "radius": 2.0})
+    )
+    assert (table.index[-1] == len(atoms)).any()
+    np.testing.assert_allclose(made.force, blocks.force, atol=1e-12 * float(np.abs(blocks.force).max()))
+    assert np.array_equal(made.decisions.bits, blocks.decisions.bits)
+    assert made.decisions.nearest == blocks.decisions.nearest
+    tables = simulation.tables(table)
+    x = jnp.asarray(wrap_positions(simulation.cell, atoms.positions)[0][table.order].T)
+    again = jax.jit(lambda x: [simulation.force(x, tables, decisions=True) for _ in range(20)])(x)
+    for one in again:
+        # whichever thread took which block
+        assert np.array_equal(one.force, made.force)
+        assert np.array_equal(one.decisions.bits, made.decisions.bits)
+
+
+def test_derivatives_and_batches_go_through_it():
+    system = make(crystal(), LENNARD_JONES, {"kind": "force-shifted", "radius": 2.3})
+    simulation = build(system)
+    wrapped, _ = wrap_positions(simulation.cell, system.atoms.positions)
+    table = simulation.verlet_list().build(wrapped, simulation.cell)
+    tables, x = simulation.tables(table), jnp.asarray(wrapped[table.order].T)
+
+    def energy(x):
+        return simulation.force(x, tables, decisions=False).energy.sum()
+
+    force = simulation.force(x, tables, decisions=False).force
+    np.testing.assert_allclose(jax.grad(energy)(x), -force, atol=1e-12 * float(np.abs(force).max()))
+    both = jax.vmap(lambda x: simulation.force(x, tables, decisions=False).force)(jnp.stack([x, x + 0.01]))
+    assert np.array_equal(both[0], force)
+
+
+def test_what_has_no_vectors_is_left_to_xla():
+    atoms, morse = crystal(), {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
+    _, _, _, made, blocks = evaluated(make(atoms, morse, {"kind": "hard", "radius": 2.3}))
+    assert np.array_equal(made.force, blocks.force)
+
+
+def test_another_interface_is_not_met_with_guesses(tmp_path, monkeypatch):
+    header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
+    header.parent.mkdir(parents=True)
+    header.write_text("#define XLA_FFI_API_MAJOR 0\n#define XLA_FFI_API_MINOR 9\n")
+    assert kernel.known()
+    kernel.known.cache_clear()
+    monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
+    try:
+        assert not kernel.known()
+    finally:
+        kernel.known.cache_clear()
