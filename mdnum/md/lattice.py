@@ -41,8 +41,7 @@ from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, other_than, symmetric
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
-from mdnum.numerics.exact import fence, squared_norm, zero_bits
-from mdnum.numerics.reproducible import normal_quantile, reproducible
+from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_norm, zero_bits
 
 #: Listed distances are below 2^30 spacings: three of their squares fit a 64-bit integer.
 REACH_BITS = 30

@@ -3,13 +3,16 @@
 XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has other bits in
 another fusion, another instruction set, or in numpy. A decision must not depend on that: it is written
 with the products fenced, and then the host reproduces it bit for bit. A formula that is written as any
-other is run operation by operation instead: rounded behind each, or enclosed by intervals.
+other is run operation by operation instead: rounded behind each, enclosed by intervals, or with the bits of
+every processor.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -223,4 +226,195 @@ _IN_BALLS: dict[str, Callable[..., Any]] = {
     "ge": _compare(operator.ge, operator.lt),
     "lt": _compare(operator.lt, operator.ge),
     "le": _compare(operator.le, operator.gt),
+}
+
+
+# --- elementary functions, and formulas in them, that no compiler changes -------------------------------
+#
+# A compiler's own are polynomials whose products and sums it contracts as it likes: their last bits are those
+# of an instruction set. Here every product is fenced before it is added, and IEEE 754 defines each operation.
+
+# ln 2 and π/2 in two parts; the first has zeros at its end, so that a small integer times it is exact
+_LN2 = (float.fromhex("0x1.62e42fee00000p-1"), float.fromhex("0x1.a39ef35793c76p-33"))
+_HALF_PI = (float.fromhex("0x1.921fb54400000p+0"), float.fromhex("0x1.0b4611a626331p-34"))
+_EXPONENT = 52
+_BIAS = 1023
+_MANTISSA = (1 << _EXPONENT) - 1
+
+
+def polynomial(coefficients: Sequence[float], x: jax.Array, zero: jax.Array) -> jax.Array:
+    """Horner's rule, highest coefficient first, rounded after every operation."""
+    total = jnp.full_like(x, coefficients[0])
+    for c in coefficients[1:]:
+        total = fence(total * x, zero) + c
+    return total
+
+
+def _less(x: jax.Array, n: jax.Array, parts: tuple[float, float], zero: jax.Array) -> jax.Array:
+    """x - n times a constant in two parts."""
+    return (x - fence(n * parts[0], zero)) - fence(n * parts[1], zero)
+
+
+def exp(x: jax.Array, zero: jax.Array) -> jax.Array:
+    """The exponential of float64 numbers.
+
+    Error: below 2 ulp; results below the smallest normal number are 0.
+    """
+    # the argument may be a product, which must not be contracted into the reduction
+    x = fence(x, zero)
+    n = jnp.round(jnp.clip(fence(x * (1 / math.log(2)), zero), -2000, 2000))
+    r = _less(x, n, _LN2, zero)
+    p = polynomial([1 / math.factorial(k) for k in range(13, -1, -1)], r, zero)
+    # 2^n in two factors, each of which is a normal number
+    low = jnp.clip(n, -_BIAS + 1, _BIAS - 1)
+    rest = jnp.clip(n - low, -_BIAS + 1, _BIAS - 1)
+    value = fence(fence(p * _power_of_two(low), zero) * _power_of_two(rest), zero)
+    value = jnp.where(x < -708, 0.0, jnp.where(x > 709.78, jnp.inf, value))
+    return jnp.where(jnp.isnan(x), x, value)
+
+
+def _power_of_two(n: jax.Array) -> jax.Array:
+    return lax.bitcast_convert_type((n.astype(jnp.int64) + _BIAS) << _EXPONENT, jnp.float64)
+
+
+def log(x: jax.Array, zero: jax.Array) -> jax.Array:
+    """The natural logarithm of positive normal float64 numbers; NaN elsewhere.
+
+    Error: below 2 ulp of the larger of the result and 1e-2.
+    """
+    bits = lax.bitcast_convert_type(x, jnp.int64)
+    exponent = (bits >> _EXPONENT) - _BIAS
+    m = lax.bitcast_convert_type((bits & _MANTISSA) | (_BIAS << _EXPONENT), jnp.float64)
+    large = m > math.sqrt(2)
+    m = jnp.where(large, 0.5 * m, m)
+    n = (exponent + large.astype(jnp.int64)).astype(jnp.float64)
+    s = (m - 1) / (m + 1)
+    square = fence(s * s, zero)
+    tail = polynomial([2 / (2 * k + 1) for k in range(11, 0, -1)], square, zero)
+    small = fence(s * fence(tail * square, zero), zero) + (s + s)
+    value = fence(n * _LN2[0], zero) + (small + fence(n * _LN2[1], zero))
+    return jnp.where(x > 0, value, jnp.nan)
+
+
+def cos_sin(x: jax.Array, zero: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Cosine and sine of float64 numbers up to some thousand.
+
+    Error: below 1e-15.
+    """
+    x = fence(x, zero)
+    n = jnp.round(fence(x * (2 / math.pi), zero))
+    r = _less(x, n, _HALF_PI, zero)
+    square = fence(r * r, zero)
+    c = polynomial([(-1) ** k / math.factorial(2 * k) for k in range(8, -1, -1)], square, zero)
+    odd = polynomial([(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)], square, zero)
+    s = fence(r * fence(odd * square, zero), zero) + r
+    quarter = n.astype(jnp.int64) & 3
+    swap, negative = quarter & 1 == 1, quarter >= 2
+    cosine, sine = jnp.where(swap, -s, c), jnp.where(swap, c, s)
+    return jnp.where(negative, -cosine, cosine), jnp.where(negative, -sine, sine)
+
+
+# Wichura, Applied Statistics 37, 477 (1988), algorithm AS 241 (PPND16): numerators and denominators
+_CENTER = (
+    (2.5090809287301226727e3, 3.3430575583588128105e4, 6.7265770927008700853e4, 4.5921953931549871457e4,
+     1.3731693765509461125e4, 1.9715909503065514427e3, 1.3314166789178437745e2, 3.3871328727963666080e0),
+    (5.2264952788528545610e3, 2.8729085735721942674e4, 3.9307895800092710610e4, 2.1213794301586595867e4,
+     5.3941960214247511077e3, 6.8718700749205790830e2, 4.2313330701600911252e1, 1.0),
+)  # fmt: skip
+_NEAR = (
+    (7.74545014278341407640e-4, 2.27238449892691845833e-2, 2.41780725177450611770e-1,
+     1.27045825245236838258e0, 3.64784832476320460504e0, 5.76949722146069140550e0, 4.63033784615654529590e0,
+     1.42343711074968357734e0),
+    (1.05075007164441684324e-9, 5.47593808499534494600e-4, 1.51986665636164571966e-2,
+     1.48103976427480074590e-1, 6.89767334985100004550e-1, 1.67638483018380384940e0,
+     2.05319162663775882187e0, 1.0),
+)  # fmt: skip
+_FAR = (
+    (2.01033439929228813265e-7, 2.71155556874348757815e-5, 1.24266094738807843860e-3,
+     2.65321895265761230930e-2, 2.96560571828504891230e-1, 1.78482653991729133580e0,
+     5.46378491116411436990e0, 6.65790464350110377720e0),
+    (2.04426310338993978564e-15, 1.42151175831644588870e-7, 1.84631831751005468180e-5,
+     7.86869131145613259100e-4, 1.48753612908506148525e-2, 1.36929880922735805310e-1,
+     5.99832206555887937690e-1, 1.0),
+)  # fmt: skip
+
+
+def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
+    """The normal deviate of a number between -1 and 1: sqrt(2) erf⁻¹(u), float64.
+
+    Error: relative, about 1e-15.
+    """
+
+    def ratio(parts, r):
+        return fence(polynomial(parts[0], r, zero) / polynomial(parts[1], r, zero), zero)
+
+    q = 0.5 * u
+    center = fence(q * ratio(_CENTER, 0.180625 - fence(q * q, zero)), zero)
+    r = jnp.sqrt(-log(0.5 * (1 - jnp.abs(u)), zero))
+    tail = jnp.where(r <= 5, ratio(_NEAR, r - 1.6), ratio(_FAR, r - 5))
+    return jnp.where(jnp.abs(q) <= 0.425, center, jnp.where(q < 0, -tail, tail))
+
+
+# --- programs ------------------------------------------------------------------------------------------
+
+_SUMS = ("add", "sub")
+# results that are not a product or quotient, nor a rearranged one
+_SAFE = ("add", "sub", "sqrt", "abs", "max", "min", "round", "floor", "convert_element_type", "iota")
+
+
+@dataclass
+class _Held:
+    """A number of a program that is run: may it be added as it is, do all entries share it?"""
+
+    value: Any
+    safe: bool = True
+    shared: bool = False
+
+
+def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
+    """The function in float64, with results that do not depend on how it is compiled.
+
+    Args:
+        function: of arrays; it may close over others.
+        zero: an integer zero that XLA must not know (`mdnum.numerics.exact.zero_bits`).
+    """
+
+    def enter(x: Any) -> _Held:
+        return _Held(x.value, x.safe) if isinstance(x, _Held) else _Held(x)
+
+    def rule(equation: Any, inputs: list[_Held]) -> list[_Held]:
+        name = equation.primitive.name
+        if name in _OWN and _is_float(inputs[0].value):
+            return [_Held(_OWN[name](*(x.value for x in inputs), zero=zero, **equation.params), False)]
+        for held in inputs if name in _SUMS else ():
+            # what has been fenced once need not be again
+            if not held.safe and _is_float(held.value):
+                held.value, held.safe = fence(held.value, zero), True
+        values = [x.value for x in inputs]
+        if name == "div" and inputs[1].shared:
+            # of a divisor that all entries share, XLA takes the reciprocal once
+            values[1] = fence(values[1], zero)
+        return [_Held(x, name in _SAFE, name == "broadcast_in_dim") for x in bound(equation, values)]
+
+    return stepwise(function, rule, enter, lambda held: held.value)
+
+
+def _is_float(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def _power(x: Any, y: Any, *, zero: jax.Array, **_: Any) -> jax.Array:
+    """x to the power y, for x above 0; 0 or 1 at 0."""
+    x = jnp.asarray(x)
+    y = jnp.asarray(y, x.dtype)
+    value = exp(fence(y * log(x, zero), zero), zero)
+    return jnp.where(x > 0, value, jnp.where(y == 0, jnp.ones_like(x), jnp.zeros_like(x)))
+
+
+_OWN: dict[str, Callable[..., Any]] = {
+    "exp": lambda x, zero, **_: exp(x, zero),
+    "log": lambda x, zero, **_: log(x, zero),
+    "cos": lambda x, zero, **_: cos_sin(x, zero)[0],
+    "sin": lambda x, zero, **_: cos_sin(x, zero)[1],
+    "pow": _power,
 }

@@ -12,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
 from mdnum.forks.processes import digests, digests_elsewhere
 from mdnum.forks.worlds import program_of
-from mdnum.rollout.dials import names
+from mdnum.rollout.program import names
 from mdnum.systems.build import build
 
 # processes of their own, and hundreds of runs

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mdnum.numerics import reproducible as elementary
-from mdnum.numerics.exact import fence, rounded, squared_norm, zero_bits
-from mdnum.numerics.reproducible import reproducible
+from mdnum.numerics import exact as elementary
+from mdnum.numerics.exact import fence, reproducible, rounded, squared_norm, zero_bits
 
 DTYPES = [np.float16, ml_dtypes.bfloat16, np.float32, np.float64]
 each = pytest.mark.parametrize("dtype", DTYPES)

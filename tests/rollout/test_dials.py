@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.rollout.dials import dial, names, unit
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import run_epoch
+from mdnum.rollout.program import dial, names, unit
 from mdnum.systems.build import build
 
 
