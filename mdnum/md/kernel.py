@@ -89,7 +89,7 @@ def over_pairs(
     call = jax.ffi.ffi_call(_registered(written.loop), shapes, vmap_method="sequential")
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
     bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
-    equal = np.full(1, margins == ">=")
+    equal = jnp.full(1, margins == ">=", jnp.int64)
     kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)
     sums, decided, nearest = call(index, columns, bits, written.constants, equal, kinds)
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
@@ -289,7 +289,8 @@ def _registered(source: str) -> str:
     machine = llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3
     )
-    module = llvm.parse_assembly(source + _CALLED.format(loop=_over_blocks.address, task=_help.address))
+    loop, task = _driver()
+    module = llvm.parse_assembly(source + _CALLED.format(loop=loop, task=task))
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=3))
     builder.getModulePassManager().run(module, builder)
     engine = llvm.create_mcjit_compiler(module, machine)
@@ -307,7 +308,11 @@ _ALIVE: list[Any] = []
 # --- the loop over a list, which calls the other ----------------------------------------------------------
 
 
-@intrinsic
+_carray: Any = numba.carray  # pyright: ignore
+_intrinsic: Any = intrinsic
+
+
+@_intrinsic
 def _pointer(typingctx: Any, address: Any) -> Any:
     """A number as the address of memory."""
 
@@ -317,7 +322,7 @@ def _pointer(typingctx: Any, address: Any) -> Any:
     return types.voidptr(types.intp), generate
 
 
-@intrinsic
+@_intrinsic
 def _call(typingctx: Any, address: Any, arguments: Any) -> Any:
     """What a C function at an address makes of a tuple of 64-bit arguments."""
 
@@ -330,7 +335,7 @@ def _call(typingctx: Any, address: Any, arguments: Any) -> Any:
     return types.intp(types.intp, arguments), generate
 
 
-@intrinsic
+@_intrinsic
 def _added(typingctx: Any, address: Any, amount: Any) -> Any:
     """Add to the 64-bit number at an address, in one step for all threads; the number before."""
 
@@ -348,47 +353,78 @@ _free = types.ExternalFunction("free", types.void(types.intp))
 @numba.njit(cache=True, nogil=True)
 def _words(address):
     """Memory as 64-bit words, as many as a frame has or fewer."""
-    return numba.carray(_pointer(address), (32,), np.int64)  # pyright: ignore
+    return _carray(_pointer(address), (32,), np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
 def _buffer(buffers, k):
-    """Where the data of a frame's k-th operand or result begin, and its dimensions."""
+    """Where the data of a frame's k-th operand or result begin, and its first two dimensions."""
     words = _words(buffers[k])
-    return words[3], _words(words[5])
+    size = _words(words[5])
+    return words[3], size[0], size[1]
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _gathered(index, column, out):
-    for k in range(index.shape[0]):
-        out[k] = column[index[k]]
+# Loops over n numbers at given addresses: each a function of its own, so that it becomes one of vectors.
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _widened(values, out):
-    for k in range(values.shape[0]):
+@numba.njit(cache=True, nogil=True)
+def _filled(out_at, n, value):
+    out = _carray(_pointer(out_at), (n,), np.float64)
+    for k in range(n):
+        out[k] = value
+
+
+@numba.njit(cache=True, nogil=True)
+def _copied(values_at, out_at, n):
+    values = _carray(_pointer(values_at), (n,), np.float64)
+    out = _carray(_pointer(out_at), (n,), np.float64)
+    for k in range(n):
         out[k] = values[k]
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _unpacked(bits, shift, out):
-    for k in range(bits.shape[0]):
-        out[k] = (bits[k] >> shift) & 1
+@numba.njit(cache=True, nogil=True)
+def _least(values_at, n):
+    values = _carray(_pointer(values_at), (n,), np.float64)
+    least = np.inf
+    for k in range(n):
+        least = min(least, values[k])
+    return least
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _packed(margin, equal, shift, bits):
+@numba.njit(cache=True, nogil=True)
+def _gathered(index_at, column_at, out_at, n):
+    index = _carray(_pointer(index_at), (n,), np.int32)
+    column = _carray(_pointer(column_at), (n,), np.float64)
+    out = _carray(_pointer(out_at), (n,), np.float64)
+    for k in range(n):
+        out[k] = column[index[k]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _unpacked(bytes_at, shift, mask, out_at, n):
+    values = _carray(_pointer(bytes_at), (n,), np.uint8)
+    out = _carray(_pointer(out_at), (n,), np.float64)
+    for k in range(n):
+        out[k] = (values[k] >> np.uint8(shift)) & np.uint8(mask)
+
+
+@numba.njit(cache=True, nogil=True)
+def _packed(margin_at, equal, shift, bytes_at, n):
+    margin = _carray(_pointer(margin_at), (n,), np.float64)
+    values = _carray(_pointer(bytes_at), (n,), np.uint8)
     if equal:
-        for k in range(bits.shape[0]):
-            bits[k] |= np.uint8(margin[k] >= 0) << shift
+        for k in range(n):
+            values[k] |= np.uint8(margin[k] >= 0) << np.uint8(shift)
     else:
-        for k in range(bits.shape[0]):
-            bits[k] |= np.uint8(margin[k] > 0) << shift
+        for k in range(n):
+            values[k] |= np.uint8(margin[k] > 0) << np.uint8(shift)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
-def _nearer(margin, nearest):
-    for k in range(margin.shape[0]):
+@numba.njit(cache=True, nogil=True)
+def _nearer(margin_at, nearest_at, n):
+    margin = _carray(_pointer(margin_at), (n,), np.float64)
+    nearest = _carray(_pointer(nearest_at), (n,), np.float64)
+    for k in range(n):
         size = abs(margin[k])
         nearest[k] = size if size < nearest[k] else nearest[k]
 
@@ -399,7 +435,7 @@ def _nearer(margin, nearest):
 _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _ROWS, _PADDED, _THREADS, _ASKED, _NEAREST = (*range(9), 16)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@numba.njit(cache=True, nogil=True)
 def _work(job):
     """Take one block of a job after the other, until none is left."""
     words = _words(job)
@@ -408,67 +444,65 @@ def _work(job):
         return
     frame = _words(words[_FRAME])
     operands, results = _words(frame[9]), _words(frame[14])
-    at, size = _buffer(operands, 0)
-    slots, atoms = size[0], size[1]
-    index = numba.carray(_pointer(at), (slots, atoms), np.int32)
-    own, size = _buffer(operands, 1)
-    columns = size[0]
-    padded = numba.carray(_pointer(words[_PADDED]), (columns, atoms + 1), np.float64)
-    at, size = _buffer(operands, 2)
-    flags = size[0]
-    told = numba.carray(_pointer(at), (flags, slots // 8, atoms), np.uint8)
-    constants, _ = _buffer(operands, 3)
-    at, _ = _buffer(operands, 4)
-    equal = numba.carray(_pointer(at), (1,), np.bool_)[0]
-    at, size = _buffer(operands, 5)
-    types_of = numba.carray(_pointer(at), (size[0], atoms), np.uint8)
-    typed = int(size[0] > 0)
-    at, size = _buffer(results, 0)
-    terms = size[0]
-    sums = numba.carray(_pointer(at), (terms, atoms), np.float64)
-    at, size = _buffer(results, 1)
-    margins = size[0] > 0
-    bits = numba.carray(_pointer(at), (size[0], atoms), np.uint8)
-    nearest = numba.carray(_pointer(job + 8 * _NEAREST), (blocks,), np.float64)
+    index, slots, atoms = _buffer(operands, 0)
+    own, columns, _ = _buffer(operands, 1)
+    told, flags, _ = _buffer(operands, 2)
+    constants, _, _ = _buffer(operands, 3)
+    at, _, _ = _buffer(operands, 4)
+    equal = _words(at)[0]
+    types_of, typed, _ = _buffer(operands, 5)
+    typed = min(typed, 1)
+    sums, terms, _ = _buffer(results, 0)
+    bits, margins, _ = _buffer(results, 1)
+    margins = min(margins, 1)
 
-    near, closest = np.empty((columns + typed + flags + int(margins), _BLOCK)), np.empty(_BLOCK)
-    pointers = np.empty(columns + len(near) + terms, np.intp)
-    for row in range(len(near)):
-        pointers[columns + row] = near[row].ctypes.data
+    # addresses of the rows that the loop over a slot is given, then those rows that are a thread's own
+    copied = columns + typed + flags + margins
+    room = _malloc(8 * (columns + copied + terms + (copied + 1) * _BLOCK))
+    near = room + 8 * (columns + copied + terms)
+    margin, closest = near + 8 * (copied - 1) * _BLOCK, near + 8 * copied * _BLOCK
+    rows = _carray(_pointer(room), (columns + copied + terms,), np.int64)
+    for row in range(copied):
+        rows[columns + row] = near + 8 * row * _BLOCK
     while block < blocks:
         start = block * _BLOCK
-        end = min(start + _BLOCK, atoms)
-        sums[:, start:end], bits[:, start:end], closest[:] = 0, 0, np.inf
+        n = min(_BLOCK, atoms - start)
         for row in range(columns):
-            pointers[row] = own + (row * atoms + start) * 8
+            rows[row] = own + 8 * (row * atoms + start)
         for row in range(terms):
-            pointers[len(pointers) - terms + row] = sums[row, start:].ctypes.data
+            rows[columns + copied + row] = sums + 8 * (row * atoms + start)
+            _filled(sums + 8 * (row * atoms + start), n, 0.0)
+        _filled(closest, n, np.inf)
         for slot in range(slots):
-            word, shift = slot // 8, np.uint8(slot % 8)
+            word, shift = slot // 8, slot % 8
+            out = near
             for row in range(columns):
-                _gathered(index[slot, start:end], padded[row], near[row])
+                padded = words[_PADDED] + 8 * row * (atoms + 1)
+                _gathered(index + 4 * (slot * atoms + start), padded, out, n)
+                out += 8 * _BLOCK
             if typed:
-                _widened(types_of[slot, start:end], near[columns])
-            for row in range(flags):
-                _unpacked(told[row, word, start:end], shift, near[columns + typed + row])
-            _call(words[_ROWS], (end - start, constants, pointers.ctypes.data))
+                _unpacked(types_of + slot * atoms + start, 0, 255, out, n)
+                out += 8 * _BLOCK
+            for flag in range(flags):
+                _unpacked(told + (flag * (slots // 8) + word) * atoms + start, shift, 1, out, n)
+                out += 8 * _BLOCK
+            _call(words[_ROWS], (n, constants, room))
             if margins:
-                margin = near[-1, : end - start]
-                _packed(margin, equal, shift, bits[word, start:end])
-                _nearer(margin, closest[: end - start])
-        nearest[block] = closest.min()
+                _packed(margin, equal, shift, bits + word * atoms + start, n)
+                _nearer(margin, closest, n)
+        _filled(job + 8 * (_NEAREST + block), 1, _least(closest, n))
         _added(job + 8 * _DONE, 1)
         block = _added(job + 8 * _NEXT, 1)
+    _free(room)
 
 
 @numba.njit(cache=True, nogil=True)
 def _leave(job):
     """The last one to use a job clears it away."""
-    if _added(job + 8 * _USERS, -1) == 1:  # pyright: ignore
+    if _added(job + 8 * _USERS, -1) == 1:
         _free(job)
 
 
-@numba.cfunc(types.intp(types.intp), cache=True)
 def _help(job):
     """What another thread does."""
     _work(job)
@@ -493,7 +527,6 @@ def _helped(job, frame, helpers, task):
             return
 
 
-@numba.cfunc(types.intp(types.intp, types.intp, types.intp), cache=True)
 def _over_blocks(frame, rows, task):
     """Every block of atoms, as `over_pairs` asks for it; 0 for no error.
 
@@ -508,24 +541,39 @@ def _over_blocks(frame, rows, task):
     if words[4] & 0xFFFFFFFF != 3:
         # one of the stages before execution
         return 0
-    at, size = _buffer(_words(words[9]), 1)
-    columns, atoms = size[0], size[1]
-    own = numba.carray(_pointer(at), (columns, atoms), np.float64)
+    own, columns, atoms = _buffer(_words(words[9]), 1)
+    bits, margins, _ = _buffer(_words(words[14]), 1)
+    nearest, _, _ = _buffer(_words(words[14]), 2)
     blocks = -(-atoms // _BLOCK)
     job = _malloc(8 * (_NEAREST + blocks + columns * (atoms + 1)))
     mine = _words(job)
     mine[_USERS], mine[_NEXT], mine[_DONE], mine[_BLOCKS] = 1, 0, 0, blocks
     mine[_FRAME], mine[_ROWS], mine[_PADDED] = frame, rows, job + 8 * (_NEAREST + blocks)
-    # padding names an atom behind the last
-    padded = numba.carray(_pointer(mine[_PADDED]), (columns, atoms + 1), np.float64)
-    padded[:, :atoms], padded[:, atoms] = own, np.nan
+    for row in range(columns):
+        out = mine[_PADDED] + 8 * row * (atoms + 1)
+        _copied(own + 8 * row * atoms, out, atoms)
+        # padding names an atom behind the last
+        _filled(out + 8 * atoms, 1, np.nan)
+    cleared = _carray(_pointer(bits), (margins * atoms,), np.uint8)
+    for k in range(margins * atoms):
+        cleared[k] = 0
     if blocks > 1:
         _helped(job, words, blocks - 1, task)
     _work(job)
     while _added(job + 8 * _DONE, 0) < blocks:
         pass
-    at, _ = _buffer(_words(words[14]), 2)
-    nearest = numba.carray(_pointer(job + 8 * _NEAREST), (blocks,), np.float64)
-    numba.carray(_pointer(at), (1,), np.float64)[0] = nearest.min()
+    _filled(nearest, 1, _least(job + 8 * _NEAREST, blocks))
     _leave(job)
     return 0
+
+
+@cache
+def _driver() -> tuple[int, int]:
+    """Addresses of the loop over a list and of what helps it; compiled once after an installation."""
+    made = [
+        numba.cfunc(types.intp(*[types.intp] * count), cache=True)(function)
+        for function, count in ((_over_blocks, 3), (_help, 1))
+    ]
+    _ALIVE.extend(made)
+    loop, task = (int(one.address or 0) for one in made)
+    return loop, task

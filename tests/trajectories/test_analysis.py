@@ -242,7 +242,6 @@ def test_an_atom_that_is_not_looked_at_spoils_nothing_and_widens_no_bound():
         ({"r_cut": -1.0}, "a radius of -1.0"),
         ({"r_cut": {("C", "Xx"): 2.5}}, "'Xx'"),
         ({"r_cut": None}, "no cutoff"),
-        ({"rule": 4}, "is no membership rule"),
         ({"bound": -1}, "bound = -1; expected"),
         ({"bound": np.nan}, "bound = nan; expected"),
         ({"atoms": lambda water: water.select_atoms("name NOBODY")}, "atoms is empty"),
