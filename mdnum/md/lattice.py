@@ -499,6 +499,10 @@ class LatticeForce(PairForce):
         assert isinstance(self.decider, LatticeDecider)
         return LatticeJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.lattice)
 
+    def decide(self, positions, tables):
+        """As `PairForce`, of whole numbers."""
+        return self.judge(positions).decide(tables)
+
     def __call__(self, positions, tables, *, decisions, given=None, where=None):
         """As `PairForce`: forces that are whole multiples of the unit of force.
 

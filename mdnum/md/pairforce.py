@@ -113,7 +113,28 @@ class PairForce(eqx.Module):
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions, without forces."""
+        if self.in_one_loop(tables):
+
+            def pair(own, other, types):
+                return (self._geometry(own, other, types)[3],)
+
+            made = kernel.over_pairs(pair, positions.astype(np.float64), tables, margins=self._inside)
+            if made is not None and made.decisions is not None:
+                return made.decisions
         return self.judge(positions).decide(tables)
+
+    @property
+    def _inside(self) -> str:
+        """How the margin of a pair inside compares with 0."""
+        return ">=" if self.decider.compare.endswith("<=") else ">"
+
+    def _geometry(self, own, other, types):
+        """Displacement, its square, decision and margin of a pair in double precision."""
+        d = self.cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
+        r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        quantity = jnp.sqrt(r2) if self.decider.space == "r" else r2
+        threshold = of_type(self.thresholds, types)
+        return d, r2, self.decider.inside(quantity, threshold), threshold - quantity
 
     def __call__(
         self,
@@ -240,24 +261,18 @@ def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool):
     """As `PairForce.in_blocks` in one compiled loop; None where that is not known."""
-    cell, decider = force.cell, force.decider
     terms_of = force._terms()
 
     def pair(own, other, types, *bits):
-        threshold = of_type(force.thresholds, types)
-        d = cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
-        r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        quantity = jnp.sqrt(r2) if decider.space == "r" else r2
-        inside = decider.inside(quantity, threshold)
+        d, r2, inside, margin = force._geometry(own, other, types)
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
         # a slot of padding is nowhere
-        d = [jnp.where(inside, c, 0) for c in d]
-        return *terms_of(d, r2, inside, types), threshold - quantity if decisions else None
+        terms = terms_of([jnp.where(inside, c, 0) for c in d], r2, inside, types)
+        return (*terms, margin) if decisions else terms
 
-    margins = (">=" if decider.compare.endswith("<=") else ">") if decisions else None
     flags = [one for one in (given, where) if one is not None]
-    columns = positions.astype(np.float64)
+    columns, margins = positions.astype(np.float64), force._inside if decisions else None
     made = kernel.over_pairs(pair, columns, tables, flags=flags, margins=margins)
     return None if made is None else _forces(tuple(made.sums), made.decisions)
 
