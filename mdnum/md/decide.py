@@ -178,8 +178,8 @@ class Decisions(NamedTuple):
 
     Attributes:
         bits: decisions, eight slots to a byte, shape (slots/8, atoms).
-        nearest: smallest |margin| of any listed pair, in the quantity's space; inf where none is listed.
-            Only where it is within the rounding bound can a decision be ambiguous: the loop need not count.
+        nearest: smallest |margin| of any listed pair, in the quantity's space. Only where it is within the
+            rounding bound can a decision be ambiguous, so the loop need not count those.
     """
 
     bits: UInt8[Array, "words atoms"]
@@ -241,14 +241,14 @@ class SlotJudge:
             j: shape (GROUP, atoms). types: their pair types, or None.
         """
         d = displacements(self.components, self.cell, j)
-        # padding is infinitely far away
-        quantity = jnp.where(j < self.atoms, self.decider.quantity(*d, self.zero), jnp.inf)
+        quantity = self.decider.quantity(*d, self.zero)
         threshold = of_type(self.value, types)
-        return d, quantity, self.decider.inside(quantity, threshold), threshold
+        return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
         """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
+        # padding repeats the last atom, which is listed too or too far away to be the nearest to a threshold
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
             bits = bits | (inside[k].astype(jnp.uint8) << jnp.uint8(k))

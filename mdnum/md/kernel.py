@@ -44,7 +44,8 @@ class PairSums(NamedTuple):
 
     Attributes:
         sums: of each term over the slots of each atom, first slot first, shape (terms, atoms).
-        decisions: None where no margin is asked for.
+        decisions: None where no margin is asked for. Their nearest margin is that of a listed pair, and inf
+            where there is none.
     """
 
     sums: Float[Array, "terms atoms"]

@@ -437,10 +437,9 @@ class LatticeJudge(SlotJudge):
             # the low half is the integer: a product of two halves is one that every processor has
             whole = whole.astype(jnp.int32).astype(jnp.int64)
             squares.append(whole * whole)
-        # padding is as far away as numbers go
-        r2 = jnp.where(j < self.atoms, squares[0] + squares[1] + squares[2], jnp.iinfo(jnp.int64).max)
+        r2 = squares[0] + squares[1] + squares[2]
         limit = of_type(self.value, types)
-        return d, r2, r2 < limit, limit
+        return d, r2, (r2 < limit) & (j < self.atoms), limit
 
     def tally(self, nearest, quantity, inside, threshold):
         """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
@@ -456,9 +455,7 @@ class LatticeJudge(SlotJudge):
         """The pass's decisions, two groups to a byte."""
         unit = self.lattice.spacing * self.lattice.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
-        # no margin of a listed pair reaches 2^62
-        nearest = jnp.where(closest < 2 ** (2 * REACH_BITS + 2), closest.astype(jnp.float64) - 0.5, jnp.inf)
-        return Decisions(packed(halves), nearest * unit)
+        return Decisions(packed(halves), (closest.astype(jnp.float64) - 0.5) * unit)
 
 
 class LatticeForce(PairForce):

@@ -435,7 +435,7 @@ class PairDynamics(eqx.Module):
 
         def margin(j, kinds):
             _, quantity, _, threshold = judge.group(j, kinds)
-            return threshold - quantity
+            return jnp.where(j < judge.atoms, threshold - quantity, -jnp.inf)
 
         groups = [margin(index[g], None if types is None else types[g]) for g in range(index.shape[0])]
         return jnp.stack(groups)
