@@ -176,11 +176,13 @@ def _written(
     constants: dict[int, Any] = {}
     lines: list[str] = []
 
-    def text(value: Any) -> str:
+    def text(value: Any, kind: str = "double") -> str:
         if isinstance(value, _Value):
+            if value.kind != kind:
+                raise _NotKnown("a number where a decision is expected, or the other way round")
             return value.name
-        if np.size(value) != 1:
-            raise _NotKnown("an array")
+        if np.size(value) != 1 or kind != "double" or jnp.result_type(value) == np.bool_:
+            raise _NotKnown("an array, or a decision that is the same for all pairs")
         if not isinstance(value, Tracer | jax.Array):
             return _number(value)
         constants.setdefault(id(value), value)
@@ -201,7 +203,10 @@ def _written(
         name, made = equation.primitive.name, equation.outvars[0].aval
         if not any(isinstance(value, _Value) for value in inputs):
             # the same for all pairs: made once, outside
-            return bound(equation, inputs)
+            try:
+                return bound(equation, inputs)
+            except TypeError as error:
+                raise _NotKnown(str(error)) from None
         if name == "dynamic_slice" and np.ndim(inputs[0]) == 1 and equation.params["slice_sizes"] == (1,):
             # the constant of the pair's type
             of, which = inputs[0], text(inputs[1])
@@ -223,7 +228,9 @@ def _written(
         if name not in _OPERATIONS or not halves_to_even:
             raise _NotKnown(name)
         kind = "i1" if made.dtype == np.bool_ else "double"
-        return [put(_OPERATIONS[name].format(*map(text, inputs), kind=kind), kind)]
+        decisions = len(inputs) if name in ("and", "or", "xor", "not") else int(name == "select_n")
+        kinds = ["i1"] * decisions + [kind if name == "select_n" else "double"] * (len(inputs) - decisions)
+        return [put(_OPERATIONS[name].format(*map(text, inputs, kinds), kind=kind), kind)]
 
     given = [load(row) for row in range(numbers)]
     given += [put(f"fcmp une double {load(numbers + k).name}, {_number(0)}", "i1") for k in range(flags)]

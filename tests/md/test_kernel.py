@@ -15,6 +15,7 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.md import kernel
 from mdnum.md.cell import wrap_positions
+from mdnum.md.decide import Tables
 from mdnum.systems import build
 
 CUTOFFS = ("hard", "force-shifted", "switched", "quintic")
@@ -141,6 +142,36 @@ def test_what_has_no_vectors_is_left_to_xla():
     atoms, morse = crystal(), {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
     _, _, _, made, blocks = evaluated(make(atoms, morse, {"kind": "hard", "radius": 2.3}))
     assert np.array_equal(made.force, blocks.force)
+
+
+@jax.custom_jvp
+def own_rule(x):
+    return x * x
+
+
+own_rule.defjvp(lambda primals, tangents: (own_rule(*primals), 2 * primals[0] * tangents[0]))
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        lambda r2, c: jnp.exp(-r2),
+        # a decision that is the same for all pairs, and a decision that is compared
+        lambda r2, c: jnp.where(c > 1, r2, 2 * r2),
+        lambda r2, c: jnp.where((r2 > c) == (r2 > 1), r2, 0.0),
+        # programs of their own
+        lambda r2, c: own_rule(c) * r2,
+        lambda r2, c: jax.lax.cond(r2 > c, lambda x: x, lambda x: 2 * x, r2),
+    ],
+)
+def test_what_is_not_known_is_told(term):
+    """Anybody's cutoff comes here: what has no counterpart is left to XLA, and never an error."""
+    tables = Tables(jnp.zeros((1, 8, 2), jnp.int32), None, jnp.arange(2))
+
+    def summed(x, c):
+        return kernel.over_pairs(lambda a, b, types: (term((b[0] - a[0]) ** 2, c),), x, tables)
+
+    assert jax.jit(summed)(jnp.zeros((3, 2)), jnp.float64(1.5)) is None
 
 
 def test_another_interface_is_not_met_with_guesses(tmp_path, monkeypatch):
