@@ -140,7 +140,8 @@ SIGMA = 3.405
 POTENTIAL = {"kind": "lennard-jones", "sigma": SIGMA, "epsilon": 0.0103235}
 #: Rahman's box, scaled to 256 atoms.
 EDGE = 10.229 * 3.4 * (256 / 864) ** (1 / 3)
-STARTS = (0, 1, 2)
+#: More at the usual cutoff, where starts differ in what flips do.
+STARTS = {"usual": range(6), "violent": range(3), "switched": range(3)}
 CUTS = {
     "usual": {"kind": "hard", "radius": 2.5 * SIGMA},
     "violent": {"kind": "hard", "radius": 1.5 * SIGMA},
@@ -174,27 +175,26 @@ def liquid(seed: int) -> Atoms:
 def forks() -> dict[str, list[Fork]]:
     """Float32 arithmetic beside float64, by cutoff and start."""
     return {
-        cut: [fork(made("precision", argon(liquid(seed), cut)), 1000, back=False) for seed in STARTS]
+        cut: [fork(made("precision", argon(liquid(seed), cut)), 1000, back=False) for seed in STARTS[cut]]
         for cut in CUTS
     }
 
 
 @pytest.mark.nightly
-def test_flips_accelerate_at_a_violent_cutoff_alone(forks):
+def test_flips_accelerate_at_a_violent_cutoff_and_seldom_at_the_usual_one(forks):
     """E-foldings that flips were worth, at eight to thirteen starts: violent 1.5 to 21, 4.4 in the median;
-    usual 0.06 to 1.9, 0.26 in the median (0.8 with 864 atoms and a fifth of the time step); switched -0.5 to
-    0.15. One is what "accelerated" asks for.
+    usual -0.2 to 2.5, 0.5 in the median (0.8 with 864 atoms and a fifth of the time step), two starts of twelve
+    accelerated; switched -0.5 to 0.15. One is what "accelerated" asks for.
     """
     words = {cut: [one.verdict.word for one in found] for cut, found in forks.items()}
     worth = {cut: float(np.median([one.verdict.e_foldings for one in found])) for cut, found in forks.items()}
-    assert words["violent"] == ["accelerated"] * len(STARTS)
+    assert words["violent"] == ["accelerated"] * 3
     assert worth["violent"] > 2.5 and worth["violent"] > 2 * worth["usual"]
     # switched off smoothly they only come along
-    assert words["switched"] == ["bystander"] * len(STARTS)
+    assert words["switched"] == ["bystander"] * 3
     for found in forks["switched"]:
         assert found.dates.fork < found.dates.split
         assert abs(found.verdict.e_foldings) < 1
-    # chaos would have done: bystander at two of the three starts, where no pair of 6 is delayed; at the third
-    # 6 of 16 are
-    assert set(words["usual"]) <= {"bystander", "undecided"} and words["usual"].count("bystander") >= 1
+    # chaos would have done, at most starts: at the third no pair of 6 is not delayed
+    assert words["usual"].count("accelerated") <= 2 and words["usual"].count("bystander") >= 3
     assert worth["usual"] < 1.5
