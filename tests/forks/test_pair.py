@@ -183,8 +183,8 @@ def forks() -> dict[str, list[Fork]]:
 @pytest.mark.nightly
 def test_flips_accelerate_at_a_violent_cutoff_and_seldom_at_the_usual_one(forks):
     """E-foldings that flips were worth, at eight to thirteen starts: violent 1.5 to 21, 4.4 in the median;
-    usual -0.2 to 2.5, 0.5 in the median (0.8 with 864 atoms and a fifth of the time step), two starts of twelve
-    accelerated; switched -0.5 to 0.15. One is what "accelerated" asks for.
+    usual -0.2 to 2.5, 0.5 in the median (0.8 with 864 atoms and a fifth of the time step), with two starts of
+    twelve accelerated; switched -0.5 to 0.15. One is what "accelerated" asks for.
     """
     words = {cut: [one.verdict.word for one in found] for cut, found in forks.items()}
     worth = {cut: float(np.median([one.verdict.e_foldings for one in found])) for cut, found in forks.items()}
