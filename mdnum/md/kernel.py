@@ -2,9 +2,10 @@
 
 A function of one pair is traced by jax and its operations are written down again as a loop of LLVM's
 language. The neighbors of a block of atoms are copied side by side, slot after slot, and then each operation
-is one of vectors over the block; XLA's loop over the same list gathers and computes in passes of
-their own and takes about twice the time. Nothing is contracted or reordered: the sums have the same bits on
-every processor. XLA reaches the loop through its foreign-function interface (xla/ffi/api/c_api.h, 0.3).
+is one of vectors over the block; XLA's loop over the same list gathers and computes in passes of their own
+and takes about twice the time. Nothing is contracted or reordered: of the same numbers the sums have the
+same bits on every processor. XLA reaches the loop through its foreign-function interface
+(xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
