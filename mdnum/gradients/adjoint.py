@@ -154,19 +154,15 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
     made = kernel.over_pairs(pair, columns, tables, flags=(bits,)) if in_one_loop else None
     if made is not None:
         return made.sums
-    own = tuple(columns)
+    own, (index, types), halves = tuple(columns), tables.groups(), halves_of(bits)
 
-    def block(totals, listed):
-        (j, types), told = listed
+    def added(j, types, told):
         d = differences(own, [c.at[j].get(mode="promise_in_bounds") for c in own])
-        added = terms(d[:3], d[3:], unpacked(told), types)
-        totals = totals or (jnp.zeros_like(own[0]),) * len(added)
-        return _added(totals, added), None
+        return terms(d[:3], d[3:], unpacked(told), types)
 
-    index, types = tables.groups()
-    first = jax.eval_shape(lambda: block((), ((index[0], None if types is None else types[0]), bits[0]))[0])
-    start = tuple(jnp.zeros(one.shape, one.dtype) for one in first)
-    return lax.scan(block, start, ((index, types), halves_of(bits)))[0]
+    first = jax.eval_shape(added, index[0], None if types is None else types[0], halves[0])
+    start = (jnp.zeros_like(own[0]),) * len(first)
+    return lax.scan(lambda sums, slots: (_added(sums, added(*slots)), None), start, (index, types, halves))[0]
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
