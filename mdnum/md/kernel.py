@@ -1,11 +1,10 @@
 """Sums over the neighbors of every atom in one compiled loop, for CPUs: what XLA calls instead of its own.
 
-A function of one pair is traced by jax and its operations are written down again as a loop of LLVM's
-language. The neighbors of a block of atoms are copied side by side, slot after slot, and then each operation
-is one of vectors over the block; XLA's loop over the same list gathers and computes in passes of their own
-and takes about twice the time. Nothing is contracted or reordered: of the same numbers the sums have the
-same bits on every processor. XLA reaches the loop through its foreign-function interface
-(xla/ffi/api/c_api.h, version 0.3).
+A function of one pair is traced by jax, and its operations are written down again in LLVM's language, on
+vectors of eight atoms. The numbers of an atom lie side by side, so that a neighbor is a load or two, and
+eight slots are summed in registers; XLA's loop over the same list gathers and computes in passes of their
+own. Nothing is contracted or reordered: of the same numbers the sums have the same bits on every processor.
+XLA reaches the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +36,10 @@ from mdnum.numerics.exact import bound, interpreted
 
 # of the foreign-function interface, whose layout in memory the loop relies on
 _VERSION = (0, 3)
-# atoms of a block, whose copies stay in the cache: between 1,024 and 4,096 nothing changes
+# atoms of a block, which is what a thread takes at a time; full vectors
 _BLOCK = 2048
+# atoms of a vector; a processor with shorter ones takes several
+_WIDE = 8
 
 
 class PairSums(NamedTuple):
@@ -80,7 +82,7 @@ def over_pairs(
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
     try:
-        written = _written(pair, columns.shape[0], len(flags), margins is not None, tables.types is not None)
+        written = _written(pair, columns.shape[0], len(flags), margins, tables.types is not None)
     except _NotKnown:
         return None
     shapes = [
@@ -91,9 +93,8 @@ def over_pairs(
     call = jax.ffi.ffi_call(_registered(written.loop), shapes, vmap_method="sequential")
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
     bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
-    equal = jnp.full(1, margins == ">=", jnp.int64)
     kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)
-    sums, decided, nearest = call(index, columns, bits, written.constants, equal, kinds)
+    sums, decided, nearest = call(index, columns, bits, written.constants, kinds)
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
 
 
@@ -115,10 +116,10 @@ class _NotKnown(Exception):
 
 
 class _Value(NamedTuple):
-    """What differs from pair to pair, by its name in the loop; a number, or a decision."""
+    """What differs from pair to pair, by its name in the loop: a vector of numbers, or of decisions."""
 
     name: str
-    kind: str = "double"
+    kind: str = "VEC"
 
 
 class _Written(NamedTuple):
@@ -129,76 +130,76 @@ class _Written(NamedTuple):
     terms: int
 
 
+# VEC, BOOL and BYTE are vectors of WIDE numbers, decisions and bytes
 _OPERATIONS = {
-    "add": "fadd double {}, {}",
-    "add_any": "fadd double {}, {}",
-    "sub": "fsub double {}, {}",
-    "mul": "fmul double {}, {}",
-    "div": "fdiv double {}, {}",
-    "neg": "fneg double {}",
-    "square": "fmul double {0}, {0}",
-    "abs": "call double @llvm.fabs.f64(double {})",
-    "sqrt": "call double @llvm.sqrt.f64(double {})",
-    "round": "call double @llvm.rint.f64(double {})",
-    "select_n": "select i1 {0}, {kind} {2}, {kind} {1}",
-    "eq": "fcmp oeq double {}, {}",
-    "gt": "fcmp ogt double {}, {}",
-    "ge": "fcmp oge double {}, {}",
-    "lt": "fcmp olt double {}, {}",
-    "le": "fcmp ole double {}, {}",
-    "and": "and i1 {}, {}",
-    "or": "or i1 {}, {}",
-    "xor": "xor i1 {}, {}",
-    "not": "xor i1 {}, true",
+    "add": "fadd VEC {}, {}",
+    "add_any": "fadd VEC {}, {}",
+    "sub": "fsub VEC {}, {}",
+    "mul": "fmul VEC {}, {}",
+    "div": "fdiv VEC {}, {}",
+    "neg": "fneg VEC {}",
+    "square": "fmul VEC {0}, {0}",
+    "abs": "call VEC @llvm.fabs.vWIDEf64(VEC {})",
+    "sqrt": "call VEC @llvm.sqrt.vWIDEf64(VEC {})",
+    "round": "call VEC @llvm.rint.vWIDEf64(VEC {})",
+    "select_n": "select BOOL {0}, {kind} {2}, {kind} {1}",
+    "eq": "fcmp oeq VEC {}, {}",
+    "gt": "fcmp ogt VEC {}, {}",
+    "ge": "fcmp oge VEC {}, {}",
+    "lt": "fcmp olt VEC {}, {}",
+    "le": "fcmp ole VEC {}, {}",
+    "and": "and BOOL {}, {}",
+    "or": "or BOOL {}, {}",
+    "xor": "xor BOOL {}, {}",
+    "not": "xor BOOL {}, ALL[i1 true]",
 }
+_COMPARISONS = {">": "ogt", ">=": "oge"}
 #: Of an array of one number they change nothing.
 _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
 def _number(value: Any) -> str:
-    """A constant in LLVM's language."""
-    return f"0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}"
+    """A constant in LLVM's language, the same for all atoms of a vector."""
+    return f"ALL[double 0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}]"
 
 
 def _written(
-    pair: Callable[..., Sequence[Any]], columns: int, flags: int, margins: bool, types: bool
+    pair: Callable[..., Sequence[Any]], columns: int, flags: int, margins: str | None, types: bool
 ) -> _Written:
-    """The loop over a slot of the atoms of a block, as a function `rows`.
+    """The loop over eight slots of the atoms of a block, as a function `word`.
 
-    It is given how many atoms there are, the constants, and where rows of numbers of the atoms begin: their
-    own columns, the neighbor's columns, types, flags, room for the margin, and the sums.
+    It is given how many atoms there are, the constants, how many atoms lie from one slot to the next, and
+    where rows begin: the atoms' own columns, flags, sums, decisions, types and neighbors of the first slot,
+    nearest margins so far, and the table of all atoms' numbers, one atom after the other.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
     program = jax.make_jaxpr(pair)([number] * columns, [number] * columns, kind, *[truth] * flags)
-    terms = len(program.out_avals) - margins
-    numbers = columns + columns + types
-    rows = numbers + flags + margins + terms
+    terms = len(program.out_avals) - bool(margins)
+    rows = columns + flags + terms + 5
     constants: dict[int, Any] = {}
     lines: list[str] = []
+    names = count()
 
-    def text(value: Any, kind: str = "double") -> str:
+    def text(value: Any, kind: str = "VEC") -> str:
         if isinstance(value, _Value):
             if value.kind != kind:
                 raise _NotKnown("a number where a decision is expected, or the other way round")
             return value.name
-        if np.size(value) != 1 or kind != "double" or jnp.result_type(value) == np.bool_:
+        if np.size(value) != 1 or kind != "VEC" or jnp.result_type(value) == np.bool_:
             raise _NotKnown("an array, or a decision that is the same for all pairs")
         if not isinstance(value, Tracer | jax.Array):
             return _number(value)
         constants.setdefault(id(value), value)
-        return f"%c{list(constants).index(id(value))}"
+        return f"%c{list(constants).index(id(value))}.WIDE"
 
-    def put(line: str, kind: str = "double") -> _Value:
-        lines.append(f"%v{len(lines)} = {line}")
-        return _Value(f"%v{len(lines) - 1}", kind)
+    def put(line: str, kind: str = "VEC") -> _Value:
+        name = f"%v{next(names)}.WIDE"
+        lines.append(f"{name} = {line}")
+        return _Value(name, kind)
 
-    def load(row: int) -> _Value:
-        return put(f"load double, ptr {put(f'getelementptr double, ptr %r{row}, i64 %k').name}{_ACCESS}")
-
-    def store(value: str, row: int) -> None:
-        at = put(f"getelementptr double, ptr %r{row}, i64 %k").name
-        lines.append(f"store double {value}, ptr {at}{_ACCESS}")
+    def load(row: int, kind: str, single: str, at: str = "%k.WIDE") -> _Value:
+        return put(f"load {kind}, ptr {put(f'getelementptr {single}, ptr %r{row}, i64 {at}').name}, align 1")
 
     def rule(equation: Any, inputs: list[Any]) -> Sequence[Any]:
         name, made = equation.primitive.name, equation.outvars[0].aval
@@ -213,79 +214,203 @@ def _written(
             of, which = inputs[0], text(inputs[1])
             chosen = text(of[0])
             for k in range(1, len(of)):
-                other = put(f"fcmp oeq double {which}, {_number(k)}", "i1").name
-                chosen = put(f"select i1 {other}, double {text(of[k])}, double {chosen}").name
+                other = put(f"fcmp oeq VEC {which}, {_number(k)}").name
+                chosen = put(f"select BOOL {other}, VEC {text(of[k])}, VEC {chosen}").name
             return [_Value(chosen)]
         if name == "integer_pow":
             power, base = equation.params["y"], text(inputs[0])
             product = base
             for _ in range(abs(power) - 1):
-                product = put(f"fmul double {product}, {base}").name
-            return [put(f"fdiv double {_number(1)}, {product}") if power < 0 else _Value(product)]
+                product = put(f"fmul VEC {product}, {base}").name
+            return [put(f"fdiv VEC {_number(1)}, {product}") if power < 0 else _Value(product)]
         same = name == "convert_element_type" and made.dtype == equation.invars[0].aval.dtype
         if same or name in _SHAPES:
             return [inputs[0]]
         halves_to_even = name != "round" or equation.params["rounding_method"] == 1
         if name not in _OPERATIONS or not halves_to_even:
             raise _NotKnown(name)
-        kind = "i1" if made.dtype == np.bool_ else "double"
+        kind = "BOOL" if made.dtype == np.bool_ else "VEC"
         decisions = len(inputs) if name in ("and", "or", "xor", "not") else int(name == "select_n")
-        kinds = ["i1"] * decisions + [kind if name == "select_n" else "double"] * (len(inputs) - decisions)
+        kinds = ["BOOL"] * decisions + [kind if name == "select_n" else "VEC"] * (len(inputs) - decisions)
         return [put(_OPERATIONS[name].format(*map(text, inputs, kinds), kind=kind), kind)]
 
-    given = [load(row) for row in range(numbers)]
-    given += [put(f"fcmp une double {load(numbers + k).name}, {_number(0)}", "i1") for k in range(flags)]
-    results = list(map(text, interpreted(program, given, rule)))
+    # once for eight slots: what is summed and kept, by kind of vector and of number, row, and start
+    own = [load(row, "VEC", "double") for row in range(columns)]
+    told = [load(columns + k, "BYTE", "i8").name for k in range(flags)]
+    summed = range(columns + flags, columns + flags + terms)
+    kept = [("VEC", "double", row, load(row, "VEC", "double").name) for row in summed]
     if margins:
-        store(results.pop(), rows - terms - 1)
-    for row, term in enumerate(results, rows - terms):
-        store(put(f"fadd double {load(row).name}, {term}").name, row)
-    starts = [
-        line
-        for k in range(len(constants))
-        for line in (f"%cp{k} = getelementptr double, ptr %c, i64 {k}", f"%c{k} = load double, ptr %cp{k}")
+        kept.append(("VEC", "double", rows - 2, load(rows - 2, "VEC", "double").name))
+        kept.append(("BYTE", "i8", rows - 5, "zeroinitializer"))
+    once, lines = lines, []
+
+    # for each of them
+    given = [*own, *(_Value(f"%other{k}.WIDE") for k in range(columns))]
+    if types:
+        given.append(put(f"uitofp BYTE {load(rows - 4, 'BYTE', 'i8', '%from.WIDE').name} to VEC"))
+    bits = [put(f"and BYTE {byte}, %bit.WIDE").name for byte in told]
+    given += [put(f"icmp ne BYTE {bit}, zeroinitializer", "BOOL") for bit in bits]
+    results = list(map(text, interpreted(program, given, rule)))
+    after = [put(f"fadd VEC %kept{k}.WIDE, {results[k]}").name for k in range(terms)]
+    if margins:
+        margin, nearest, byte = results[-1], f"%kept{terms}.WIDE", f"%kept{terms + 1}.WIDE"
+        size = put(f"call VEC @llvm.fabs.vWIDEf64(VEC {margin})").name
+        # a slot of padding has none
+        nearer = put(f"fcmp olt VEC {size}, {nearest}").name
+        after.append(put(f"select BOOL {nearer}, VEC {size}, VEC {nearest}").name)
+        inside = put(f"fcmp {_COMPARISONS[margins]} VEC {margin}, {_number(0)}").name
+        bit = put(f"select BOOL {inside}, BYTE %bit.WIDE, BYTE zeroinitializer").name
+        after.append(put(f"or BYTE {byte}, {bit}").name)
+    held, ends = [], []
+    for k, ((kind, single, row, first), last) in enumerate(zip(kept, after, strict=True)):
+        held.append(f"%kept{k}.WIDE = phi {kind} [{first}, %begin.WIDE], [{last}, %slot.WIDE]")
+        ends.append(f"%end{k}.WIDE = getelementptr {single}, ptr %r{row}, i64 %k.WIDE")
+        ends.append(f"store {kind} {last}, ptr %end{k}.WIDE, align 1")
+
+    starts = []
+    for k in range(rows):
+        starts += [f"%rp{k} = getelementptr ptr, ptr %r, i64 {k}", f"%r{k} = load ptr, ptr %rp{k}"]
+    for k in range(len(constants)):
+        starts += [f"%cp{k} = getelementptr double, ptr %c, i64 {k}", f"%c{k} = load double, ptr %cp{k}"]
+        starts += [_of_width(_same("double", f"%c{k}", f"%c{k}.WIDE", "VEC"), wide) for wide in (_WIDE, 1)]
+    loops = [
+        _of_width(
+            _LOOP.format(
+                first=first,
+                before=before,
+                end=end,
+                behind=behind,
+                once="\n  ".join(once),
+                held="\n  ".join(held),
+                bit=_same("i8", "%bit.WIDE.k", "%bit.WIDE", "BYTE"),
+                others="\n  ".join(_others(wide, columns, rows)),
+                each="\n  ".join(lines),
+                ends="\n  ".join(ends),
+            ),
+            wide,
+        )
+        for wide, first, before, end, behind in (
+            (_WIDE, "0", "start", "%whole", "turn.1"),
+            (1, "%whole", f"turn.{_WIDE}", "%n", "done"),
+        )
     ]
-    starts += [
-        line
-        for k in range(rows)
-        for line in (f"%rp{k} = getelementptr ptr, ptr %r, i64 {k}", f"%r{k} = load ptr, ptr %rp{k}")
+    declared = [
+        _of_width(f"declare VEC @llvm.{name}.vWIDEf64(VEC)", wide)
+        for name in ("fabs", "sqrt", "rint")
+        for wide in (_WIDE, 1)
     ]
-    loop = _LOOP.format(starts="\n  ".join(starts), body="\n  ".join(lines))
+    source = _FUNCTION.format(
+        starts="\n  ".join(starts), wide=_WIDE, loops="".join(loops), known="\n".join(declared)
+    )
     known = [jnp.asarray(value, jnp.float64).reshape(()) for value in constants.values()]
-    return _Written(loop, jnp.stack(known) if known else jnp.zeros(0), terms)
+    return _Written(source, jnp.stack(known) if known else jnp.zeros(0), terms)
 
 
-_ACCESS = ", !llvm.access.group !0"
-# what is read and written in one turn has nothing to do with another: the loop may be one of vectors
-_LOOP = """
-define i64 @rows(i64 %n, ptr %c, ptr %r) #0 {{
+def _same(single: str, value: str, name: str, kind: str) -> str:
+    """A vector of one value again and again."""
+    return (
+        f"{name}.first = insertelement {kind} poison, {single} {value}, i64 0\n  "
+        f"{name} = shufflevector {kind} {name}.first, {kind} poison, <WIDE x i32> zeroinitializer"
+    )
+
+
+def _of_width(text: str, wide: int) -> str:
+    """Lines for vectors of so many atoms."""
+    text = re.sub(r"ALL\[(.+?)\]", lambda one: "<" + ", ".join([one[1]] * wide) + ">", text)
+    kinds = {"VEC": "double", "BOOL": "i1", "BYTE": "i8"}
+    for name, kind in kinds.items():
+        text = text.replace(name, f"<{wide} x {kind}>")
+    return text.replace("WIDE", str(wide))
+
+
+def _others(wide: int, columns: int, rows: int) -> list[str]:
+    """Numbers of the neighbors in a slot: loaded one neighbor after the other, four at a time, and turned."""
+    parts = -(-columns // 4)
+    lines = [
+        f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",
+        "%index.WIDE = load <WIDE x i32>, ptr %at.WIDE, align 1",
+    ]
+
+    def shuffled(name: str, size: int, a: str, b: str, chosen: Sequence[int]) -> str:
+        which = ", ".join(f"i32 {k}" for k in chosen)
+        kind = f"<{size} x double>"
+        lines.append(f"%{name}.WIDE = shufflevector {kind} {a}, {kind} {b}, <{len(chosen)} x i32> <{which}>")
+        return f"%{name}.WIDE"
+
+    for k in range(wide):
+        lines += [
+            f"%j{k}.WIDE = extractelement <WIDE x i32> %index.WIDE, i64 {k}",
+            f"%far{k}.WIDE = zext i32 %j{k}.WIDE to i64",
+            f"%atom{k}.WIDE = getelementptr [{4 * parts} x double], ptr %r{rows - 1}, i64 %far{k}.WIDE",
+        ]
+    for part in range(parts):
+        for k in range(wide):
+            at = f"%of{part}_{k}.WIDE"
+            lines.append(f"{at}p = getelementptr double, ptr %atom{k}.WIDE, i64 {4 * part}")
+            lines.append(f"{at} = load <4 x double>, ptr {at}p, align 32")
+        loaded = [f"%of{part}_{k}.WIDE" for k in range(wide)]
+        here = range(4 * part, min(columns, 4 * part + 4))
+        if wide == 1:
+            for row in here:
+                shuffled(f"other{row}", 4, loaded[0], "poison", [row - 4 * part])
+            continue
+        # x y z w of the atoms k and k + 4; x x z z and y y w w of two and two; then of all eight
+        pair = [shuffled(f"pair{part}_{k}", 4, loaded[k], loaded[k + 4], range(8)) for k in range(4)]
+        for odd in range(min(2, len(here))):
+            two = [odd + k for k in (0, 8, 2, 10, 4, 12, 6, 14)]
+            low = shuffled(f"low{part}_{odd}", 8, pair[0], pair[1], two)
+            high = shuffled(f"high{part}_{odd}", 8, pair[2], pair[3], two)
+            for row in range(4 * part + odd, here.stop, 2):
+                shift = row - 4 * part - odd
+                shuffled(f"other{row}", 8, low, high, [shift + k for k in (0, 1, 8, 9, 4, 5, 12, 13)])
+    return lines
+
+
+_FUNCTION = """
+define i64 @word(i64 %n, ptr %c, ptr %r, i64 %atoms) #0 {{
 start:
   {starts}
-  br label %turn
-turn:
-  %k = phi i64 [0, %start], [%next, %turn]
-  {body}
-  %next = add nuw nsw i64 %k, 1
-  %more = icmp slt i64 %next, %n
-  br i1 %more, label %turn, label %end, !llvm.loop !1
-end:
+  %whole = and i64 %n, -{wide}
+  br label %turn.{wide}
+{loops}
+done:
   ret i64 0
 }}
-declare double @llvm.fabs.f64(double)
-declare double @llvm.sqrt.f64(double)
-declare double @llvm.rint.f64(double)
+{known}
 attributes #0 = {{ "prefer-vector-width"="512" }}
-!0 = distinct !{{}}
-!1 = distinct !{{!1, !2, !3}}
-!2 = !{{!"llvm.loop.parallel_accesses", !0}}
-!3 = !{{!"llvm.loop.vectorize.enable", i1 true}}
+"""
+_LOOP = """
+turn.WIDE:
+  %k.WIDE = phi i64 [{first}, %{before}], [%next.WIDE, %end.WIDE]
+  %more.WIDE = icmp slt i64 %k.WIDE, {end}
+  br i1 %more.WIDE, label %begin.WIDE, label %{behind}
+begin.WIDE:
+  {once}
+  br label %slot.WIDE
+slot.WIDE:
+  %slot.WIDE.k = phi i64 [0, %begin.WIDE], [%later.WIDE, %slot.WIDE]
+  {held}
+  %shift.WIDE = trunc i64 %slot.WIDE.k to i8
+  %bit.WIDE.k = shl i8 1, %shift.WIDE
+  {bit}
+  %row.WIDE = mul i64 %slot.WIDE.k, %atoms
+  %from.WIDE = add i64 %row.WIDE, %k.WIDE
+  {others}
+  {each}
+  %later.WIDE = add nuw nsw i64 %slot.WIDE.k, 1
+  %again.WIDE = icmp ult i64 %later.WIDE, 8
+  br i1 %again.WIDE, label %slot.WIDE, label %end.WIDE
+end.WIDE:
+  {ends}
+  %next.WIDE = add nuw nsw i64 %k.WIDE, WIDE
+  br label %turn.WIDE
 """
 # what XLA calls: the loop over the list, which calls the one above
 _CALLED = """
 define i64 @called(i64 %frame) {{
   %loop = inttoptr i64 {loop} to ptr
-  %rows = ptrtoint ptr @rows to i64
-  %done = call i64 %loop(i64 %frame, i64 %rows, i64 {task})
+  %word = ptrtoint ptr @word to i64
+  %done = call i64 %loop(i64 %frame, i64 %word, i64 {task})
   ret i64 %done
 }}
 """
@@ -384,11 +509,15 @@ def _filled(out_at, n, value):
 
 
 @numba.njit(cache=True, nogil=True)
-def _copied(values_at, out_at, n):
-    values = _carray(_pointer(values_at), (n,), np.float64)
-    out = _carray(_pointer(out_at), (n,), np.float64)
-    for k in range(n):
-        out[k] = values[k]
+def _interleaved(columns_at, columns, atoms, table_at, apart):
+    """Numbers of one atom after the other, and those of an atom behind the last, which padding names."""
+    of = _carray(_pointer(columns_at), (columns * atoms,), np.float64)
+    table = _carray(_pointer(table_at), ((atoms + 1) * apart,), np.float64)
+    for k in range(atoms):
+        for row in range(columns):
+            table[k * apart + row] = of[row * atoms + k]
+    for row in range(apart):
+        table[atoms * apart + row] = np.nan
 
 
 @numba.njit(cache=True, nogil=True)
@@ -400,48 +529,10 @@ def _least(values_at, n):
     return least
 
 
-@numba.njit(cache=True, nogil=True)
-def _gathered(index_at, column_at, out_at, n):
-    index = _carray(_pointer(index_at), (n,), np.int32)
-    column = _carray(_pointer(column_at), (n,), np.float64)
-    out = _carray(_pointer(out_at), (n,), np.float64)
-    for k in range(n):
-        out[k] = column[index[k]]
-
-
-@numba.njit(cache=True, nogil=True)
-def _unpacked(bytes_at, shift, mask, out_at, n):
-    values = _carray(_pointer(bytes_at), (n,), np.uint8)
-    out = _carray(_pointer(out_at), (n,), np.float64)
-    for k in range(n):
-        out[k] = (values[k] >> np.uint8(shift)) & np.uint8(mask)
-
-
-@numba.njit(cache=True, nogil=True)
-def _packed(margin_at, equal, shift, bytes_at, n):
-    margin = _carray(_pointer(margin_at), (n,), np.float64)
-    values = _carray(_pointer(bytes_at), (n,), np.uint8)
-    if equal:
-        for k in range(n):
-            values[k] |= np.uint8(margin[k] >= 0) << np.uint8(shift)
-    else:
-        for k in range(n):
-            values[k] |= np.uint8(margin[k] > 0) << np.uint8(shift)
-
-
-@numba.njit(cache=True, nogil=True)
-def _nearer(margin_at, nearest_at, n):
-    margin = _carray(_pointer(margin_at), (n,), np.float64)
-    nearest = _carray(_pointer(nearest_at), (n,), np.float64)
-    for k in range(n):
-        size = abs(margin[k])
-        nearest[k] = size if size < nearest[k] else nearest[k]
-
-
 # A call is a job: 64-bit words that outlive it, since a thread may look for work when none is left. How many
-# use it, the next block, blocks done and blocks; addresses of frame, loop over a slot, and padded columns;
-# threads that there are, and arguments to XLA; then the nearest margin of each block, and the columns.
-_USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _ROWS, _PADDED, _THREADS, _ASKED, _NEAREST = (*range(9), 16)
+# use it, the next block, blocks done and blocks; addresses of frame, loop over a word of slots, and table;
+# threads that there are, and arguments to XLA; then the nearest margin of each block, and the table.
+_USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST = (*range(9), 16)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -457,48 +548,32 @@ def _work(job):
     own, columns, _ = _buffer(operands, 1)
     told, flags, _ = _buffer(operands, 2)
     constants, _, _ = _buffer(operands, 3)
-    at, _, _ = _buffer(operands, 4)
-    equal = _words(at)[0]
-    types_of, typed, _ = _buffer(operands, 5)
-    typed = min(typed, 1)
+    types_of, _, _ = _buffer(operands, 4)
     sums, terms, _ = _buffer(results, 0)
-    bits, margins, _ = _buffer(results, 1)
-    margins = min(margins, 1)
+    bits, _, _ = _buffer(results, 1)
 
-    # addresses of the rows that the loop over a slot is given, then those rows that are a thread's own
-    copied = columns + typed + flags + margins
-    room = _malloc(8 * (columns + copied + terms + (copied + 1) * _BLOCK))
-    near = room + 8 * (columns + copied + terms)
-    margin, closest = near + 8 * (copied - 1) * _BLOCK, near + 8 * copied * _BLOCK
-    rows = _carray(_pointer(room), (columns + copied + terms,), np.int64)
-    for row in range(copied):
-        rows[columns + row] = near + 8 * row * _BLOCK
+    # where the rows begin that the loop over a word is given, and the nearest margins
+    named = columns + flags + terms + 5
+    room = _malloc(8 * (named + _BLOCK))
+    rows = _carray(_pointer(room), (named,), np.int64)
+    closest = room + 8 * named
+    rows[named - 2], rows[named - 1] = closest, words[_TABLE]
     while block < blocks:
         start = block * _BLOCK
         n = min(_BLOCK, atoms - start)
         for row in range(columns):
             rows[row] = own + 8 * (row * atoms + start)
         for row in range(terms):
-            rows[columns + copied + row] = sums + 8 * (row * atoms + start)
+            rows[columns + flags + row] = sums + 8 * (row * atoms + start)
             _filled(sums + 8 * (row * atoms + start), n, 0.0)
         _filled(closest, n, np.inf)
-        for slot in range(slots):
-            word, shift = slot // 8, slot % 8
-            out = near
-            for row in range(columns):
-                padded = words[_PADDED] + 8 * row * (atoms + 1)
-                _gathered(index + 4 * (slot * atoms + start), padded, out, n)
-                out += 8 * _BLOCK
-            if typed:
-                _unpacked(types_of + slot * atoms + start, 0, 255, out, n)
-                out += 8 * _BLOCK
+        for word in range(slots // 8):
             for flag in range(flags):
-                _unpacked(told + (flag * (slots // 8) + word) * atoms + start, shift, 1, out, n)
-                out += 8 * _BLOCK
-            _call(words[_ROWS], (n, constants, room))
-            if margins:
-                _packed(margin, equal, shift, bits + word * atoms + start, n)
-                _nearer(margin, closest, n)
+                rows[columns + flag] = told + (flag * (slots // 8) + word) * atoms + start
+            rows[named - 5] = bits + word * atoms + start
+            rows[named - 4] = types_of + 8 * word * atoms + start
+            rows[named - 3] = index + 4 * (8 * word * atoms + start)
+            _call(words[_WORD], (n, constants, room, atoms))
         _filled(job + 8 * (_NEAREST + block), 1, _least(closest, n))
         _added(job + 8 * _DONE, 1)
         block = _added(job + 8 * _NEXT, 1)
@@ -536,11 +611,11 @@ def _helped(job, frame, helpers, task):
             return
 
 
-def _over_blocks(frame, rows, task):
+def _over_blocks(frame, word, task):
     """Every block of atoms, as `over_pairs` asks for it; 0 for no error.
 
     Args:
-        frame: address of XLA's frame of the call. rows: address of the loop over a slot. task: of `_help`.
+        frame: address of XLA's frame of the call. word, task: of the loop over a word, and of `_help`.
     """
     words = _words(frame)
     if words[1] != 0 and _words(words[1])[1] & 0xFFFFFFFF == 1:
@@ -551,21 +626,16 @@ def _over_blocks(frame, rows, task):
         # one of the stages before execution
         return 0
     own, columns, atoms = _buffer(_words(words[9]), 1)
-    bits, margins, _ = _buffer(_words(words[14]), 1)
     nearest, _, _ = _buffer(_words(words[14]), 2)
     blocks = -(-atoms // _BLOCK)
-    job = _malloc(8 * (_NEAREST + blocks + columns * (atoms + 1)))
+    apart = 4 * -(-columns // 4)
+    job = _malloc(8 * (_NEAREST + blocks + (atoms + 1) * apart) + 64)
     mine = _words(job)
     mine[_USERS], mine[_NEXT], mine[_DONE], mine[_BLOCKS] = 1, 0, 0, blocks
-    mine[_FRAME], mine[_ROWS], mine[_PADDED] = frame, rows, job + 8 * (_NEAREST + blocks)
-    for row in range(columns):
-        out = mine[_PADDED] + 8 * row * (atoms + 1)
-        _copied(own + 8 * row * atoms, out, atoms)
-        # padding names an atom behind the last
-        _filled(out + 8 * atoms, 1, np.nan)
-    cleared = _carray(_pointer(bits), (margins * atoms,), np.uint8)
-    for k in range(margins * atoms):
-        cleared[k] = 0
+    mine[_FRAME], mine[_WORD] = frame, word
+    # whole lines of the cache
+    mine[_TABLE] = (job + 8 * (_NEAREST + blocks) + 63) // 64 * 64
+    _interleaved(own, columns, atoms, mine[_TABLE], apart)
     if blocks > 1:
         _helped(job, words, blocks - 1, task)
     _work(job)
