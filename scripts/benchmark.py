@@ -98,7 +98,7 @@ def mdnum_loop(simulation: Simulation, record: bool) -> Callable[[int], Turn]:
     def run(steps: int) -> Turn:
         recorder = PairRecorder(simulation)
         watch, counted = None, 0
-        for segment in Engine(simulation, steps, record=record).segments():
+        for segment in Engine(simulation, steps, record=record, rows=False).segments():
             if record:
                 recorder.counts(segment)
                 recorder.flips(segment)

@@ -7,20 +7,23 @@ the ledger all compute them through this file, with the same bits.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cache, cached_property
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numba
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
+from mdnum.md.foreign import asked_to_run, buffer, carray, known, pointer, words_at
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
+from mdnum.numerics.events import lowest_bit
 from mdnum.numerics.exact import squared_norm
 from mdnum.numerics.rounding import unit_roundoff
 
@@ -96,6 +99,12 @@ class PairDecider:
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
+    @property
+    def grows(self) -> bool:
+        """Whether bounds may grow with the positions."""
+        narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))
+        return narrows and len(self.reach.lattice) < 3
+
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
         """`bounds` at each of some states: they grow where atoms have left the reach along a free axis.
 
@@ -106,8 +115,7 @@ class PairDecider:
             x: wrapped positions of each state, in the dtype of the state, length.
         """
         bounds = np.tile(np.array(self.bounds), (len(x), 1))
-        narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))
-        if narrows and len(self.reach.lattice) < 3 and x.size:
+        if self.grows and x.size:
             seen = np.maximum(x.max(axis=2), -x.min(axis=2)).astype(np.float64)
             left = (seen > self.reach.coordinate).any(axis=1)
             if left.any():
@@ -274,3 +282,149 @@ class SlotJudge:
 def displacements(components, cell: Cell, j):
     """Nearest images of x_j - x_i, per component; indices of padding are clamped into range by XLA."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
+
+
+# --- what changed from one pass to the next ---------------------------------------------------------------
+
+
+class Changes(NamedTuple):
+    """Decisions that changed, step after step, each seen from the atom that is sorted first.
+
+    Attributes:
+        pairs: row, sorted atoms and whether inside now, shape (room, 4).
+        ends: positions of both atoms, then velocities, shape (room, 12).
+        count: of changes seen so, and seen from both ends; more of them than room are not noted, shape (2,).
+    """
+
+    pairs: Int[Array, "room 4"]
+    ends: Float[Array, "room 12"]
+    count: Int[Array, "2"]
+
+    @classmethod
+    def empty(cls, room: int, dtype: np.dtype) -> Changes:
+        """Room for so many."""
+        return cls(jnp.zeros((room, 4), jnp.int32), jnp.zeros((room, 12), dtype), jnp.zeros(2, jnp.int64))
+
+    def emptied(self) -> Changes:
+        """The same room without any."""
+        return self._replace(count=jnp.zeros_like(self.count))
+
+    def noted(
+        self,
+        before: UInt8[Array, "words atoms"],
+        bits: UInt8[Array, "words atoms"],
+        tables: Tables,
+        x: Float[Array, "3 atoms"],
+        v: Float[Array, "3 atoms"],
+        row: Int[Array, ""],
+        most: int,
+    ) -> Changes:
+        """These, and what has changed since the decisions before.
+
+        Args:
+            most: how many may come at a time on a device other than a CPU, where each step takes the same
+                time however many they are. Where more come, `count` is beyond the room.
+        """
+        if known() and x.dtype == np.float64:
+            return self._noted_by_host(before, bits, tables, x, v, row)
+        atoms = x.shape[1]
+        changed = before ^ bits
+        slot = jnp.arange(8, dtype=jnp.uint8)[None, :, None]
+        each = ((changed[:, None] >> slot) & jnp.uint8(1) == 1) & (jnp.arange(atoms) < tables.index)
+        both = jnp.sum(jnp.bitwise_count(changed), dtype=jnp.int64)
+        found = jnp.sum(each, dtype=jnp.int64)
+        (at,) = jnp.nonzero(each.reshape(-1), size=most, fill_value=0)
+        word, k, first = jnp.unravel_index(at, each.shape)
+        second = tables.index[word, k, first]
+        inside = (bits[word, first] >> k.astype(jnp.uint8)) & jnp.uint8(1)
+        pairs = jnp.stack([jnp.broadcast_to(row, at.shape), first, second, inside], axis=1)
+        ends = jnp.concatenate([x[:, first], x[:, second], v[:, first], v[:, second]]).T
+        start = (self.count[0], jnp.zeros((), jnp.int64))
+        count = self.count + jnp.stack([jnp.where(found > most, len(self.pairs) + found, found), both])
+        return Changes(
+            lax.dynamic_update_slice(self.pairs, pairs.astype(jnp.int32), start),
+            lax.dynamic_update_slice(self.ends, ends.astype(self.ends.dtype), start),
+            count,
+        )
+
+    def _noted_by_host(self, before, bits, tables: Tables, x, v, row) -> Changes:
+        shapes = [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in self]
+        call = jax.ffi.ffi_call(_noting(), shapes, input_output_aliases={0: 0, 1: 1, 2: 2})
+        index = tables.index.astype(jnp.int32)
+        return Changes(*call(*self, before, bits, index, x, v, row.astype(jnp.int64)))
+
+
+@cache
+def _noting() -> str:
+    """The name by which XLA knows `_note`."""
+    made = numba.cfunc(numba.types.intp(numba.types.intp), cache=True)(_note)
+    _ALIVE.append(made)
+    name = "mdnum_changes"
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(made.ctypes), platform="cpu")
+    return name
+
+
+#: What XLA calls must outlive every program.
+_ALIVE: list[Any] = []
+
+
+def _note(frame):
+    """`Changes.noted`; 0 for no error."""
+    if asked_to_run(frame):
+        _compare(frame)
+    return 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _compare(frame):
+    operands, results = words_at(words_at(frame)[9]), words_at(words_at(frame)[14])
+    pairs_at, room, _ = buffer(results, 0)
+    ends_at, _, _ = buffer(results, 1)
+    count_at, _, _ = buffer(results, 2)
+    before_at, words, atoms = buffer(operands, 3)
+    bits_at, _, _ = buffer(operands, 4)
+    index_at, _, _ = buffer(operands, 5)
+    x_at, _, _ = buffer(operands, 6)
+    v_at, _, _ = buffer(operands, 7)
+    row_at, _, _ = buffer(operands, 8)
+    pairs = carray(pointer(pairs_at), (room, 4), np.int32)
+    ends = carray(pointer(ends_at), (room, 12), np.float64)
+    count = words_at(count_at)
+    size = words * atoms
+    before = carray(pointer(before_at), (size // 8,), np.uint64)
+    bits = carray(pointer(bits_at), (size // 8,), np.uint64)
+    index = carray(pointer(index_at), (8 * size,), np.int32)
+    x = carray(pointer(x_at), (3, atoms), np.float64)
+    v = carray(pointer(v_at), (3, atoms), np.float64)
+    row = words_at(row_at)[0]
+    begun, both = count[0], count[1]
+    found = begun
+    # what is left of eight bytes at the end
+    ahead, last = np.zeros(1, np.uint64), np.zeros(1, np.uint64)
+    for k in range(size // 8 * 8, size):
+        ahead[0] |= np.uint64(carray(pointer(before_at), (size,), np.uint8)[k]) << np.uint64(8 * (k % 8))
+        last[0] |= np.uint64(carray(pointer(bits_at), (size,), np.uint8)[k]) << np.uint64(8 * (k % 8))
+    word, begin = 0, 0
+    for chunk in range(-(-size // 8)):
+        now = bits[chunk] if chunk < size // 8 else last[0]
+        changed = now ^ (before[chunk] if chunk < size // 8 else ahead[0])
+        while changed:
+            bit = lowest_bit(changed)
+            changed &= changed - np.uint64(1)
+            place = 8 * chunk + (bit >> 3)
+            while place >= begin + atoms:
+                word, begin = word + 1, begin + atoms
+            first = place - begin
+            second = index[(8 * word + (bit & 7)) * atoms + first]
+            # written always and kept where it is seen from its first end, which half of them are
+            at = min(found, room - 1)
+            pairs[at, 0], pairs[at, 1], pairs[at, 2] = row, first, second
+            pairs[at, 3] = (now >> np.uint64(bit)) & np.uint64(1)
+            found += np.int64(second > first)
+            both += 1
+    for at in range(min(begun, room), min(found, room)):
+        first, second = pairs[at, 1], pairs[at, 2]
+        for axis in range(3):
+            ends[at, axis], ends[at, 3 + axis] = x[axis, first], x[axis, second]
+            ends[at, 6 + axis], ends[at, 9 + axis] = v[axis, first], v[axis, second]
+    count[0], count[1] = found, both

@@ -16,7 +16,6 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import count
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -26,16 +25,12 @@ import numba
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, UInt8
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from mdnum.md.decide import Decisions, Tables
+from mdnum.md.foreign import added, asked_to_run, buffer, call, carray, free, malloc, pointer, words_at
 from mdnum.numerics.exact import bound, interpreted
 
-# of the foreign-function interface, whose layout in memory the loop relies on
-_VERSION = (0, 3)
 # atoms of a block, which is what a thread takes at a time; full vectors
 _BLOCK = 2048
 # atoms of a vector; a processor with shorter ones takes several
@@ -96,16 +91,6 @@ def over_pairs(
     kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)
     sums, decided, nearest = call(index, columns, bits, written.constants, kinds)
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
-
-
-@cache
-def known() -> bool:
-    """Whether XLA's interface is the one that the loop was written for, and programs run on a CPU."""
-    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    text = header.read_text() if header.exists() else ""
-    found = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
-    version = tuple(int(one[1]) for one in found if one)
-    return version == _VERSION and jax.default_backend() == "cpu" and np.intp().itemsize == 8
 
 
 # --- the function of a pair, written down ----------------------------------------------------------------
@@ -442,68 +427,12 @@ _ALIVE: list[Any] = []
 # --- the loop over a list, which calls the other ----------------------------------------------------------
 
 
-_carray: Any = numba.carray  # pyright: ignore
-_intrinsic: Any = intrinsic
-
-
-@_intrinsic
-def _pointer(typingctx: Any, address: Any) -> Any:
-    """A number as the address of memory."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
-
-    return types.voidptr(types.intp), generate
-
-
-@_intrinsic
-def _call(typingctx: Any, address: Any, arguments: Any) -> Any:
-    """What a C function at an address makes of a tuple of 64-bit arguments."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        whole = context.get_value_type(types.intp)
-        kind = ir.FunctionType(whole, [whole] * arguments.count)
-        given = cgutils.unpack_tuple(builder, args[1])
-        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
-
-    return types.intp(types.intp, arguments), generate
-
-
-@_intrinsic
-def _added(typingctx: Any, address: Any, amount: Any) -> Any:
-    """Add to the 64-bit number at an address, in one step for all threads; the number before."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        at = builder.inttoptr(args[0], context.get_value_type(types.intp).as_pointer())
-        return builder.atomic_rmw("add", at, args[1], "seq_cst")
-
-    return types.intp(types.intp, types.intp), generate
-
-
-_malloc = types.ExternalFunction("malloc", types.intp(types.intp))
-_free = types.ExternalFunction("free", types.void(types.intp))
-
-
-@numba.njit(cache=True, nogil=True)
-def _words(address):
-    """Memory as 64-bit words, as many as a frame has or fewer."""
-    return _carray(_pointer(address), (32,), np.int64)
-
-
-@numba.njit(cache=True, nogil=True)
-def _buffer(buffers, k):
-    """Where the data of a frame's k-th operand or result begin, and its first two dimensions."""
-    words = _words(buffers[k])
-    size = _words(words[5])
-    return words[3], size[0], size[1]
-
-
 # Loops over n numbers at given addresses: each a function of its own, so that it becomes one of vectors.
 
 
 @numba.njit(cache=True, nogil=True)
 def _filled(out_at, n, value):
-    out = _carray(_pointer(out_at), (n,), np.float64)
+    out = carray(pointer(out_at), (n,), np.float64)
     for k in range(n):
         out[k] = value
 
@@ -511,8 +440,8 @@ def _filled(out_at, n, value):
 @numba.njit(cache=True, nogil=True)
 def _interleaved(columns_at, columns, atoms, table_at, apart):
     """Numbers of one atom after the other, and those of an atom behind the last, which padding names."""
-    of = _carray(_pointer(columns_at), (columns * atoms,), np.float64)
-    table = _carray(_pointer(table_at), ((atoms + 1) * apart,), np.float64)
+    of = carray(pointer(columns_at), (columns * atoms,), np.float64)
+    table = carray(pointer(table_at), ((atoms + 1) * apart,), np.float64)
     for k in range(atoms):
         for row in range(columns):
             table[k * apart + row] = of[row * atoms + k]
@@ -522,7 +451,7 @@ def _interleaved(columns_at, columns, atoms, table_at, apart):
 
 @numba.njit(cache=True, nogil=True)
 def _least(values_at, n):
-    values = _carray(_pointer(values_at), (n,), np.float64)
+    values = carray(pointer(values_at), (n,), np.float64)
     least = np.inf
     for k in range(n):
         least = min(least, values[k])
@@ -538,24 +467,24 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 @numba.njit(cache=True, nogil=True)
 def _work(job):
     """Take one block of a job after the other, until none is left."""
-    words = _words(job)
-    block, blocks = _added(job + 8 * _NEXT, 1), words[_BLOCKS]
+    words = words_at(job)
+    block, blocks = added(job + 8 * _NEXT, 1), words[_BLOCKS]
     if block >= blocks:
         return
-    frame = _words(words[_FRAME])
-    operands, results = _words(frame[9]), _words(frame[14])
-    index, slots, atoms = _buffer(operands, 0)
-    own, columns, _ = _buffer(operands, 1)
-    told, flags, _ = _buffer(operands, 2)
-    constants, _, _ = _buffer(operands, 3)
-    types_of, _, _ = _buffer(operands, 4)
-    sums, terms, _ = _buffer(results, 0)
-    bits, _, _ = _buffer(results, 1)
+    frame = words_at(words[_FRAME])
+    operands, results = words_at(frame[9]), words_at(frame[14])
+    index, slots, atoms = buffer(operands, 0)
+    own, columns, _ = buffer(operands, 1)
+    told, flags, _ = buffer(operands, 2)
+    constants, _, _ = buffer(operands, 3)
+    types_of, _, _ = buffer(operands, 4)
+    sums, terms, _ = buffer(results, 0)
+    bits, _, _ = buffer(results, 1)
 
     # where the rows begin that the loop over a word is given, and the nearest margins
     named = columns + flags + terms + 5
-    room = _malloc(8 * (named + _BLOCK))
-    rows = _carray(_pointer(room), (named,), np.int64)
+    room = malloc(8 * (named + _BLOCK))
+    rows = carray(pointer(room), (named,), np.int64)
     closest = room + 8 * named
     rows[named - 2], rows[named - 1] = closest, words[_TABLE]
     while block < blocks:
@@ -573,18 +502,18 @@ def _work(job):
             rows[named - 5] = bits + word * atoms + start
             rows[named - 4] = types_of + 8 * word * atoms + start
             rows[named - 3] = index + 4 * (8 * word * atoms + start)
-            _call(words[_WORD], (n, constants, room, atoms))
+            call(words[_WORD], (n, constants, room, atoms))
         _filled(job + 8 * (_NEAREST + block), 1, _least(closest, n))
-        _added(job + 8 * _DONE, 1)
-        block = _added(job + 8 * _NEXT, 1)
-    _free(room)
+        added(job + 8 * _DONE, 1)
+        block = added(job + 8 * _NEXT, 1)
+    free(room)
 
 
 @numba.njit(cache=True, nogil=True)
 def _leave(job):
     """The last one to use a job clears it away."""
-    if _added(job + 8 * _USERS, -1) == 1:
-        _free(job)
+    if added(job + 8 * _USERS, -1) == 1:
+        free(job)
 
 
 def _help(job):
@@ -597,17 +526,17 @@ def _help(job):
 @numba.njit(cache=True, nogil=True)
 def _helped(job, frame, helpers, task):
     """Ask XLA's threads for help; without any the work is done all the same."""
-    words, api = _words(job), _words(frame[2])
+    words, api = words_at(job), words_at(frame[2])
     schedule, ask, asked = api[17], api[18], job + 8 * _ASKED
     words[_ASKED], words[_ASKED + 1], words[_ASKED + 2] = 32, 0, frame[3]
     words[_ASKED + 3] = job + 8 * _THREADS
-    if _call(ask, (asked,)) != 0:
+    if call(ask, (asked,)) != 0:
         return
     words[_ASKED], words[_ASKED + 3], words[_ASKED + 4] = 40, task, job
     for _ in range(min(helpers, words[_THREADS] - 1)):
-        _added(job + 8 * _USERS, 1)
-        if _call(schedule, (asked,)) != 0:
-            _added(job + 8 * _USERS, -1)
+        added(job + 8 * _USERS, 1)
+        if call(schedule, (asked,)) != 0:
+            added(job + 8 * _USERS, -1)
             return
 
 
@@ -617,20 +546,15 @@ def _over_blocks(frame, word, task):
     Args:
         frame: address of XLA's frame of the call. word, task: of the loop over a word, and of `_help`.
     """
-    words = _words(frame)
-    if words[1] != 0 and _words(words[1])[1] & 0xFFFFFFFF == 1:
-        # a question: for which version of the interface was this written?
-        _words(_words(words[1])[3])[3] = _VERSION[0] | (_VERSION[1] << 32)
+    if not asked_to_run(frame):
         return 0
-    if words[4] & 0xFFFFFFFF != 3:
-        # one of the stages before execution
-        return 0
-    own, columns, atoms = _buffer(_words(words[9]), 1)
-    nearest, _, _ = _buffer(_words(words[14]), 2)
+    words = words_at(frame)
+    own, columns, atoms = buffer(words_at(words[9]), 1)
+    nearest, _, _ = buffer(words_at(words[14]), 2)
     blocks = -(-atoms // _BLOCK)
     apart = 4 * -(-columns // 4)
-    job = _malloc(8 * (_NEAREST + blocks + (atoms + 1) * apart) + 64)
-    mine = _words(job)
+    job = malloc(8 * (_NEAREST + blocks + (atoms + 1) * apart) + 64)
+    mine = words_at(job)
     mine[_USERS], mine[_NEXT], mine[_DONE], mine[_BLOCKS] = 1, 0, 0, blocks
     mine[_FRAME], mine[_WORD] = frame, word
     # whole lines of the cache
@@ -639,7 +563,7 @@ def _over_blocks(frame, word, task):
     if blocks > 1:
         _helped(job, words, blocks - 1, task)
     _work(job)
-    while _added(job + 8 * _DONE, 0) < blocks:
+    while added(job + 8 * _DONE, 0) < blocks:
         pass
     _filled(nearest, 1, _least(job + 8 * _NEAREST, blocks))
     _leave(job)

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real, UInt8
 
-from mdnum.md import kernel
+from mdnum.md import foreign, kernel
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import (
@@ -167,7 +167,7 @@ class PairForce(eqx.Module):
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES
-        return wide and few and self.reduction == Sequential() and kernel.known()
+        return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self) -> Callable[..., tuple[Float[Array, "..."], ...]]:
         """What a pair adds to force, energy and virial, from its displacement, square and decision."""

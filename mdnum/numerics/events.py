@@ -189,6 +189,12 @@ _ONLY_BIT[[(0x03F79D71B4CB0A89 << bit & 2**64 - 1) >> 58 for bit in range(64)]] 
 
 
 @numba.njit(cache=True, nogil=True)
+def lowest_bit(word):
+    """Which is the lowest bit of 64 that is set."""
+    return _ONLY_BIT[((word ^ (word & (word - np.uint64(1)))) * _FACTOR) >> np.uint64(58)]
+
+
+@numba.njit(cache=True, nogil=True)
 def _scan(before, rows, columns, row, slot, column, values):
     """Note the bits that change from row to row; returns their number, of which those that fit are noted."""
     at, room = 0, row.shape[0]
@@ -199,9 +205,8 @@ def _scan(before, rows, columns, row, slot, column, values):
             now = rows[r, w]
             changed = now ^ (rows[r - 1, w] if r else before[w])
             while changed:
-                rest = changed & (changed - np.uint64(1))
-                bit = _ONLY_BIT[((changed ^ rest) * _FACTOR) >> np.uint64(58)]
-                changed = rest
+                bit = lowest_bit(changed)
+                changed &= changed - np.uint64(1)
                 if at < room:
                     place = 8 * w + (bit >> 3)
                     while place >= end:

@@ -7,15 +7,18 @@ its successor has been started.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
+from mdnum.md.decide import Tables
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -33,6 +36,8 @@ _RECORD_BYTES = 64 * 2**20
 _MOST_ROWS = 128
 # a record this small has its rows whatever it is for: each number of rows is another program
 _SMALL_BYTES = 4 * 2**20
+# of a change of a decision with both atoms' positions and velocities
+_CHANGE_BYTES = 16 + 12 * 8
 
 
 # how a rollout ends that should not have
@@ -58,6 +63,9 @@ class Segment:
         moved: largest displacement since the list was built, at that step, length.
         state: where the rollout goes on.
         reference: wrapped positions at which the list was built, shape (atoms, 3).
+        start: where the rollout stood before.
+        held: decisions at the last row that was made, shape (words, atoms); None with rows.
+        again: the record with rows, made anew where it was made without.
     """
 
     first: int
@@ -73,6 +81,9 @@ class Segment:
     moved: float
     state: EpochState
     reference: Float[np.ndarray, "atoms 3"]
+    start: EpochState
+    held: UInt8[np.ndarray, "words atoms"] | None
+    again: Callable[[], EpochRecord]
 
     @property
     def last(self) -> int:
@@ -80,12 +91,17 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """The filled rows of a column of the record."""
-        return np.asarray(getattr(self.record, name))[: self.rows]
+        """The filled rows of a column of the record; where it has none, the steps are made once more."""
+        lacks = self.record.changes is not None and name in ("x", "v", "images", "bits")
+        return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     def unsorted(self, name: str, row: int) -> np.ndarray:
         """A row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
-        sorted_row = np.asarray(getattr(self.record, name))[row]
+        if name == "x" and row == 0:
+            return np.asarray(self.start.x).T
+        if name == "x" and self.first + row + 1 == int(self.state.step):
+            return np.asarray(self.state.x_before).T
+        sorted_row = self.rows_of(name)[row]
         out = np.empty((sorted_row.shape[1], 3), sorted_row.dtype)
         out[self.table.order] = sorted_row.T
         return out
@@ -160,6 +176,14 @@ def room_for(rows: int, per_row: int) -> int:
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
 
+class _Listed(NamedTuple):
+    """A list on the host and on the device, and the positions it was built at, shape (3, atoms)."""
+
+    table: PairTable
+    tables: Tables
+    home: Float[Array, "3 atoms"]
+
+
 class Engine:
     """Runs a simulation from a start to a last step.
 
@@ -169,6 +193,9 @@ class Engine:
         start: where to begin; default the system's own start.
         record: whether decisions and positions leave the loop. Energies do in any case, and trajectories
             have the same bits either way.
+        rows: whether they are kept for every step. Without, only changes of decisions leave the loop, in
+            double precision a tenth of the memory, and `Segment.rows_of` makes the steps of a segment once
+            more where somebody asks.
         pins: decisions to act on instead of the run's own. The record holds its own all the same.
     """
 
@@ -179,11 +206,13 @@ class Engine:
         *,
         start: Start | None = None,
         record: bool = True,
+        rows: bool = True,
         pins: Pins | None = None,
     ):
         self.simulation = simulation
         self.last = last
         self.record = record
+        self.rows = rows or not record
         self.pins = pins
         self.start = start or first_state(simulation)
         self.verlet: VerletList = simulation.verlet_list()
@@ -199,26 +228,35 @@ class Engine:
             rule.delay,
             rule.check,
             record,
+            self.rows,
         )
+        # a liquid has one change for ten atoms a step; where there are more, room is doubled
+        self._room_for_changes(0 if self.rows else max(64, simulation.atoms // 4))
+        self._records: list[EpochRecord | None] = [None, None]
+
+    def _room_for_changes(self, most: int) -> None:
+        self.program = replace(self.program, most=most)
         leaves, self.structure = jax.tree.flatten(self.program)
         self.leaves = tuple(leaves)
-        self._records: list[EpochRecord | None] = [None, None]
 
     def _room(self, words: int) -> int:
         """Rows of a record: a power of two within the memory allowed."""
-        per_row = self.simulation.atoms * (2 * 24 + 12 + words) if self.record else 64
+        kept = self.record and self.rows
+        per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         rows = max(2, min(_MOST_ROWS, _RECORD_BYTES // per_row))
         # no list is expected to live longer than the run
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
         """The record buffer whose turn it is; it is donated to the epoch that fills it."""
-        rows, held = self._room(words), self._records[turn]
+        rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
-        if held is not None and held.bits.shape[:2] == (rows, words):
+        changes = None if self.rows else max(2 * most, min(16 * most, _RECORD_BYTES // _CHANGE_BYTES))
+        had = None if held is None or held.changes is None else len(held.changes.pairs)
+        if held is not None and held.bits.shape[:2] == (rows, words) and had == changes:
             return held
         dtype = self.simulation.policy.dtype("state")
-        return empty_record(rows, words, self.simulation.atoms, dtype, self.record)
+        return empty_record(rows, words, self.simulation.atoms, dtype, self.record, changes)
 
     def give(self, turn: int, record: EpochRecord) -> None:
         """Return a record that nobody reads any more."""
@@ -226,33 +264,26 @@ class Engine:
 
     def segments(self) -> Iterator[Segment]:
         """Stretches of steps in order; the last one has `closes` set to "end" or one of FAILURES."""
-        start, cell = self.start, self.simulation.cell
-        state, reference, built, epoch = start.state, start.reference, start.built, start.epoch
-        table = self.verlet.build(reference, cell)
-        tables = self.simulation.tables(table)
-        home = jnp.asarray(reference.T, self.simulation.policy.dtype("state"))
-        first, opens, turn = int(state.step), int(state.step) == built, 0
+        here, turn, held = self.start, 0, None
+        listed = self._listed(here)
         waiting: Segment | None = None
-        # the decisions of the step before: a new list looks back for them, one in use remembers them
-        before: np.ndarray | None = None
         while True:
-            outcome, record = self._advance(table, tables, state, home, first, built, before is None, turn)
+            begun = self._advance(listed, here, held, turn)
             if waiting is not None:
                 # the device is at work: the caller may read the record before this one
                 yield waiting
                 self._records[1 - turn] = waiting.record
-            waiting = self._segment(outcome, record, before, table, first, epoch, built, opens, reference)
-            closes, rows = waiting.closes, waiting.rows
-            state, first, turn, opens = outcome.state, first + rows, 1 - turn, False
-            before = np.array(waiting.rows_of("bits")[-1]) if self.record and rows else None
-            if closes == "end" or closes in FAILURES:
+            waiting, held = self._segment(listed, here, held, turn, begun)
+            turn = 1 - turn
+            if waiting.closes == "end" or waiting.closes in FAILURES:
                 yield waiting
                 return
-            if closes:
+            here = replace(here, state=waiting.state)
+            if waiting.closes:
+                state = waiting.state
                 reference = np.asarray(state.x, np.float64).T.copy()
-                home, built, epoch, opens, before = state.x, first, epoch + 1, True, None
-                table = self.verlet.build(reference, cell)
-                tables = self.simulation.tables(table)
+                here, held = Start(state, reference, waiting.last + 1, here.epoch + 1), None
+                listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
         """The one segment that begins at a start, made anew with the bits that it had.
@@ -260,86 +291,92 @@ class Engine:
         Args:
             start: where a segment of this engine began (`resume_point` of the one before).
         """
-        state, cell = start.state, self.simulation.cell
         self.verlet.slots = start.slots
-        table = self.verlet.build(start.reference, cell)
-        home = jnp.asarray(start.reference.T, self.simulation.policy.dtype("state"))
-        first = int(state.step)
-        outcome, record = self._advance(
-            table, self.simulation.tables(table), state, home, first, start.built, True, 0
-        )
-        made = self._segment(
-            outcome,
-            record,
-            None,
-            table,
-            first,
-            start.epoch,
-            start.built,
-            first == start.built,
-            start.reference,
-        )
-        self._records[0] = record
+        listed = self._listed(start)
+        made, _ = self._segment(listed, start, None, 0, self._advance(listed, start, None, 0))
+        self._records[0] = made.record
         return made
 
-    def _advance(
-        self,
-        table: PairTable,
-        tables,
-        state: EpochState,
-        home,
-        first: int,
-        built: int,
-        look_back: bool,
-        turn: int,
-    ):
-        """Start the compiled loop on the device."""
-        words = table.slots // 8
+    def _listed(self, start: Start) -> _Listed:
+        """The list of a start, searched for."""
+        table = self.verlet.build(start.reference, self.simulation.cell)
+        home = jnp.asarray(start.reference.T, self.simulation.policy.dtype("state"))
+        return _Listed(table, self.simulation.tables(table), home)
+
+    def _advance(self, listed: _Listed, start: Start, held, turn: int):
+        """Start the compiled loop on the device.
+
+        Args:
+            held: decisions of the list at the step before; None where it has to look back.
+        """
+        words = listed.table.slots // 8
+        told = self._pinned(listed.table, int(start.state.step), words) or (None, None)
+        look_back, earlier = held is None, None
+        if not self.rows:
+            earlier = jnp.zeros((words, self.simulation.atoms), jnp.uint8) if look_back else jnp.asarray(held)
         return run_epoch(
             self.leaves,
             self.structure,
-            tables,
-            state,
-            home,
-            jnp.asarray(built, jnp.int64),
+            listed.tables,
+            start.state,
+            listed.home,
+            jnp.asarray(start.built, jnp.int64),
             jnp.asarray(self.last, jnp.int64),
             jnp.asarray(look_back),
             self.take(turn, words),
-            *self._pinned(table, first, words),
+            *told,
+            earlier,
         )
 
     def _segment(
-        self,
-        outcome: EpochOutcome,
-        record: EpochRecord,
-        before,
-        table: PairTable,
-        first,
-        epoch,
-        built,
-        opens,
-        reference,
-    ) -> Segment:
-        """What the loop left behind; waits for it."""
+        self, listed: _Listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
+    ) -> tuple[Segment, np.ndarray | jax.Array | None]:
+        """What the loop left behind, and the decisions at its last row; waits for it."""
+        outcome, record = begun
         rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+        changes = record.changes
+        while changes is not None and finite and int(changes.count[0]) > len(changes.pairs):
+            # a step had more changes than there was room for
+            self._room_for_changes(4 * self.program.most)
+            outcome, record = self._advance(listed, start, held, turn)
+            rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+            changes = record.changes
+        first, table = int(start.state.step), listed.table
+        before = held if outcome.before is None or held is not None else outcome.before
+        if self.rows:
+            last = np.array(np.asarray(record.bits)[rows - 1]) if self.record and rows else None
+        else:
+            last = outcome.held
         closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
-        if before is None and outcome.before is not None:
-            before = np.asarray(outcome.before)
-        return Segment(
+        segment = Segment(
             first,
             rows,
             record,
-            before,
+            None if before is None else np.asarray(before),
             table,
-            epoch,
-            built,
-            opens,
+            start.epoch,
+            start.built,
+            first == start.built,
             closes,
             bool(rebuild),
             float(outcome.moved),
             outcome.state,
-            reference,
+            start.reference,
+            start.state,
+            None if self.rows or last is None else np.asarray(last),
+            cache(partial(self._with_rows, replace(start, slots=table.slots), first + rows - 1)),
         )
+        return segment, last
+
+    def _with_rows(self, start: Start, last: int) -> EpochRecord:
+        """The steps from a start to a last one of the same list, recorded row by row."""
+        engine = Engine(self.simulation, last, start=start, pins=self.pins)
+        parts: list[list[Any]] = [
+            [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-1]]
+            for segment in engine.segments()
+        ]
+        whole: list[Any] = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
         """What the rows of the next epoch are told, and where; nothing without pins."""

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
-from mdnum.md.decide import Tables
+from mdnum.md.decide import Changes, Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
@@ -97,7 +97,9 @@ class EpochProgram(eqx.Module):
         half_skin: half the skin, length.
         every, delay: when the list may be rebuilt (RebuildRule).
         check: whether a rebuild needs an atom to have moved by half the skin.
-        record: whether decisions and positions leave the loop.
+        record: whether decisions leave the loop.
+        rows: whether they do so row by row, with positions; else as changes from one row to the next.
+        most: changes of one row that there is room for, without rows.
     """
 
     force: eqx.Module
@@ -109,6 +111,8 @@ class EpochProgram(eqx.Module):
     delay: int = eqx.field(static=True)
     check: bool = eqx.field(static=True)
     record: bool = eqx.field(static=True)
+    rows: bool = eqx.field(static=True, default=True)
+    most: int = eqx.field(static=True, default=0)
 
 
 class EpochState(NamedTuple):
@@ -137,11 +141,12 @@ class EpochRecord(NamedTuple):
     """One row per step of an epoch, atoms in the order of its tables.
 
     Attributes:
-        x, v: positions and full-step velocities, shape (rows, 3, atoms).
-        images: shape (rows, 3, atoms), int32.
-        bits: decisions, shape (rows, words, atoms).
+        x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows.
+        images: shape (rows, 3, atoms), int32, or none.
+        bits: decisions, shape (rows, words, atoms), or none.
         potential, kinetic, virial, heat: energies, shape (rows,).
         nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,).
+        changes: of decisions from row to row, instead of rows.
     """
 
     x: Float[Array, "rows 3 atoms"]
@@ -154,6 +159,7 @@ class EpochRecord(NamedTuple):
     heat: Float[Array, "rows"]
     nearest: Float[Array, "rows"]
     moved: Float[Array, "rows"]
+    changes: Changes | None = None
 
 
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved")
@@ -170,17 +176,26 @@ class EpochOutcome(NamedTuple):
             decisions would no longer be exact.
         moved: largest displacement since the list was built, at the step that comes next, length.
         before: decisions of the list at the step before, for the count check and the first flips of a new
-            list; all no where they were not asked for. None without recording.
+            list; where they were not asked for, those that were held. None without recording.
+        held: decisions at the last row, None with rows.
     """
 
     state: EpochState
     flags: Int[Array, "4"]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
+    held: UInt8[Array, "words atoms"] | None = None
 
 
-def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> EpochRecord:
-    """Room for the rows of an epoch; without recording only the per-step numbers have room."""
+def empty_record(
+    rows: int, words: int, atoms: int, dtype, record: bool, changes: int | None = None
+) -> EpochRecord:
+    """Room for the rows of an epoch; without recording only the per-step numbers have room.
+
+    Args:
+        changes: room for so many instead of for decisions and positions.
+    """
+    record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
     return EpochRecord(
         x=jnp.zeros(shape, dtype),
@@ -188,6 +203,7 @@ def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Epoc
         images=jnp.zeros(shape, jnp.int32),
         bits=jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
         **{name: jnp.zeros(rows, jnp.float64) for name in _NUMBERS},
+        changes=None if changes is None else Changes.empty(changes, dtype),
     )
 
 
@@ -218,6 +234,7 @@ def run_epoch(
     record: EpochRecord,
     told: UInt8[Array, "rows words atoms"] | None = None,
     pinned: UInt8[Array, "rows words atoms"] | None = None,
+    held: UInt8[Array, "words atoms"] | None = None,
 ) -> tuple[EpochOutcome, EpochRecord]:
     """Advance with one list until it is used up, the record is full or the last step is done.
 
@@ -233,6 +250,7 @@ def run_epoch(
         told: decisions of each row to act on instead of the list's own, which are recorded all the same;
             pair potentials only.
         pinned: the slots of each row at which it acts on what it is told; everywhere when None.
+        held: decisions of the list at the step before, where that is not decided again; needed without rows.
     """
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
@@ -250,7 +268,7 @@ def run_epoch(
         before = lax.cond(
             look_back,
             lambda x: program.force.decide(x, tables).bits,  # type: ignore[attr-defined]
-            lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8),
+            lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8) if held is None else held,
             state.x_before[:, order],
         )
 
@@ -259,7 +277,7 @@ def run_epoch(
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def body(carry):
-        step, x, v, images, _, heat, bath, row, _, _, _, largest, record = carry
+        step, x, v, images, _, heat, bath, row, _, _, _, largest, record, earlier = carry
         given = {} if told is None else {"given": told[row]}
         if pinned is not None:
             given["where"] = pinned[row]
@@ -280,8 +298,12 @@ def run_epoch(
         if program.record:
             d = made.decisions
             assert d is not None
-            values |= {"x": x, "v": v, "images": images, "bits": d.bits}
             values["nearest"] = d.nearest
+            if program.rows:
+                values |= {"x": x, "v": v, "images": images, "bits": d.bits}
+            else:
+                changes = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
+                record, earlier = record._replace(changes=changes), d.bits
         record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
         v = program.integrator.kick(v, half_step, acceleration, mass_row)
@@ -299,11 +321,14 @@ def run_epoch(
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
-        return step, after, v, images, x, heat + taken, bath, row + 1, due, finite, runaway, largest, record
+        ended = due, finite, runaway, largest
+        return step, after, v, images, x, heat + taken, bath, row + 1, *ended, record, earlier
 
     def go_on(carry):
-        step, _, _, _, _, _, bath, row, due, finite, runaway, _, _ = carry
+        step, _, _, _, _, _, bath, row, due, finite, runaway, _, record, _ = carry
         more = (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
+        if record.changes is not None:
+            more &= record.changes.count[0] + program.most <= len(record.changes.pairs)
         if bath is None:
             return more
         # a full bath is put aside by whoever wants to go back
@@ -322,10 +347,11 @@ def run_epoch(
         jnp.ones((), bool),
         jnp.zeros((), bool),
         moved(x),
-        record,
+        record if record.changes is None else record._replace(changes=record.changes.emptied()),
+        None if program.rows else before,
     )
     done = lax.while_loop(go_on, body, carry)
-    step, x, v, images, x_before, heat, bath, rows, due, finite, runaway, largest, record = done
+    step, x, v, images, x_before, heat, bath, rows, due, finite, runaway, largest, record, earlier = done
 
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
@@ -334,4 +360,4 @@ def run_epoch(
     if bath is not None:
         end = end._replace(bath=unsorted(bath))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    return EpochOutcome(end, flags, largest, before), record
+    return EpochOutcome(end, flags, largest, before, earlier), record

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
+from mdnum.md.decide import Changes
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.rollout.engine import Segment
@@ -53,39 +54,42 @@ def _fingerprint_of_keys(keys):
 
 
 @numba.njit(cache=True, nogil=True)
-def _from_first_end(row, slot, column, values, index, order):
-    """The changes seen from the atom with the smaller label: row, sorted atoms, decision, labels.
+def _from_first_end(row, slot, column, values, index):
+    """The changes seen from the atom that is sorted first, as `Changes.pairs`.
 
     There are as many as from the other end; more of either are counted and not noted.
     """
     kept, room = 0, row.shape[0] // 2
-    rows, first, second = np.empty((3, room + 1), np.int32)
-    entered = np.empty(room + 1, np.uint8)
-    labels = np.empty((room + 1, 2), np.int32)
+    pairs = np.empty((room + 1, 4), np.int32)
     for q in range(row.shape[0]):
         c = column[q]
         n = index[slot[q], c]
-        i, j = order[c], order[n]
-        # written always and kept where i < j: half of the branches would be mispredicted
+        # written always and kept where c < n: half of the branches would be mispredicted
         at = min(kept, room)
-        rows[at], first[at], second[at], entered[at], labels[at, 0], labels[at, 1] = (
-            row[q],
-            c,
-            n,
-            values[q],
-            i,
-            j,
-        )
-        kept += np.int64(i < j)
-    return kept, rows[:room], first[:room], second[:room], entered[:room], labels[:room]
+        pairs[at, 0], pairs[at, 1], pairs[at, 2], pairs[at, 3] = row[q], c, n, values[q]
+        kept += np.int64(c < n)
+    return kept, pairs[:room]
+
+
+@numba.njit(cache=True, nogil=True)
+def _ends(x, v, pairs):
+    """Positions and velocities of both atoms, as `Changes.ends`."""
+    ends = np.empty((pairs.shape[0], 12), x.dtype)
+    for f in range(pairs.shape[0]):
+        r, a, b = pairs[f, 0], pairs[f, 1], pairs[f, 2]
+        for axis in range(3):
+            ends[f, axis], ends[f, 3 + axis] = x[r, axis, a], x[r, axis, b]
+            ends[f, 6 + axis], ends[f, 9 + axis] = v[r, axis, a], v[r, axis, b]
+    return ends
 
 
 # atoms in one place have no radial speed: not a number, as in numpy
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _measure(x, v, row, first, second, entered, kind, by_type, bounds, root, narrow, lattice):
+def _measure(ends, chosen, row, entered, kind, by_type, bounds, root, narrow, lattice):
     """Margin, bound, energy jump, distance, radial speed and force jump of each flip, shape (6, flips).
 
     Args:
+        ends: of changes, of which some are chosen.
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
         root: whether distances are compared, not their squares.
         narrow, lattice: of the cell in the dtype of the decision, and in float64.
@@ -93,8 +97,8 @@ def _measure(x, v, row, first, second, entered, kind, by_type, bounds, root, nar
     out = np.empty((6, row.shape[0]))
     small, wide = narrow[0].dtype.type, np.float64
     for f in range(row.shape[0]):
-        r, a, b, k = row[f], first[f], second[f], kind[f]
-        x0, y0, z0, x1, y1, z1 = x[r, 0, a], x[r, 1, a], x[r, 2, a], x[r, 0, b], x[r, 1, b], x[r, 2, b]
+        r, k, at = row[f], kind[f], ends[chosen[f]]
+        x0, y0, z0, x1, y1, z1 = at[0], at[1], at[2], at[3], at[4], at[5]
         dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz
         distance = np.sqrt(r2)
@@ -105,7 +109,7 @@ def _measure(x, v, row, first, second, entered, kind, by_type, bounds, root, nar
             )
             short = sx * sx + sy * sy + sz * sz
             quantity = wide(np.sqrt(short) if root else short)
-        u0, u1, u2 = v[r, 0, b] - v[r, 0, a], v[r, 1, b] - v[r, 1, a], v[r, 2, b] - v[r, 2, a]
+        u0, u1, u2 = at[9] - at[6], at[10] - at[7], at[11] - at[8]
         approach = wide(u0) * dx + wide(u1) * dy + wide(u2) * dz
         sign = 1.0 if entered[f] else -1.0
         out[0, f], out[1, f], out[2, f] = by_type[0, k] - quantity, bounds[r, k], sign * by_type[1, k]
@@ -114,15 +118,28 @@ def _measure(x, v, row, first, second, entered, kind, by_type, bounds, root, nar
 
 
 @numba.njit(cache=True, nogil=True)
-def _longest(start, end, order, lattice):
-    """The longest way of an atom between two configurations, the second of shape (3, atoms) and sorted."""
+def _longest(start, end, lattice):
+    """The longest way of an atom between two configurations, each of shape (3, atoms)."""
     longest = 0.0
-    for k in range(order.shape[0]):
-        i = order[k]
-        x, y, z = end[0, k] - start[i, 0], end[1, k] - start[i, 1], end[2, k] - start[i, 2]
+    for i in range(start.shape[1]):
+        x, y, z = end[0, i] - start[0, i], end[1, i] - start[1, i], end[2, i] - start[2, i]
         x, y, z = nearest_image(lattice, np.float64(x), np.float64(y), np.float64(z))
         longest = max(longest, x * x + y * y + z * z)
     return np.sqrt(longest)
+
+
+_ONE_END = "a flip was recorded from one end only"
+
+
+def _noted(segment: Segment, changes: Changes) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs and ends of the changes in a segment's rows."""
+    found, both = np.asarray(changes.count).tolist()
+    room = min(found, len(changes.pairs))
+    pairs, ends = np.asarray(changes.pairs)[:room], np.asarray(changes.ends)[:room]
+    if 2 * found != both:
+        raise MdnumError(_ONE_END, remedy="Report this as a bug")
+    kept = np.searchsorted(pairs[:, 0], segment.rows)
+    return pairs[:kept], ends[:kept]
 
 
 class AmbiguousPairs(NamedTuple):
@@ -189,11 +206,20 @@ class PairRecorder:
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs inside at every step of a segment."""
-        return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
+        changes = segment.record.changes
+        if changes is None:
+            return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
+        assert segment.before is not None
+        row, _, _, inside = _noted(segment, changes)[0].T
+        by_row = np.bincount(row, weights=2 * inside - 1, minlength=segment.rows)
+        return self.inside(segment.before) + np.cumsum(by_row).astype(np.int64)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
         """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
-        return self.simulation.decider.bounds_at(segment.rows_of("x"))
+        decider = self.simulation.decider
+        if not decider.grows:
+            return np.tile(np.array(decider.bounds), (segment.rows, 1))
+        return decider.bounds_at(segment.rows_of("x"))
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
@@ -235,28 +261,30 @@ class PairRecorder:
             MdnumError: a flip was recorded from one end only, or a margin contradicts its decision: the
                 compiled program and the host would disagree about arithmetic.
         """
-        bits = segment.rows_of("bits")
-        before = segment.before
+        before, table, changes = segment.before, segment.table, segment.record.changes
         assert before is not None
         replaced = self._replace(segment, before)
-        if replaced is not None:
-            before = bits[0]
-        row, slot, column, values = changes_in_time(before, bits)
-        table = segment.table
-        found, *ends = _from_first_end(row, slot, column, values, table.index, table.order)
-        if 2 * found != len(row):
-            raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
-        if replaced is not None:
-            keys, now = replaced
-            labels = np.stack(np.divmod(keys, self.simulation.atoms), axis=1)
-            first, second = np.argsort(table.order)[labels.T]
-            added = np.zeros(len(keys), np.int64), first, second, now, labels
-            ends = [np.concatenate(parts) for parts in zip(added, ends, strict=True)]
+        if changes is not None and replaced is None:
+            pairs, ends = _noted(segment, changes)
+        else:
+            bits = segment.rows_of("bits")
+            changed = changes_in_time(before if replaced is None else bits[0], bits)
+            found, pairs = _from_first_end(*changed, table.index)
+            if 2 * found != len(changed[0]):
+                raise MdnumError(_ONE_END, remedy="Report this as a bug")
+            if replaced is not None:
+                keys, now = replaced
+                atoms = np.argsort(table.order)[np.stack(np.divmod(keys, self.simulation.atoms))]
+                added = np.stack([np.zeros(len(keys), np.int64), *atoms, now], axis=1).astype(np.int32)
+                pairs = np.concatenate([added, pairs])
+            ends = _ends(segment.rows_of("x"), segment.rows_of("v"), pairs)
         if segment.closes:
-            self._held_segment, self._held_keys = (table, np.array(bits[-1])), None
+            last = segment.rows_of("bits")[-1] if segment.held is None else segment.held
+            self._held_segment, self._held_keys = (table, np.array(last)), None
             self._held_positions = segment.unsorted("x", segment.rows - 1)
-        order = sort_rows(ends[0], ends[-1])
-        return self._ledger(segment, *(part[order] for part in ends))
+        labels = np.sort(table.order[pairs[:, 1:3]], axis=1)
+        order = sort_rows(pairs[:, 0], labels)
+        return self._ledger(segment, ends, order, pairs[order, 0], pairs[order, 3], labels[order])
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""
@@ -269,8 +297,7 @@ class PairRecorder:
         rule = self.simulation.rule
         if self._held_segment is None or self._held_positions is None or not rule.safe:
             return False
-        x, order = segment.rows_of("x")[0], segment.table.order
-        longest = _longest(self._held_positions, x, order, self._cell.lattice)
+        longest = _longest(self._held_positions.T, segment.unsorted("x", 0).T, self._cell.lattice)
         return bool(2 * longest < rule.skin) and self.inside(self._held_segment[1]) == self.inside(before)
 
     def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
@@ -295,11 +322,11 @@ class PairRecorder:
         keys = np.setxor1d(held, now, assume_unique=True)
         return keys, np.isin(keys, now, assume_unique=True)
 
-    def _ledger(self, segment: Segment, row, first, second, entered, labels) -> Ledger:
-        x, v, entered = segment.rows_of("x"), segment.rows_of("v"), entered.astype(bool)
+    def _ledger(self, segment: Segment, ends, chosen, row, entered, labels) -> Ledger:
+        entered = entered.astype(bool)
         kind = self.simulation.type_of(labels[:, 0], labels[:, 1])
         measured = _measure(
-            x, v, row, first, second, entered, kind, self._by_type, self.bounds(segment),
+            ends, chosen, row, entered, kind, self._by_type, self.bounds(segment),
             self.simulation.decider.space == "r", self._decision_cell.lattice, self._cell.lattice,
         )  # fmt: skip
         margin, bound, jump, distance, speed, force_jump = measured

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from ase import Atoms
 
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
+from mdnum.md import foreign
 from mdnum.numerics import Ledger
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
@@ -36,6 +38,8 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 # as long as several steps: there the steps in between are at least as many as these
 _BUDGET_CHECKS, _LARGE, _STEPS_OF_A_LARGE = 20, 10_000, 100
 _LOG_LINES = 50
+# about the life of two lists: where frames are nearer, steps would be made twice for them too often
+_FRAMES_APART = 25
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,7 @@ class Rollout:
             NumericalError: a number stopped being finite; everything up to the step before it is kept.
             FolderError: the folder cannot be written.
         """
-        engine = Engine(self.simulation, self.steps, start=self.start)
+        engine = Engine(self.simulation, self.steps, start=self.start, rows=self._needs_rows())
         least = _STEPS_OF_A_LARGE if self.simulation.atoms > _LARGE else 1
         interval = max(least, self.steps // _BUDGET_CHECKS)
         blown: Segment | None = None
@@ -159,6 +163,15 @@ class Rollout:
         self.folder.finalize()
         self.folder.write_summary(summary)
         return summary
+
+    def _needs_rows(self) -> bool:
+        """Whether rows of the record are asked for so often that they are better kept."""
+        simulation = self.simulation
+        policy = simulation.policy
+        # in single precision most steps have a margin within its bound, and a bad list misses pairs
+        narrow = {policy.dtype("state"), policy.dtype("decision")} != {np.dtype(np.float64)}
+        often = 0 < self.save_every < _FRAMES_APART or narrow or not simulation.rule.safe
+        return often or (jax.default_backend() == "cpu" and not foreign.known())
 
     def _take(self, segment: Segment, interval: int) -> None:
         done = self.done

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from oracles import all_pairs, cut_energy, margins
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
-from mdnum.md import kernel
+from mdnum.md import foreign, kernel
 from mdnum.md.cell import wrap_positions
 from mdnum.md.decide import Tables
 from mdnum.systems import build
@@ -178,10 +178,37 @@ def test_another_interface_is_not_met_with_guesses(tmp_path, monkeypatch):
     header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
     header.parent.mkdir(parents=True)
     header.write_text("#define XLA_FFI_API_MAJOR 0\n#define XLA_FFI_API_MINOR 9\n")
-    assert kernel.known()
-    kernel.known.cache_clear()
+    assert foreign.known()
+    foreign.known.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
     try:
-        assert not kernel.known()
+        assert not foreign.known()
     finally:
-        kernel.known.cache_clear()
+        foreign.known.cache_clear()
+
+
+@pytest.mark.parametrize("columns", [1, 3, 4, 5, 9])
+@pytest.mark.parametrize("atoms", [1, 8, 37])
+def test_sums_are_slot_after_slot_whatever_the_vectors(columns, atoms):
+    rng = np.random.default_rng(atoms + columns)
+    index = rng.integers(0, atoms + 1, (2, 8, atoms)).astype(np.int32)
+    values = rng.normal(size=(columns, atoms))
+    tables = Tables(jnp.asarray(index), None, jnp.arange(atoms))
+
+    def pair(own, other, types):
+        # not a number where the slot is padding
+        gap = sum(((b - a) * k for k, (a, b) in enumerate(zip(own, other, strict=True), 1)), 0.0)
+        return jnp.where(gap == gap, gap, 0.0), 0.5 - gap
+
+    made = jax.jit(lambda values: kernel.over_pairs(pair, values, tables, margins=">"))(jnp.asarray(values))
+    padded = np.concatenate([values, np.full((columns, 1), np.nan)], axis=1)
+    gaps = np.zeros((16, atoms))
+    for k in range(columns):
+        gaps = gaps + (padded[k, index.reshape(16, atoms)] - values[k]) * (k + 1)
+    total = np.zeros(atoms)
+    for gap in gaps:
+        total = total + np.where(np.isnan(gap), 0.0, gap)
+    assert np.array_equal(made.sums[0], total)
+    bits = np.packbits((0.5 - gaps > 0).reshape(2, 8, atoms), axis=1, bitorder="little")[:, 0]
+    assert np.array_equal(made.decisions.bits, bits)
+    assert made.decisions.nearest == np.nanmin(np.abs(0.5 - gaps), initial=np.inf)

@@ -1,0 +1,96 @@
+"""What XLA calls on a CPU: numba functions that read its call frames (xla/ffi/api/c_api.h, version 0.3)."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+# of the foreign-function interface, whose layout in memory the loop relies on
+VERSION = (0, 3)
+
+
+@cache
+def known() -> bool:
+    """Whether XLA's interface is the one that this was written for, and programs run on a CPU."""
+    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    text = header.read_text() if header.exists() else ""
+    found = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
+    version = tuple(int(one[1]) for one in found if one)
+    return version == VERSION and jax.default_backend() == "cpu" and np.intp().itemsize == 8
+
+
+carray: Any = numba.carray  # pyright: ignore
+_intrinsic: Any = intrinsic
+
+
+@_intrinsic
+def pointer(typingctx: Any, address: Any) -> Any:
+    """A number as the address of memory."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return types.voidptr(types.intp), generate
+
+
+@_intrinsic
+def call(typingctx: Any, address: Any, arguments: Any) -> Any:
+    """What a C function at an address makes of a tuple of 64-bit arguments."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        whole = context.get_value_type(types.intp)
+        kind = ir.FunctionType(whole, [whole] * arguments.count)
+        given = cgutils.unpack_tuple(builder, args[1])
+        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
+
+    return types.intp(types.intp, arguments), generate
+
+
+@_intrinsic
+def added(typingctx: Any, address: Any, amount: Any) -> Any:
+    """Add to the 64-bit number at an address, in one step for all threads; the number before."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at = builder.inttoptr(args[0], context.get_value_type(types.intp).as_pointer())
+        return builder.atomic_rmw("add", at, args[1], "seq_cst")
+
+    return types.intp(types.intp, types.intp), generate
+
+
+malloc = types.ExternalFunction("malloc", types.intp(types.intp))
+free = types.ExternalFunction("free", types.void(types.intp))
+
+
+@numba.njit(cache=True, nogil=True)
+def words_at(address):
+    """Memory as 64-bit words, as many as a frame has or fewer."""
+    return carray(pointer(address), (32,), np.int64)
+
+
+@numba.njit(cache=True, nogil=True)
+def buffer(buffers, k):
+    """Where the data of a frame's k-th operand or result begin, and its first two dimensions."""
+    words = words_at(buffers[k])
+    size = words_at(words[5])
+    return words[3], size[0], size[1]
+
+
+@numba.njit(cache=True, nogil=True)
+def asked_to_run(frame):
+    """Whether a call is more than a question or a preparation; a question is answered."""
+    words = words_at(frame)
+    if words[1] != 0 and words_at(words[1])[1] & 0xFFFFFFFF == 1:
+        # for which version of the interface was this written?
+        words_at(words_at(words[1])[3])[3] = VERSION[0] | (VERSION[1] << 32)
+        return False
+    return words[4] & 0xFFFFFFFF == 3
