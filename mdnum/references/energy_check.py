@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 from ase.geometry import complete_cell
-from ase.md.verlet import VelocityVerlet
 from jaxtyping import Int
 from numpy import ndarray
-from scipy.spatial import KDTree
 
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
@@ -390,6 +388,9 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
         steps: how many steps.
         judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
     """
+    # its optimizers come with it, and a run that is only compared needs none
+    from ase.md.verlet import VelocityVerlet
+
     system = _without_bath(system)
     judge = _forces(system) if judge is None else judge
     simulation = build(system)
@@ -476,6 +477,8 @@ def neighborhoods(
     Yields:
         (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
     """
+    from scipy.spatial import KDTree
+
     x, origin = _with_images(atoms, reach)
     tree = KDTree(x)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
