@@ -381,26 +381,30 @@ def _from_extxyz(path: Path) -> Atoms | None:
     return atoms
 
 
-def to_extxyz(atoms: Atoms, columns: Sequence[str] = ("momenta", "masses")) -> str:
+def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str:
     """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals).
 
     Args:
         atoms: any.
-        columns: arrays that are written beside symbols and positions, where the atoms have them.
+        names: of the arrays that are written beside symbols and positions, where the atoms have them.
     """
-    held = {name: atoms.arrays[name] for name in columns if name in atoms.arrays}
+    import pyarrow as pa
+    from pyarrow import csv
+
+    from mdnum.store.tables import as_arrow
+
+    held = {name: atoms.arrays[name] for name in names if name in atoms.arrays}
     arrays = {"pos": atoms.positions} | {
         name: np.asarray(array, np.float64).reshape(len(atoms), -1) for name, array in held.items()
     }
     words = ["species:S:1", *(f"{name}:R:{array.shape[1]}" for name, array in arrays.items())]
     cell = np.asarray(atoms.cell)
-    comment = [f'Lattice="{_numbers(cell.ravel().tolist())}"'] if cell.any() else []
+    comment = [f'Lattice="{" ".join(map(repr, cell.ravel().tolist()))}"'] if cell.any() else []
     comment.append(f"Properties={':'.join(words)}")
     comment.append(f'pbc="{" ".join("T" if flag else "F" for flag in atoms.pbc)}"')
-    rows = zip(atoms.get_chemical_symbols(), np.hstack(list(arrays.values())).tolist(), strict=True)
-    lines = [str(len(atoms)), " ".join(comment), *(f"{symbol} {_numbers(row)}" for symbol, row in rows)]
-    return "\n".join(lines) + "\n"
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(map(repr, values))
+    columns = [as_arrow(atoms.get_chemical_symbols(), pa.string())]
+    columns += [as_arrow(values, pa.float64()) for values in np.hstack(list(arrays.values())).T]
+    sink = pa.BufferOutputStream()
+    table = pa.table(columns, names=[str(at) for at in range(len(columns))])
+    csv.write_csv(table, sink, csv.WriteOptions(include_header=False, delimiter=" ", quoting_style="none"))
+    return f"{len(atoms)}\n{' '.join(comment)}\n{sink.getvalue().to_pybytes().decode()}"
