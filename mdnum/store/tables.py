@@ -185,7 +185,7 @@ _GROUP_ROWS = 262_144
 # every page carries a checksum, which whoever reads the file can ask for
 _WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
-_DISTINCT = frozenset("i j distance margin radial_speed".split())
+_DISTINCT = frozenset({"i", "j", "distance", "margin", "radial_speed"})
 
 
 class TableStream:
@@ -354,7 +354,7 @@ class TableStream:
         """Writes rows into a file of this table, which the manifest expects before it is there."""
         schema = self._schema
         with replacing(path) as file:
-            repeating = [field.name for field in schema or () if field.name not in _DISTINCT]
+            repeating: Any = [field.name for field in schema or () if field.name not in _DISTINCT]
             with pq.ParquetWriter(file, schema, use_dictionary=repeating, **_WRITTEN) as writer:
                 for table in tables:
                     writer.write_table(table, row_group_size=_GROUP_ROWS)
