@@ -156,7 +156,8 @@ class CutPotential(eqx.Module):
 
     def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
         """Energy jump and radial force jump of a pair that enters, per pair type."""
-        at = self.at_cutoff()
+        # in numpy: to jax each operation on these few numbers is a program to compile
+        at = jax.tree.map(np.asarray, self).at_cutoff()
         return np.asarray(self.cutoff.energy_jump(at)), np.asarray(self.cutoff.force_jump(at))
 
     def astype(self, dtype) -> CutPotential:

@@ -13,11 +13,12 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, NullLocator, ScalarFormatter
 
 from mdnum.report.section import Figure, Plot, Region, Series
-from mdnum.report.words import MINUS, many, typeset
+from mdnum.report.words import MINUS, many, power, typeset
 
 # colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
 COLORS = {
@@ -77,7 +78,9 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
             axes.tick_params(which="both", length=0)
             for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):
                 if scale != "linear":
-                    axis.set_minor_formatter(NullFormatter())
+                    axis.set_minor_locator(NullLocator())
+                    # matplotlib's own sets them as formulas, which takes as long as all the rest
+                    axis.set_major_formatter(FuncFormatter(_decade))
                 elif isinstance(axis.get_major_formatter(), ScalarFormatter):
                     axis.set_major_formatter(_engineering())
             # left of the legend
@@ -268,6 +271,14 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
     return np.exp(edges) if log else edges
 
 
+def _decade(value: float, _: int | None = None) -> str:
+    """A mark of a logarithmic axis; nothing between two decades."""
+    exponent = np.log10(abs(value)) if value else 0.0
+    if not np.isclose(exponent, round(exponent), atol=1e-6):
+        return ""
+    return f"{MINUS if value < 0 else ''}{power(round(exponent))}" if value else "0"
+
+
 def _engineering() -> ScalarFormatter:
     formatter = ScalarFormatter(useOffset=False, useMathText=False)
     formatter.set_powerlimits((-3, 5))
@@ -341,8 +352,8 @@ def style() -> AbstractContextManager[None]:
     """The settings under which figures are drawn, whatever the user's matplotlibrc says."""
     return mpl.rc_context(
         {
-            **mpl.rcParamsDefault,
-            "backend": mpl.get_backend(),
+            # any backend will do, and to ask for the one in use imports pyplot
+            **{key: value for key, value in mpl.rcParamsDefault.items() if key != "backend"},
             "font.family": "DejaVu Sans",
             "font.size": 9,
             "axes.labelsize": 9,
@@ -375,7 +386,8 @@ def markup(figure: Canvas, name: str) -> str:
     """
     sink = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(sink, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        # savefig would draw it once more, for a box that is tight around it
+        FigureCanvasSVG(figure).print_svg(sink, metadata={"Date": None, "Creator": None})
     text = sink.getvalue()
     text = text[text.index("<svg ") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

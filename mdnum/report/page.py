@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from mdnum.report import drawing
 from mdnum.report.browse import STATIC_ROWS, Browse
 from mdnum.report.section import Figure, Plot, cell
 from mdnum.report.words import heading, many, typeset
@@ -34,6 +33,9 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     Raises:
         FolderError: the folder cannot be written.
     """
+    # matplotlib takes a third of a second to import, and who only reads a page needs none
+    from mdnum.report import drawing
+
     parts = [part for section in page.sections for part in section.parts]
     pictures, notes = {}, {}
     for part in parts:
@@ -83,6 +85,8 @@ def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Findi
 
 
 def _render(template: str, **content: Any) -> str:
+    from mdnum.report import drawing
+
     environment = Environment(
         loader=FunctionLoader(_text),
         autoescape=True,

@@ -184,6 +184,8 @@ _BUFFER_ROWS = 100_000
 _GROUP_ROWS = 262_144
 # every page carries a checksum, which whoever reads the file can ask for
 _WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
+# columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
+_DISTINCT = frozenset({"i", "j", "distance", "margin", "radial_speed"})
 
 
 class TableStream:
@@ -352,7 +354,8 @@ class TableStream:
         """Writes rows into a file of this table, which the manifest expects before it is there."""
         schema = self._schema
         with replacing(path) as file:
-            with pq.ParquetWriter(file, schema, **_WRITTEN) as writer:
+            repeating: Any = [field.name for field in schema or () if field.name not in _DISTINCT]
+            with pq.ParquetWriter(file, schema, use_dictionary=repeating, **_WRITTEN) as writer:
                 for table in tables:
                     writer.write_table(table, row_group_size=_GROUP_ROWS)
             file.flush()
@@ -385,7 +388,7 @@ class TableStream:
         unknown = [name for name in columns if name not in schema.names]
         if missing or unknown:
             raise ValueError(f"table {self.name!r}: columns missing {missing}, not expected {unknown}")
-        arrays = [_array(columns[field.name], field.type) for field in schema]
+        arrays = [as_arrow(columns[field.name], field.type) for field in schema]
         lengths = {field.name: len(array) for field, array in zip(schema, arrays, strict=True)}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
@@ -393,9 +396,9 @@ class TableStream:
         return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    # by its buffers, since pa.array imports pandas, which takes half a second; and of a private copy: arrow
-    # would otherwise share the caller's memory until the flush
+def as_arrow(values: Any, kind: pa.DataType) -> pa.Array:
+    """A column of values of a kind, by its buffers: `pa.array` imports pandas, which takes half a second."""
+    # a private copy: arrow would otherwise share the caller's memory until the flush
     values = np.array(values)
     if pa.types.is_string(kind):
         texts = [text.encode() for text in values.tolist()]

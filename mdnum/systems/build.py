@@ -189,8 +189,9 @@ class Simulation:
             # padding borrows the last atom's species; its decision is no whatever its type
             species = self.species[np.append(table.order, table.order[-1])]
             kinds = pair_type(species[table.index], species[:atoms], len(self.system.species))
-            types = jnp.asarray(kinds.astype(np.uint8).reshape(shape))
-        return Tables(jnp.asarray(table.index.reshape(shape)), types, jnp.asarray(table.order))
+            types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
+        # not jnp.asarray, which compiles a program for every shape
+        return Tables(jax.device_put(table.index.reshape(shape)), types, jax.device_put(table.order))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,7 +76,7 @@ def run(
     try:
         result = roll_out(
             system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
-            progress=progress,
+            progress=_importing(progress, check, report),
         )  # fmt: skip
     except NumericalError as error:
         if error.folder is not None:
@@ -86,6 +88,21 @@ def run(
         _compare(folder, result)
         _beside_float64(folder, result)
     return finish(folder, report=report, result=result, progress=progress)
+
+
+def _importing(progress: Progress | None, check: bool, report: bool) -> Progress:
+    """Progress that imports what the end of a run needs beside its loop, most of which is not in Python."""
+    needed = ["mdnum.report.drawing"] * report + ["mdnum.references.energy_check"] * check
+    begun: list[Thread] = []
+
+    def told(step: int, steps: int, info: dict[str, Any]) -> None:
+        if not begun:
+            begun.append(Thread(target=lambda: [import_module(name) for name in needed]))
+            begun[0].start()
+        if progress is not None:
+            progress(step, steps, info)
+
+    return told
 
 
 def _compare(folder: RunFolder, result: RunResult) -> None:

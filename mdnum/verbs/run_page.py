@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mdnum.errors import FolderError
 from mdnum.report import analysis
 from mdnum.report.browse import Browse, Column, flipped
-from mdnum.report.drawing import FIRST, MUTED, SECOND, THIRD, envelope, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, curves, pairs, positive
@@ -198,6 +196,10 @@ def _energy(run: RunView) -> Iterator[Any]:
     smooth = not np.any(run.series["energy_jump"])
 
     def draw(figure: Canvas) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        from mdnum.report.drawing import FIRST, MUTED, SECOND, THIRD, legend, line
+
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         time = run.series["time"]
         if smooth:
@@ -246,6 +248,10 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
     series = run.series
 
     def draw(figure: Canvas) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        from mdnum.report.drawing import FIRST, MUTED, SECOND, THIRD, envelope, legend, line
+
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         # no decision came before the first step, so it has no flips
         time = series["time"][1:]
@@ -255,11 +261,11 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
                 above.fill_between(at, sign * low, sign * high, color=color, alpha=0.3, lw=0, step="mid")
                 above.step(at, sign * middle, color=color, lw=1.1, where="mid", label=name)
         above.axhline(0, color=MUTED, lw=0.6)
-        above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{abs(value):g}"))
+        above.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
         above.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         line(below, series["time"], series["pairs"].astype(float), THIRD)
         below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-        below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        below.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         above.set_ylabel("flips per step")
         below.set_ylabel("pairs inside")
         below.set_xlabel(f"time ({run.units.time})")
