@@ -7,6 +7,8 @@ half the smallest perpendicular width.
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -268,7 +270,7 @@ def neighbor_table(
     start = np.zeros(int(np.prod(bins)) + 1, np.int64)
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
-    table = np.empty((room, atoms), np.int32)
+    table = _table(room, atoms)
     most = _fill(
         np.ascontiguousarray(components[:, order]),
         np.asarray(cell.matrix, np.float64),
@@ -281,6 +283,26 @@ def neighbor_table(
         table,
     )
     return table, order, int(most)
+
+
+_used: list[np.ndarray] = []
+_using = threading.Lock()
+
+
+def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
+    """Memory for a table, aligned so that a CPU backend needs no copy; again that of one nobody holds.
+
+    Of a million atoms it is half a gigabyte, and memory that a process gets anew takes longer than a search.
+    """
+    size = 4 * room * atoms + 64
+    with _using:
+        # references: the list's and the argument's
+        free = [k for k in range(len(_used)) if sys.getrefcount(_used[k]) == 2]
+        fitting = [k for k in free if _used[k].nbytes == size]
+        memory = _used[fitting[0]] if fitting else np.empty(size, np.uint8)
+        _used[:] = [held for k, held in enumerate(_used) if k not in free] + [memory]
+        first = -memory.ctypes.data % 64
+        return memory[first : first + size - 64].view(np.int32).reshape(room, atoms)
 
 
 def _free_axis(cell: Cell, components, k: int):
