@@ -11,6 +11,8 @@ nothing that was known of the frame before helps. In one process and on one core
 Contenders take turns, so that a busy machine is busy for all of them, each through all of its frames. The
 table holds means over the frames (mdnum makes a list now and then, which belongs to the frames it serves) of
 the best turn by CPU time, after compilation. MDAnalysis works in float32: its flips are not quite the same.
+Then a file (xtc, the steps there and back again): what the whole command `mdnum flips` takes over reading it
+alone, by CPU time, and `NeighborFlips` in one process over two, by the clock, where there are two cores.
 Then memory over many frames, and frames of a million atoms (copies of the liquid side by side, in an order
 that knows nothing of space).
 
@@ -23,6 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -36,7 +39,9 @@ from _output import figure, parser, save, say, start, table
 OURS, SETS, MERGE = "mdnum", "MDAnalysis, sets", "vesin, sorted merge"
 EVERY, FAR = "every step", "every 100th step"
 ASKED_MS = {EVERY: 1.3, FAR: 9.0}
-ASKED_MILLION, ASKED_OVER_SETS = 5.0, 10.0
+ASKED_MILLION, ASKED_OVER_SETS, ASKED_OVER_READING, ASKED_TWO_CORES = 5.0, 10.0, 2.0, 1.8
+# Å of a unit of length, so that the file resolves what flips
+ANGSTROM = 3.4
 # frames that are not timed: compilation, and those before mdnum has made a list
 WARM = 3
 
@@ -193,6 +198,48 @@ def memory(length: float, frames: list[np.ndarray], total: int) -> list[dict[str
     return seen
 
 
+def file_costs(length: float, frames: list[np.ndarray], total: int, cores: set[int]) -> dict[str, float]:
+    """Seconds for a file of so many frames: reading it, the command (CPU), one process and two (clock)."""
+    import MDAnalysis
+
+    from mdnum.trajectories.analysis import NeighborFlips
+    from mdnum.trajectories.trajectory import open_trajectory
+    from mdnum.verbs.flips import flips
+
+    there_and_back, radius = frames + frames[-2:0:-1], R_CUT * ANGSTROM
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "liquid.xtc"
+        universe: Any = MDAnalysis.Universe.empty(len(frames[0]), trajectory=True)
+        with MDAnalysis.Writer(str(path), len(frames[0])) as file:
+            for at in range(total):
+                universe.atoms.positions = ANGSTROM * there_and_back[at % len(there_and_back)]
+                universe.dimensions = [ANGSTROM * length] * 3 + [90.0] * 3
+                file.write(universe.atoms)
+
+        def taken(work: Callable[[], object], clock: Callable[[], float]) -> float:
+            seconds = []
+            for _ in range(2):
+                begin = clock()
+                work()
+                seconds.append(clock() - begin)
+            return min(seconds)
+
+        made = iter(range(100))
+        found = {
+            "reading": taken(lambda: list(map(id, open_trajectory(path).frames())), time.process_time),
+            "command": taken(
+                lambda: flips(path, cutoffs=[radius], out=Path(folder) / f"{next(made)}"), time.process_time
+            ),
+        }
+        if len(cores) > 1:
+            os.sched_setaffinity(0, set(sorted(cores)[:2]))
+            for name, how in (("one", {}), ("two", {"backend": "multiprocessing", "n_workers": 2})):
+                asked = NeighborFlips(MDAnalysis.Universe(str(path), to_guess=()), radius)
+                found[name] = taken(lambda asked=asked, how=how: asked.run(**how), time.perf_counter)
+            os.sched_setaffinity(0, set(sorted(cores)[:1]))
+    return found
+
+
 def many(moved: Motion, name: str, chosen: list[np.ndarray], copies: tuple[int, int, int]) -> dict[str, Any]:
     """Seconds a frame of copies side by side, in a scattered order; none of the frames is left out."""
     from mdnum.trajectories.frame import Box, Frame
@@ -229,6 +276,16 @@ def verdicts(result: dict[str, Any]) -> Iterator[tuple[str, str, str, bool]]:
         )  # fmt: skip
         ratio = by_code[MERGE].cpu_ms / ours
         yield f"{MERGE} / mdnum, {name}", f"{ratio:.1f}", "> 1", ratio > 1
+    files = result["file"]
+    ratio = files["command"] / files["reading"]
+    yield (
+        "whole command / reading the file", f"{ratio:.1f}", f"<= {ASKED_OVER_READING:g}",
+        ratio <= ASKED_OVER_READING,
+    )  # fmt: skip
+    if "two" in files:
+        ratio = files["one"] / files["two"]
+        holds = ratio >= ASKED_TWO_CORES
+        yield "one process / two, by the clock", f"{ratio:.2f}", f">= {ASKED_TWO_CORES:g}", holds
     for row in result["many"]:
         worst = max(row["cpu_seconds"][1:])
         what = f"{row['atoms']:,} atoms, {row['frames']}, slowest frame"
@@ -269,6 +326,11 @@ def show(result: dict[str, Any]) -> None:
         ("frame", "resident MB"),
         ((f"{row['frame']:,}", f"{row['resident_mb']:.0f}") for row in result["memory"]),
     )
+    table(
+        "\nfile",
+        ("what", "s"),
+        ((name, f"{seconds:.2f}") for name, seconds in result["file"].items()),
+    )
     table("\nratios", ("what", "measured", "asked", "holds"), verdicts(result))
 
 
@@ -299,7 +361,9 @@ def _options() -> argparse.Namespace:
 def main() -> None:
     """Parse, measure, print and draw."""
     chosen = _options()
+    cores: set[int] = set()
     if hasattr(os, "sched_setaffinity"):
+        cores = os.sched_getaffinity(0)
         # before anything is imported that makes threads
         os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:1]))
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -314,6 +378,8 @@ def main() -> None:
     result: dict[str, Any] = {"speeds": []}
     for name, frames in ((EVERY, near), (FAR, far)):
         result["speeds"] += [asdict(row) for row in race(moved.length, name, frames, slow, turns)]
+    say("file")
+    result["file"] = file_costs(moved.length, near, 60 if chosen.quick else 800, cores)
     say("memory")
     result["memory"] = memory(moved.length, near, 60 if chosen.quick else 800)
     a, b, c = chosen.copies or ([2, 1, 1] if chosen.quick else [5, 5, 4])

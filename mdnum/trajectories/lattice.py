@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numba
@@ -32,10 +33,9 @@ _UNIT_ROUNDOFF = 2.0**-53
 _FLAT = 1e-10
 #: repeats of a box along one direction within the cutoff
 MOST_IMAGES = 500
-#: centers examined in one go where pairs are handed on: what is found fits into a core's cache
-BATCH = 1024
-#: what a search records: pairs inside; pairs near their threshold; all in reach, from the centers
-INSIDE, BAND, DIRECTED = 0, 1, 2
+#: what a search records: pairs inside; all in reach, from the centers
+#: (programs compiled and kept by modules that did not change hold these numbers)
+INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
@@ -240,6 +240,12 @@ class Participants:
         """Atoms on both sides: images of themselves can be their neighbors."""
         return self.centers & self.others
 
+    @cached_property
+    def kinds(self) -> list[Int[np.ndarray, "some"]]:
+        """Atoms of one species and on the same sides, for each there are; the rarest first."""
+        kind = 4 * self.species + 2 * self.centers + self.others
+        return sorted((np.flatnonzero(kind == one) for one in np.unique(kind)), key=len)
+
 
 @dataclass(frozen=True)
 class Placed:
@@ -253,7 +259,7 @@ class Placed:
 class SearchLimits(NamedTuple):
     """Squared distances that a search distinguishes, by species."""
 
-    kind: int  # `INSIDE`, `BAND` or `DIRECTED`
+    kind: int  # `INSIDE` or `DIRECTED`
     low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain
     high: Float[np.ndarray, "species species"]  # pairs further than this are not looked for
     largest: float  # of high
@@ -303,12 +309,6 @@ class Binned(NamedTuple):
     atoms: int  # most atoms, and most runs of bins, around a bin
     runs: int
 
-    def batches(self) -> list[tuple[int, int]]:
-        """Bins, about `BATCH` centers at a time."""
-        edges = np.searchsorted(self.center_start, np.arange(0, self.center_start[-1], BATCH), side="left")
-        edges = np.unique(np.concatenate([[0], edges, [len(self.center_start) - 1]]))
-        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
-
 
 def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     """Put atoms into bins, in which pairs within reach are to be found.
@@ -321,9 +321,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     if atoms and not lattice.periodic.all():
         extent = np.where(lattice.periodic, 0.0, np.ptp(positions @ lattice.inverse, axis=0))
     bins, away, step = grid_for(lattice, reach + placed.rounding, atoms, extent)
-    wrapped, home = np.empty((atoms, 3)), np.zeros((atoms, 3), np.int64)
-    bin_of = np.empty(atoms, np.int64)
-    _place(positions, lattice, bins, step, wrapped, home, bin_of)
+    wrapped, home, bin_of = wrap(positions, lattice, bins, step)
     if (away // bins * lattice.periodic).max() >= MOST_IMAGES - 1:
         raise InputError(
             f"a box of widths {np.round(lattice.widths, 6).tolist()} for pairs within {reach:g}",
@@ -370,8 +368,9 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 
 @numba.njit(cache=True, nogil=True)
-def _place(x, lattice, bins, step, wrapped, home, bin_of):
-    """Wrap every atom and name its bin."""
+def wrap(x, lattice, bins, step):
+    """Wrap every atom, and name the lattice vectors taken off and its bin."""
+    wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
         here = 0
@@ -395,6 +394,7 @@ def _place(x, lattice, bins, step, wrapped, home, bin_of):
                 home[i, k] = 0
             here = here * bins[k] + b
         bin_of[i] = here
+    return wrapped, home, bin_of
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,9 +12,6 @@ from jaxtyping import Bool, Float, Int
 
 from mdnum.trajectories.search import Changed
 
-# flips in a part, about
-_PART = 2048
-
 
 class Columns:
     """A table: equally long columns, the fields of a frozen dataclass in their order."""
@@ -114,7 +111,7 @@ class LedgerRows:
     def __init__(self, labels: Int[np.ndarray, "participants"], atoms: int):
         self.labels, self.atoms = labels, atoms
         # kept from frame to frame: pages that are new to a process can cost more than what is done in them
-        self._rows = np.empty((0, 7))
+        self._keys = np.empty((4, 0), np.int64)
 
     def flips(
         self,
@@ -126,102 +123,64 @@ class LedgerRows:
     ) -> FlipTable:
         """The rows of one frame from indices among the atoms that take part, and distances now and before."""
         count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
-        if len(self._rows) < count:
-            self._rows = np.empty((count + count // 8, 7))
-        # parts of the atoms, each of whose flips fit into a core's cache
-        shift = max(int(self.atoms).bit_length() - max(count // _PART, 1).bit_length(), 0)
-        start = np.zeros((max(self.atoms, 1) - 1 >> shift) + 2, np.int64)
-        _parted(changed, *distances, self.labels, ranks, shift, start, self._rows, thresholds)
-        *columns, ambiguous = _sorted(start, shift, self._rows, ranks, bound, count)
+        if self._keys.shape[1] < count:
+            self._keys = np.empty((4, count + count // 8), np.int64)
+        order = _ordered(changed, self.labels, self.atoms, ranks, thresholds.directed, self._keys)
+        *columns, ambiguous = _rows(changed, *distances, self.labels, order, thresholds, bound)
         columns = [np.full(count, frame), *columns, np.full(count, bound), ambiguous]
         return FlipTable(*columns)
 
 
 @numba.njit(cache=True, nogil=True)
-def _parted(changed, distance, before, labels, ranks, shift, start, rows, of):
-    """Rows (first, key, distance, before, margin, margin_before, entered), part by part of the first atoms.
-
-    Integers among them are small enough for float64. What belongs together is moved together: where there are
-    millions, a place in memory is dear, and its width is not.
-    """
-    i, j, directed = changed.i, changed.j, of.directed
-    for k in range(i.shape[0]):
-        one, other = labels[i[k]], labels[j[k]]
-        start[((one if directed else min(one, other)) >> shift) + 1] += 1
-    for part in range(1, start.shape[0]):
-        start[part] += start[part - 1]
-    cursor = start.copy()
-    for k in range(i.shape[0]):
-        a, yes = i[k], changed.entered[k]
-        one, other = labels[a], labels[j[k]]
-        if directed:
-            limit = of.last_in[a] if yes else of.first_out[a]
-            old_limit = of.old_first_out[a] if yes else of.old_last_in[a]
-        else:
+def _ordered(changed, labels, atoms, ranks, directed, room):
+    """Numbers of the flips, sorted by the file's numbers and rank: digit by digit, the last first."""
+    count, most, bits = changed.i.shape[0], atoms * atoms * ranks, 1
+    keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
+    for k in range(count):
+        one, other = labels[changed.i[k]], labels[changed.j[k]]
+        if not directed:
             one, other = min(one, other), max(one, other)
-            limit = of.radii[of.species[a], of.species[j[k]]]
-            old_limit = limit
-        part = one >> shift
-        at = cursor[part]
-        cursor[part] = at + 1
-        rows[at, 0], rows[at, 1] = one, other * ranks + changed.rank[k]
-        rows[at, 2], rows[at, 3] = distance[k], before[k]
-        rows[at, 4], rows[at, 5], rows[at, 6] = limit - distance[k], old_limit - before[k], yes
+        keys[k], numbers[k] = (one * atoms + other) * ranks + changed.rank[k], k
+    while most >> bits:
+        bits += 1
+    digits = (bits + 10) // 11
+    width = (bits + digits - 1) // digits
+    cursor, mask = np.empty((1 << width) + 1, np.int64), (1 << width) - 1
+    for digit in range(digits):
+        cursor[:] = 0
+        for k in range(count):
+            cursor[((keys[k] >> digit * width) & mask) + 1] += 1
+        for value in range(mask):
+            cursor[value + 1] += cursor[value]
+        for k in range(count):
+            value = (keys[k] >> digit * width) & mask
+            other_keys[cursor[value]], other_numbers[cursor[value]] = keys[k], numbers[k]
+            cursor[value] += 1
+        keys, numbers, other_keys, other_numbers = other_keys, other_numbers, keys, numbers
+    return numbers[:count]
 
 
 @numba.njit(cache=True, nogil=True)
-def _sorted(start, shift, rows, ranks, bound, count):
-    """The columns, in order: in each part a counting sort by the first atom, and then each atom's few."""
+def _rows(changed, distances, distances_before, labels, order, of, bound):
+    """The columns, in order."""
+    count = order.shape[0]
     i, j, rank = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
     distance, before = np.empty(count), np.empty(count)
     margin, margin_before = np.empty(count), np.empty(count)
     entered, ambiguous = np.empty(count, np.bool_), np.empty(count, np.bool_)
-    cursor = np.empty((1 << shift) + 1, np.int64)
-    most = 0
-    for part in range(start.shape[0] - 1):
-        most = max(most, start[part + 1] - start[part])
-    order = np.empty(most, np.int64)
-    for part in range(start.shape[0] - 1):
-        low, high, lowest = start[part], start[part + 1], part << shift
-        cursor[:] = 0
-        for k in range(low, high):
-            cursor[np.int64(rows[k, 0]) - lowest + 1] += 1
-        for a in range(1, cursor.shape[0]):
-            cursor[a] += cursor[a - 1]
-        for k in range(low, high):
-            a = np.int64(rows[k, 0]) - lowest
-            order[cursor[a]] = k
-            cursor[a] += 1
-        # a cursor now stands where the next atom begins
-        begin = 0
-        for a in range(cursor.shape[0] - 1):
-            end = cursor[a]
-            # Shell's sort: that of a card player for a few, and no worse than others for many
-            gap = 1
-            while 9 * gap < end - begin:
-                gap = 3 * gap + 1
-            while gap > 0:
-                for m in range(begin + gap, end):
-                    k, at = order[m], m
-                    key = rows[k, 1]
-                    while at >= begin + gap and rows[order[at - gap], 1] > key:
-                        order[at] = order[at - gap]
-                        at -= gap
-                    order[at] = k
-                gap //= 3
-            begin = end
-        for m in range(high - low):
-            k, at = order[m], low + m
-            key = np.int64(rows[k, 1])
-            i[at], j[at], rank[at] = np.int64(rows[k, 0]), key, 0
-            if ranks > 1:
-                j[at], rank[at] = key // ranks, key % ranks
-            distance[at], before[at], margin[at], margin_before[at] = (
-                rows[k, 2],
-                rows[k, 3],
-                rows[k, 4],
-                rows[k, 5],
-            )
-            entered[at] = rows[k, 6] != 0.0
-            ambiguous[at] = abs(rows[k, 4]) <= bound or abs(rows[k, 5]) <= bound
+    for at in range(count):
+        k = np.uint64(order[at])
+        a, b, yes = changed.i[k], changed.j[k], changed.entered[k]
+        one, other = labels[a], labels[b]
+        if of.directed:
+            limit = of.last_in[a] if yes else of.first_out[a]
+            old_limit = of.old_first_out[a] if yes else of.old_last_in[a]
+        else:
+            one, other = min(one, other), max(one, other)
+            limit = of.radii[of.species[a], of.species[b]]
+            old_limit = limit
+        i[at], j[at], rank[at], entered[at] = one, other, changed.rank[k], yes
+        distance[at], before[at] = distances[k], distances_before[k]
+        margin[at], margin_before[at] = limit - distance[at], old_limit - before[at]
+        ambiguous[at] = abs(margin[at]) <= bound or abs(margin_before[at]) <= bound
     return i, j, rank, entered, distance, before, margin, margin_before, ambiguous

@@ -34,7 +34,7 @@ from mdnum.trajectories.search import (
     rows_of,
     search,
 )
-from mdnum.trajectories.superset import Superset, displaced, examine, listed, skin_for
+from mdnum.trajectories.tiles import Tiles, tiles_of
 
 #: Indices of the atoms on either side of a pair; None for all.
 Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]
@@ -104,9 +104,9 @@ class Tracker:
         self._atoms = -1
         # how many were decided from the coordinates as stored last time, to make room for as many
         self._open = 0
-        self._list: Superset | None = None
+        self._list: Tiles | None = None
         # one that has served, whose memory the next can use
-        self._spare: Superset | None = None
+        self._spare: Tiles | None = None
         self._who: Participants
         self._box: Box | None = None
         self._last: Moment | None = None
@@ -257,34 +257,16 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """The flips that a list gives; None where none would be worth its making."""
-        who, radius, bound = self._who, self._who.radius, self.bound + now.rounding
-        horizon = HORIZON * radius
+        """The flips that tiles give; None where they cannot serve."""
+        who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
-        # what rounding adds to every distance
-        slack = 8.0 * max(before.rounding, now.rounding)
-
-        def advanced(held: Superset) -> bool:
-            """Whether a list serves once its odometer has been read."""
-            held.last = displaced(before, now, held.home, radius + 2.0 * held.skin)
-            held.gone += held.last + slack
-            return held.serves(now.lattice, radius, clear)
-
-        if self._list is not None and not advanced(self._list):
+        if self._list is not None and not self._list.serve(before, now, who.radius, clear):
             self._spare, self._list = self._list, None
         if self._list is None:
-            # made at the frame before, if it serves now and will for a while
-            pace = displaced(before, now, np.zeros((len(now.positions), 3), np.int64), 1.5 * radius)
-            skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
-            if not skin > 0:
-                return None
-            made, self._spare = listed(before, who, skin, self.pairs, self._spare), None
-            if not advanced(made):
-                return None
-            self._list = made
-        changed, self.near, smallest = examine(
-            self._list, now, who, bound=bound, horizon=horizon, guard=slack
-        )
+            self._list, self._spare = tiles_of(before, now, who, clear, self.pairs, self._spare), None
+        if self._list is None:
+            return None
+        changed, self.near, smallest = self._list.examine(now, bound=bound, horizon=horizon, pairs=self.pairs)
         self.pairs += 2 * int(changed.entered.sum()) - len(changed.entered)
         self.min_margin = smallest if smallest <= horizon else np.inf
         return self._table(before, now, changed)
