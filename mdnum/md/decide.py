@@ -327,24 +327,25 @@ class Changes(NamedTuple):
         """
         if known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
-        atoms = x.shape[1]
-        changed = before ^ bits
-        slot = jnp.arange(8, dtype=jnp.uint8)[None, :, None]
-        each = ((changed[:, None] >> slot) & jnp.uint8(1) == 1) & (jnp.arange(atoms) < tables.index)
+        changed, index = before ^ bits, tables.index.astype(jnp.int32)
+        slot, atom = jnp.arange(8, dtype=jnp.uint8)[None, :, None], jnp.arange(x.shape[1], dtype=jnp.int32)
+        each = ((changed[:, None] >> slot) & jnp.uint8(1) == 1) & (atom < index)
         both = jnp.sum(jnp.bitwise_count(changed), dtype=jnp.int64)
         found = jnp.sum(each, dtype=jnp.int64)
         (at,) = jnp.nonzero(each.reshape(-1), size=most, fill_value=0)
         word, k, first = jnp.unravel_index(at, each.shape)
-        second = tables.index[word, k, first]
+        second = index[word, k, first]
         inside = (bits[word, first] >> k.astype(jnp.uint8)) & jnp.uint8(1)
-        pairs = jnp.stack([jnp.broadcast_to(row, at.shape), first, second, inside], axis=1)
+        rows = jnp.full(most, row.astype(jnp.int32))
+        pairs = jnp.stack([column.astype(jnp.int32) for column in (rows, first, second, inside)], axis=1)
         ends = jnp.concatenate([x[:, first], x[:, second], v[:, first], v[:, second]]).T
         start = (self.count[0], jnp.zeros((), jnp.int64))
-        count = self.count + jnp.stack([jnp.where(found > most, len(self.pairs) + found, found), both])
+        # more than there may be is more than there is room for
+        seen = jnp.where(found > most, found + len(self.pairs), found)
         return Changes(
-            lax.dynamic_update_slice(self.pairs, pairs.astype(jnp.int32), start),
+            lax.dynamic_update_slice(self.pairs, pairs, start),
             lax.dynamic_update_slice(self.ends, ends.astype(self.ends.dtype), start),
-            count,
+            self.count + jnp.stack([seen, both]),
         )
 
     def _noted_by_host(self, before, bits, tables: Tables, x, v, row) -> Changes:

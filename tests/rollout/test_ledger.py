@@ -22,10 +22,12 @@ from rollout.harness import (
     write_system,
 )
 
+from mdnum.md import decide, foreign
 from mdnum.md.neighbors import VerletList
 from mdnum.numerics import Ledger
 from mdnum.rollout.engine import _MOST_ROWS, _RECORD_BYTES, Engine
 from mdnum.rollout.epoch import EpochRecord
+from mdnum.rollout.flips import PairRecorder, flip_columns
 from mdnum.rollout.summary import EnergyBudget
 from mdnum.systems import load
 from mdnum.systems.build import build
@@ -308,3 +310,53 @@ def test_no_steps_at_all_is_one_evaluation(path, tmp_path):
     assert series["step"].tolist() == [0]
     assert len(folder.read("flips")["step"]) == 0
     assert result.summary["status"] == "complete" and result.summary["energy_budget_closes"]
+
+
+def recorded(simulation, rows, steps=60, most=None):
+    """Ledger, pairs inside and last positions of a run, and the room that a step has had in the end."""
+    engine, recorder = Engine(simulation, steps, rows=rows), PairRecorder(simulation)
+    if most:
+        engine._room_for_changes(most)
+    parts, counts = [], []
+    for segment in engine.segments():
+        counts.append(recorder.counts(segment))
+        parts.append(recorder.flips(segment))
+        last = segment.unsorted("x", segment.rows - 1)
+    columns = [flip_columns(part) for part in parts]
+    ledger = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
+    return ledger, np.concatenate(counts), last, engine.program.most
+
+
+@pytest.mark.parametrize("name", ["fluid", "binary/kob-andersen-1000", "silicon/stillinger-weber-512"])
+@pytest.mark.parametrize("on", ["host", "device"])
+def test_changes_noted_in_the_loop_are_those_of_its_rows(fluid, monkeypatch, name, on):
+    system = shaken(fluid, 3, 2.5) if name == "fluid" else load(name)
+    if on == "device":
+        # as where there is no CPU: XLA finds the changes, and its own loop makes the forces
+        monkeypatch.setattr(foreign, "known", lambda: False)
+        monkeypatch.setattr(decide, "known", lambda: False)
+    simulation = build(system)
+    jax.clear_caches()
+    try:
+        with_rows, few, plenty = (
+            recorded(simulation, rows, most=most) for rows, most in ((True, None), (False, 2), (False, None))
+        )
+    finally:
+        jax.clear_caches()
+    assert len(with_rows[0]["i"]) > 30
+    for one in (few, plenty):
+        for name, values in with_rows[0].items():
+            np.testing.assert_array_equal(one[0][name], values)
+        assert np.array_equal(one[1], with_rows[1]) and np.array_equal(one[2], with_rows[2])
+    # steps with more changes than there was room for were made again
+    assert few[3] > 2
+
+
+def test_rows_are_made_again_where_somebody_asks(fluid):
+    simulation = build(shaken(fluid, 3, 2.0))
+    steps = zip(Engine(simulation, 60, rows=False).segments(), Engine(simulation, 60).segments(), strict=True)
+    for lean, kept in steps:
+        assert lean.record.x.size == 0 and lean.rows == kept.rows
+        for name in ("x", "v", "images", "bits", "potential"):
+            assert np.array_equal(lean.rows_of(name), kept.rows_of(name))
+        assert np.array_equal(lean.unsorted("v", 1), kept.unsorted("v", 1))
