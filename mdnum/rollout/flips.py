@@ -368,7 +368,28 @@ def pair_keys(
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
     """Sorted keys of the pairs inside."""
-    return pair_keys(*table.decided(bits), simulation.atoms)
+    keys = np.empty(count_set(bits), np.int64)
+    return keys[: _write_keys(bits, table.index, table.order, np.argsort(table.order), keys)].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _write_keys(bits, index, order, place, keys):
+    """Keys atom after atom, each with its neighbors in order; returns how many there are."""
+    atoms, at = order.shape[0], 0
+    for i in range(atoms):
+        begin, c = at, place[i]
+        for w in range(bits.shape[0]):
+            byte = bits[w, c]
+            for k in range(8):
+                if (byte >> k) & 1 and order[index[8 * w + k, c]] > i:
+                    key = i * atoms + order[index[8 * w + k, c]]
+                    q = at
+                    while q > begin and keys[q - 1] > key:
+                        keys[q] = keys[q - 1]
+                        q -= 1
+                    keys[q] = key
+                    at += 1
+    return at
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
