@@ -139,12 +139,18 @@ class System:
     @property
     def species(self) -> tuple[str, ...]:
         """Chemical symbols present, sorted."""
-        return tuple(sorted(set(self.atoms.get_chemical_symbols())))
+        from ase.data import chemical_symbols
+
+        return tuple(sorted(chemical_symbols[number] for number in np.unique(self.atoms.numbers)))
 
     @property
     def species_index(self) -> Int64[np.ndarray, " atoms"]:
         """Each atom's place in species."""
-        return np.searchsorted(np.array(self.species), np.array(self.atoms.get_chemical_symbols()))
+        from ase.data import atomic_numbers, chemical_symbols
+
+        place = np.zeros(len(chemical_symbols), np.int64)
+        place[[atomic_numbers[symbol] for symbol in self.species]] = np.arange(len(self.species))
+        return place[self.atoms.numbers]
 
     @property
     def velocities(self) -> Float64[np.ndarray, "atoms 3"] | None:
