@@ -282,7 +282,8 @@ class PairRecorder:
             last = segment.rows_of("bits")[-1] if segment.held is None else segment.held
             self._held_segment, self._held_keys = (table, np.array(last)), None
             self._held_positions = segment.unsorted("x", segment.rows - 1)
-        labels = np.sort(table.order[pairs[:, 1:3]], axis=1)
+        i, j = table.order[pairs[:, 1]], table.order[pairs[:, 2]]
+        labels = np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)
         order = sort_rows(pairs[:, 0], labels)
         return self._ledger(segment, ends, order, pairs[order, 0], pairs[order, 3], labels[order])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import jax
 import numpy as np
 import oracles
 import pytest
@@ -171,3 +172,23 @@ def test_a_radius_beyond_half_the_box_is_refused_with_what_would_fit():
     with pytest.raises(InputError):
         check_radius(Cell.create([[7.0, 0, 0], [5.0, 5.0, 0], [0, 0, 9.0]]), 3.0, 0.0)
     check_radius(Cell.create([1.0, 9.0, 9.0], (False, True, True)), 3.0, 0.5)
+
+
+def test_a_table_takes_the_memory_of_one_that_nobody_holds():
+    rng, box = np.random.default_rng(0), Cell.create(np.eye(3) * 9.0, True)
+
+    def search():
+        return neighbor_table(rng.uniform(0, 9, (300, 3)), box, 2.0, 64)[0]
+
+    one, other = search(), search()
+    kept = other.copy()
+    assert one.ctypes.data % 64 == other.ctypes.data % 64 == 0
+    # as a list does that is cut to its size, or a device that reads it in place
+    part, place = one[:32], one.ctypes.data
+    on_device = jax.device_put(other)
+    del one, other
+    third = search()
+    assert not np.shares_memory(third, part) and np.array_equal(on_device, kept)
+    del part
+    assert search().ctypes.data == place
+    assert np.array_equal(on_device, kept)
