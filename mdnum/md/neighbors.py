@@ -29,6 +29,9 @@ _TOGETHER = 16
 # unlisted pair was at least r_list apart
 _SAFETY = 1.0 + 1e-12
 
+# along an axis, before a dilute system gets fewer: a radius may be many orders smaller than the box
+_MOST_BINS = 1e9
+
 
 @numba.njit(cache=True, nogil=True)
 def _bin_atoms(fractional, bins, bin_of, start, order):
@@ -225,7 +228,7 @@ def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
     for k in range(3):
         width = fractional_extent[k]
         # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
-        fine = int(2 * width / (r_list * _SAFETY))
+        fine = int(min(2 * width / (r_list * _SAFETY), _MOST_BINS))
         if fine >= 5:
             bins[k], reach[k] = fine, 2
         # fewer: one bin along this axis, every atom meets every atom once
