@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, known, pointer, words_at
+from mdnum.md.foreign import asked_to_run, buffer, carray, known, pointer, registered, words_at
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
@@ -359,25 +359,13 @@ class Changes(NamedTuple):
 def _noting() -> str:
     """The name by which XLA knows `_note`."""
     made = numba.cfunc(numba.types.intp(numba.types.intp), cache=True)(_note)
-    _ALIVE.append(made)
-    name = "mdnum_changes"
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(made.ctypes), platform="cpu")
-    return name
-
-
-#: What XLA calls must outlive every program.
-_ALIVE: list[Any] = []
+    return registered("mdnum_changes", made.ctypes, made)
 
 
 def _note(frame):
     """`Changes.noted`; 0 for no error."""
-    if asked_to_run(frame):
-        _compare(frame)
-    return 0
-
-
-@numba.njit(cache=True, nogil=True)
-def _compare(frame):
+    if not asked_to_run(frame):
+        return 0
     operands, results = words_at(words_at(frame)[9]), words_at(words_at(frame)[14])
     pairs_at, room, _ = buffer(results, 0)
     ends_at, _, _ = buffer(results, 1)
@@ -410,7 +398,7 @@ def _compare(frame):
         now = bits[chunk] if chunk < size // 8 else last[0]
         changed = now ^ (before[chunk] if chunk < size // 8 else ahead[0])
         while changed:
-            bit = lowest_bit(changed)
+            bit = np.int64(lowest_bit(changed))
             changed &= changed - np.uint64(1)
             place = 8 * chunk + (bit >> 3)
             while place >= begin + atoms:
@@ -429,3 +417,4 @@ def _compare(frame):
             ends[at, axis], ends[at, 3 + axis] = x[axis, first], x[axis, second]
             ends[at, 6 + axis], ends[at, 9 + axis] = v[axis, first], v[axis, second]
     count[0], count[1] = found, both
+    return 0

@@ -29,6 +29,17 @@ def known() -> bool:
     return version == VERSION and jax.default_backend() == "cpu" and np.intp().itemsize == 8
 
 
+#: What XLA calls must outlive every program.
+ALIVE: list[Any] = []
+
+
+def registered(name: str, function: Any, *held: Any) -> str:
+    """A name by which XLA knows a C function on a CPU, which is kept with what it needs."""
+    ALIVE.extend([function, *held])
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
+    return name
+
+
 carray: Any = numba.carray  # pyright: ignore
 _intrinsic: Any = intrinsic
 

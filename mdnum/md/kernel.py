@@ -28,7 +28,19 @@ from jaxtyping import Array, Float, UInt8
 from numba import types
 
 from mdnum.md.decide import Decisions, Tables
-from mdnum.md.foreign import added, asked_to_run, buffer, call, carray, free, malloc, pointer, words_at
+from mdnum.md.foreign import (
+    ALIVE,
+    added,
+    asked_to_run,
+    buffer,
+    call,
+    carray,
+    free,
+    malloc,
+    pointer,
+    registered,
+    words_at,
+)
 from mdnum.numerics.exact import bound, interpreted
 
 # atoms of a block, which is what a thread takes at a time; full vectors
@@ -415,13 +427,7 @@ def _registered(source: str) -> str:
     engine = llvm.create_mcjit_compiler(module, machine)
     engine.finalize_object()
     function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("called"))
-    _ALIVE.append((engine, function))
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
-    return name
-
-
-#: What XLA calls must outlive every program.
-_ALIVE: list[Any] = []
+    return registered(name, function, engine)
 
 
 # --- the loop over a list, which calls the other ----------------------------------------------------------
@@ -577,6 +583,6 @@ def _driver() -> tuple[int, int]:
         numba.cfunc(types.intp(*[types.intp] * count), cache=True)(function)
         for function, count in ((_over_blocks, 3), (_help, 1))
     ]
-    _ALIVE.extend(made)
+    ALIVE.extend(made)
     loop, task = (int(one.address or 0) for one in made)
     return loop, task

@@ -8,6 +8,9 @@ from typing import Any
 import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from mdnum.errors import InputError
 
@@ -182,16 +185,18 @@ def _counted(column, low, size, order):
 # A step of a list with W*8 slots for each of C columns leaves a (W, C) array of bytes; slot k of column c is
 # bit k % 8 of byte [k // 8, c].
 
-# which bit of a word is its only one, by the six bits that this factor moves to the front (de Bruijn)
-_FACTOR = np.uint64(0x03F79D71B4CB0A89)
-_ONLY_BIT = np.empty(64, np.int64)
-_ONLY_BIT[[(0x03F79D71B4CB0A89 << bit & 2**64 - 1) >> 58 for bit in range(64)]] = np.arange(64)
+# typed as Any: numba's decorator hides the signature
+_intrinsic: Any = intrinsic
 
 
-@numba.njit(cache=True, nogil=True)
-def lowest_bit(word):
-    """Which is the lowest bit of 64 that is set."""
-    return _ONLY_BIT[((word ^ (word & (word - np.uint64(1)))) * _FACTOR) >> np.uint64(58)]
+@_intrinsic
+def lowest_bit(typingctx: Any, word: Any) -> Any:
+    """Number of the lowest of 64 bits that is set, unsigned; there is one."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), generate
 
 
 @numba.njit(cache=True, nogil=True)
@@ -205,7 +210,7 @@ def _scan(before, rows, columns, row, slot, column, values):
             now = rows[r, w]
             changed = now ^ (rows[r - 1, w] if r else before[w])
             while changed:
-                bit = lowest_bit(changed)
+                bit = np.int64(lowest_bit(changed))
                 changed &= changed - np.uint64(1)
                 if at < room:
                     place = 8 * w + (bit >> 3)

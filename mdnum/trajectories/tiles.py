@@ -23,6 +23,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from mdnum.numerics.events import lowest_bit
 from mdnum.trajectories.lattice import Participants, Placed, wrap
 from mdnum.trajectories.search import Changed, exact_square
 
@@ -553,16 +554,6 @@ def _lanes(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
     return types.uintp(types.uintp, types.uintp, types.float32, types.float32), generate
 
 
-@_intrinsic
-def _lowest(typingctx: Any, bits: Any) -> Any:
-    """Number of the lowest bit that is set; there is one."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.uintp(types.uintp), generate
-
-
 @numba.njit(cache=True, nogil=True)
 def _box(columns, boxes):
     """The box around each cluster, leaving out empty slots."""
@@ -597,7 +588,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         # of a cluster with itself each pair is met once
         alone, held = i == j and code == np.uintp(_NONE), np.uintp(0)
         while left != np.uintp(0):
-            row = _lowest(left)
+            row = lowest_bit(left)
             left &= left - np.uintp(1)
             bits = _lanes(scratch_at + np.uintp(4) * row, j_at, low, high)
             if alone:
@@ -621,7 +612,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
             if changed != np.uintp(0):
                 inside[tile, row] = now
                 while limits.record and changed != np.uintp(0):
-                    lane = _lowest(changed)
+                    lane = lowest_bit(changed)
                     changed &= changed - np.uintp(1)
                     place = np.uintp(count)
                     flips.i[place] = order[np.uintp(CLUSTER) * i + row]
@@ -641,7 +632,7 @@ def _settled(inside, doubtful, i, slot, code, numbers, limits):
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):
-        lane = _lowest(doubtful)
+        lane = lowest_bit(doubtful)
         doubtful &= doubtful - np.uintp(1)
         real = exact_square(numbers.positions, numbers.home, i, order[slot + lane], n0, n1, n2, vectors)
         margin = abs(limits.radius - np.sqrt(real))
