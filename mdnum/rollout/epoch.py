@@ -146,6 +146,7 @@ class EpochRecord(NamedTuple):
         bits: decisions, shape (rows, words, atoms), or none.
         potential, kinetic, virial, heat: energies, shape (rows,).
         nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,).
+        inside: how many decisions are yes, without rows; shape (rows,).
         changes: of decisions from row to row, instead of rows.
     """
 
@@ -159,10 +160,11 @@ class EpochRecord(NamedTuple):
     heat: Float[Array, "rows"]
     nearest: Float[Array, "rows"]
     moved: Float[Array, "rows"]
+    inside: Float[Array, "rows"]
     changes: Changes | None = None
 
 
-_NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved")
+_NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved", "inside")
 
 
 class EpochOutcome(NamedTuple):
@@ -302,6 +304,8 @@ def run_epoch(
             if program.rows:
                 values |= {"x": x, "v": v, "images": images, "bits": d.bits}
             else:
+                # counted, not added up from the changes: it is what they are held against
+                values["inside"] = jnp.sum(jnp.bitwise_count(d.bits), dtype=jnp.int64)
                 changes = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
                 record, earlier = record._replace(changes=changes), d.bits
         record = write_row(record, row, **values)

@@ -197,7 +197,10 @@ class PairRecorder:
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
         """Number of pairs inside; a full list holds each twice."""
-        both = int(count_set(bits))
+        return self._once(int(count_set(bits)))
+
+    def _once(self, both: int) -> int:
+        """Pairs, of which both ends were counted."""
         if both % 2:
             raise MdnumError(
                 "a pair was decided differently from its two ends", remedy="Report this as a bug"
@@ -206,13 +209,9 @@ class PairRecorder:
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs inside at every step of a segment."""
-        changes = segment.record.changes
-        if changes is None:
+        if segment.record.changes is None:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
-        assert segment.before is not None
-        row, _, _, inside = _noted(segment, changes)[0].T
-        by_row = np.bincount(row, weights=2 * inside - 1, minlength=segment.rows)
-        return self.inside(segment.before) + np.cumsum(by_row).astype(np.int64)
+        return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
         """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
