@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, known, pointer, registered, words_at
+from mdnum.md.foreign import asked_to_run, buffer, carray, known, peek, pointer, poke, registered
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
@@ -366,7 +366,7 @@ def _note(frame):
     """`Changes.noted`; 0 for no error."""
     if not asked_to_run(frame):
         return 0
-    operands, results = words_at(words_at(frame)[9]), words_at(words_at(frame)[14])
+    operands, results = peek(frame, 9), peek(frame, 14)
     pairs_at, room, _ = buffer(results, 0)
     ends_at, _, _ = buffer(results, 1)
     count_at, _, _ = buffer(results, 2)
@@ -378,15 +378,13 @@ def _note(frame):
     row_at, _, _ = buffer(operands, 8)
     pairs = carray(pointer(pairs_at), (room, 4), np.int32)
     ends = carray(pointer(ends_at), (room, 12), np.float64)
-    count = words_at(count_at)
     size = words * atoms
     before = carray(pointer(before_at), (size // 8,), np.uint64)
     bits = carray(pointer(bits_at), (size // 8,), np.uint64)
     index = carray(pointer(index_at), (8 * size,), np.int32)
     x = carray(pointer(x_at), (3, atoms), np.float64)
     v = carray(pointer(v_at), (3, atoms), np.float64)
-    row = words_at(row_at)[0]
-    begun, both = count[0], count[1]
+    row, begun, both = peek(row_at, 0), peek(count_at, 0), peek(count_at, 1)
     found = begun
     # what is left of eight bytes at the end
     ahead, last = np.zeros(1, np.uint64), np.zeros(1, np.uint64)
@@ -416,5 +414,6 @@ def _note(frame):
         for axis in range(3):
             ends[at, axis], ends[at, 3 + axis] = x[axis, first], x[axis, second]
             ends[at, 6 + axis], ends[at, 9 + axis] = v[axis, first], v[axis, second]
-    count[0], count[1] = found, both
+    poke(count_at, 0, found)
+    poke(count_at, 1, both)
     return 0
