@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -134,7 +134,7 @@ class PairDecider:
 
     def values(self) -> jax.Array:
         """Threshold values as an array of the decision's dtype, shape (types,)."""
-        return jnp.asarray([t.value for t in self.thresholds], np.dtype(self.dtype))
+        return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
         """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
@@ -287,6 +287,11 @@ def displacements(components, cell: Cell, j):
 # --- what changed from one pass to the next ---------------------------------------------------------------
 
 
+def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
+    """Zeros on the device, without the program that jnp's would compile for each shape."""
+    return jax.device_put(np.zeros(shape, dtype))
+
+
 class Changes(NamedTuple):
     """Decisions that changed, step after step, each seen from the atom that is sorted first.
 
@@ -303,7 +308,7 @@ class Changes(NamedTuple):
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
         """Room for so many."""
-        return cls(jnp.zeros((room, 4), jnp.int32), jnp.zeros((room, 12), dtype), jnp.zeros(2, jnp.int64))
+        return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(2, np.int64))
 
     def emptied(self) -> Changes:
         """The same room without any."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.decide import Tables
+from mdnum.md.decide import Tables, zeros
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -152,16 +152,16 @@ def first_state(simulation: Simulation) -> Start:
     positions, velocities = simulation.first_frame()
     wrapped, images = wrap_positions(simulation.cell, positions)
     wrapped = wrapped.astype(dtype)
-    x = jnp.asarray(wrapped.T)
-    bath = jnp.zeros((3, simulation.atoms), jnp.int64) if simulation.has_bath else None
+    # of numpy arrays: each of jnp's compiles a program
+    x = jax.device_put(wrapped.T.copy())
     state = EpochState(
-        jnp.zeros((), jnp.int64),
+        zeros((), np.int64),
         x,
-        jnp.asarray(velocities.T, dtype),
-        jnp.asarray(images.T, jnp.int32),
+        jax.device_put(velocities.T.astype(dtype, order="C")),
+        jax.device_put(images.T.astype(np.int32, order="C")),
         x,
-        jnp.zeros((), jnp.float64),
-        bath,
+        zeros((), np.float64),
+        zeros((3, simulation.atoms), np.int64) if simulation.has_bath else None,
     )
     return Start(state, np.asarray(wrapped, np.float64))
 
@@ -222,8 +222,8 @@ class Engine:
             simulation.force,
             simulation.propagator,
             simulation.cell.astype(np.float64),
-            jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2, jnp.float64),
+            jax.device_put(simulation.masses),
+            jax.device_put(np.float64(rule.skin / 2)),
             rule.every,
             rule.delay,
             rule.check,
@@ -300,7 +300,7 @@ class Engine:
     def _listed(self, start: Start) -> _Listed:
         """The list of a start, searched for."""
         table = self.verlet.build(start.reference, self.simulation.cell)
-        home = jnp.asarray(start.reference.T, self.simulation.policy.dtype("state"))
+        home = jax.device_put(start.reference.T.astype(self.simulation.policy.dtype("state"), order="C"))
         return _Listed(table, self.simulation.tables(table), home)
 
     def _advance(self, listed: _Listed, start: Start, held, turn: int):
@@ -313,16 +313,16 @@ class Engine:
         told = self._pinned(listed.table, int(start.state.step), words) or (None, None)
         look_back, earlier = held is None, None
         if not self.rows:
-            earlier = jnp.zeros((words, self.simulation.atoms), jnp.uint8) if look_back else jnp.asarray(held)
+            earlier = np.zeros((words, self.simulation.atoms), np.uint8) if look_back else held
         return run_epoch(
             self.leaves,
             self.structure,
             listed.tables,
             start.state,
             listed.home,
-            jnp.asarray(start.built, jnp.int64),
-            jnp.asarray(self.last, jnp.int64),
-            jnp.asarray(look_back),
+            np.int64(start.built),
+            np.int64(self.last),
+            np.bool_(look_back),
             self.take(turn, words),
             *told,
             earlier,
@@ -335,7 +335,7 @@ class Engine:
         outcome, record = begun
         rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         changes = record.changes
-        while changes is not None and finite and int(changes.count[0]) > len(changes.pairs):
+        while changes is not None and finite and np.asarray(changes.count)[0] > len(changes.pairs):
             # a step had more changes than there was room for
             self._room_for_changes(4 * self.program.most)
             outcome, record = self._advance(listed, start, held, turn)
