@@ -16,6 +16,7 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import count
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -48,6 +49,8 @@ from mdnum.numerics.exact import bound, interpreted
 _BLOCK = 2048
 # atoms of a vector; a processor with shorter ones takes several
 _WIDE = 8
+# a loop is made once, whichever thread asks
+_ONE = Lock()
 
 
 class PairSums(NamedTuple):
@@ -98,7 +101,9 @@ def over_pairs(
         jax.ShapeDtypeStruct((words if margins else 0, atoms), np.uint8),
         jax.ShapeDtypeStruct((1,), np.float64),
     ]
-    call = jax.ffi.ffi_call(_registered(written.loop), shapes, vmap_method="sequential")
+    with _ONE:
+        name = _registered(written.loop)
+    call = jax.ffi.ffi_call(name, shapes, vmap_method="sequential")
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
     bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
     kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,7 +110,7 @@ class EnergyReport:
 
 def check_energy(
     subject: Any,
-    frames: Mapping[str, Atoms] | Sequence[Atoms] | None = None,
+    frames: Mapping[str, Atoms] | Sequence[Atoms] | Iterator[tuple[str, Atoms]] | None = None,
     *,
     judge: Reference | None = None,
 ) -> EnergyReport:
@@ -118,8 +118,8 @@ def check_energy(
 
     Args:
         subject: a `System`, or a `Simulation` built from one.
-        frames: positions and cells to compare at, by name or in order; default the initial frame and the
-            one after some steps, which a crystal needs to have forces at all.
+        frames: positions and cells to compare at, by name or in order, or names and frames as they come;
+            default the initial frame and one some steps later, which a crystal needs to have forces at all.
         judge: instead of the reference chosen by `ase_models.reference`.
 
     Of more than `SAMPLED` atoms with a pair potential, energies and forces of a few hundred are compared, at
@@ -137,7 +137,7 @@ def check_energy(
     calculator, other = judge.make(), third.make() if third else None
     compared: list[FrameComparison] = []
     sampled: set[int] = set()
-    for seed, (name, atoms) in enumerate(named.items()):
+    for seed, (name, atoms) in enumerate(named):
         sample = system.spec.cutoff is not None and len(atoms) > SAMPLED
         whole, mine = _evaluated(atoms, simulation, stress=not sample)
         if not sample:
@@ -167,11 +167,13 @@ def _places(system: System) -> str:
     return max(map(str, map(carrier, (precision.state, precision.decision))), key=unit_roundoff)
 
 
-def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any) -> dict[str, Atoms]:
+def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
+    if isinstance(frames, Iterator):
+        return frames
     if isinstance(frames, Mapping):
-        return dict(frames)
+        return frames.items()
     if frames is not None:
-        return {f"frame {number}": atoms for number, atoms in enumerate(frames)}
+        return ((f"frame {number}", atoms) for number, atoms in enumerate(frames))
     system: System = simulation.system
     steps = min(SOME_STEPS, system.spec.dynamics.steps)
     positions = simulation.positions
@@ -179,7 +181,7 @@ def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any
         pass
     later = system.atoms.copy()
     later.set_positions(positions)
-    return {"initial": system.atoms, f"step {steps}": later}
+    return ("initial", system.atoms), (f"step {steps}", later)
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
@@ -466,8 +468,8 @@ def neighborhoods(
     """Groups of atoms at random places, each with every atom within reach of one of them, as a free cluster.
 
     What a pair potential of that reach gives the chosen atoms in the cluster is what it gives them in the
-    whole system, so a difference there is one of the whole. Found by a tree over the atoms and their images,
-    which shares nothing with mdnum's cell lists.
+    whole system, so a difference there is one of the whole. Found by distance among the atoms and their
+    images, which shares nothing with mdnum's cell lists.
 
     Args:
         atoms: the whole, of any cell; coordinates may lie outside of it.
@@ -478,19 +480,19 @@ def neighborhoods(
     Yields:
         (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
     """
-    from scipy.spatial import KDTree
-
     x, origin = _with_images(atoms, reach)
-    tree = KDTree(x)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
-    reach = reach * (1 + 1e-9)
+    limit = (reach * (1 + 1e-9)) ** 2
     rng = np.random.default_rng(seed)
     numbers = atoms.numbers
     for center in rng.choice(len(atoms), size=min(places, len(atoms)), replace=False):
         # the first rows of x are the atoms themselves
-        near = np.array(tree.query_ball_point(x[center], reach))
-        chosen = near[np.argsort(((x[near] - x[center]) ** 2).sum(axis=1), kind="stable")[:count]]
-        around = np.concatenate([np.array(rows) for rows in tree.query_ball_point(x[chosen], reach)])
+        square = ((x - x[center]) ** 2).sum(axis=1)
+        near = np.flatnonzero(square <= limit)
+        chosen = near[np.argsort(square[near], kind="stable")[:count]]
+        there = np.flatnonzero(square <= 4.001 * limit)
+        apart = ((x[there][:, None] - x[chosen]) ** 2).sum(axis=2)
+        around = there[(apart <= limit).any(axis=1)]
         rows = np.concatenate([chosen, np.setdiff1d(around, chosen)])
         yield Atoms(numbers=numbers[origin[rows]], positions=x[rows]), origin[chosen]
 

@@ -33,6 +33,7 @@ from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
 
 Progress = Callable[[int, int, dict[str, Any]], None]
+Shown = Callable[[Simulation, np.ndarray], None]
 
 # the budget is checked this often; each check evaluates the whole system once more, which takes a large one
 # as long as several steps: there the steps in between are at least as many as these
@@ -88,6 +89,7 @@ class Rollout:
         save_every: a trajectory frame every so many steps; 0 for none.
         progress: called with step, steps and a dictionary of figures.
         began: time.perf_counter() at the start, for the time to the first step.
+        shown: called with the simulation and the first and the last positions, as soon as there are any.
     """
 
     simulation: Simulation
@@ -96,6 +98,7 @@ class Rollout:
     save_every: int
     progress: Progress | None = None
     began: float = field(default_factory=time.perf_counter)
+    shown: Shown | None = None
 
     def __post_init__(self):
         self.recorder = PairRecorder(self.simulation)
@@ -132,6 +135,7 @@ class Rollout:
             # from here on a run that is stopped can be resumed
             self.folder.checkpoint(self._to_dict(engine.start), force=True)
         self._say("compile", int(engine.start.state.step))
+        self._show(engine.start.reference if self.done.first is None else self.done.first)
         loop_began: float | None = None
         counted = 0
         for segment in engine.segments():
@@ -157,12 +161,17 @@ class Rollout:
         summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
+        self._show(self.done.last)
         # after the checkpoint: a run that is continued goes on with this list, and drops the row
         if (row := self.done.health.last_row()) is not None:
             self.folder.append("epochs", row)
         self.folder.finalize()
         self.folder.write_summary(summary)
         return summary
+
+    def _show(self, positions: Any) -> None:
+        if self.shown is not None:
+            self.shown(self.simulation, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
         """Whether rows of the record are asked for so often that they are better kept."""
@@ -303,6 +312,7 @@ def run(
     overrides: Mapping[str, Any] | None = None,
     resume: str | Path | None = None,
     progress: Progress | None = None,
+    shown: Shown | None = None,
 ) -> RunResult:
     """Simulate a system and record every flip into a run folder.
 
@@ -314,6 +324,8 @@ def run(
         overrides: dotted keys to values, as for `mdnum.systems.load`.
         resume: continue the run in this folder; bit for bit what it would have been without the stop.
         progress: called now and then with step, steps and a dictionary of figures.
+        shown: called with the simulation and the first and the last positions, shape (atoms, 3), wrapped,
+            length, as soon as there are any; not where the run in the folder has nothing left to do.
 
     Raises:
         InputError: the system cannot be run. FolderError: the folder cannot be used.
@@ -336,6 +348,7 @@ def run(
     else:
         loaded = load(system, overrides, world="md")
         rollout = _fresh(loaded, out, steps, save_every, progress, began)
+    rollout.shown = shown
     try:
         summary = rollout.run()
     except BaseException:

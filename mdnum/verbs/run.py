@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib import import_module
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from threading import Thread
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,11 @@ from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, page
 
 if TYPE_CHECKING:
+    from ase import Atoms
+
+    from mdnum.references.energy_check import EnergyReport
     from mdnum.rollout.run import RunResult
+    from mdnum.systems.build import Simulation
     from mdnum.systems.load import System
 
 #: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
@@ -73,48 +77,62 @@ def run(
         raise InputError(
             f"is the folder of `mdnum {folder.verb}`, and no run", where=str(resume), remedy=remedy
         )
-    try:
-        result = roll_out(
-            system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
-            progress=_importing(progress, check, report),
-        )  # fmt: skip
-    except NumericalError as error:
-        if error.folder is not None:
-            finish(error.folder, report=report)
-        raise
+    frames: SimpleQueue[np.ndarray | None] = SimpleQueue()
+    compared: list[Future[EnergyReport | None]] = []
+    with ThreadPoolExecutor(1) as thread:
+
+        def shown(simulation: Simulation, positions: np.ndarray) -> None:
+            frames.put(positions)
+            if not compared:
+                compared.append(thread.submit(_beside_the_loop, simulation, frames, check, report))
+
+        try:
+            result = roll_out(
+                system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
+                progress=progress, shown=shown,
+            )  # fmt: skip
+        except BaseException as error:
+            frames.put(None)
+            if isinstance(error, NumericalError) and error.folder is not None:
+                finish(error.folder, report=report)
+            raise
+        if not compared:
+            # it had ended before
+            for positions in result.frames:
+                shown(result.simulation, positions)
     folder = RunFolder.open(result.folder)
     if check:
         say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
-        _compare(folder, result)
+        _keep(folder, compared[0].result())
         _beside_float64(folder, result)
     return finish(folder, report=report, result=result, progress=progress)
 
 
-def _importing(progress: Progress | None, check: bool, report: bool) -> Progress:
-    """Progress that imports what the end of a run needs beside its loop, most of which is not in Python."""
-    needed = ["mdnum.report.drawing"] * report + ["mdnum.references.energy_check"] * check
-    begun: list[Thread] = []
-
-    def told(step: int, steps: int, info: dict[str, Any]) -> None:
-        if not begun:
-            begun.append(Thread(target=lambda: [import_module(name) for name in needed]))
-            begun[0].start()
-        if progress is not None:
-            progress(step, steps, info)
-
-    return told
-
-
-def _compare(folder: RunFolder, result: RunResult) -> None:
-    """Puts the comparison of the first and the last frame with ASE into the summary."""
+def _beside_the_loop(
+    simulation: Simulation, frames: SimpleQueue[np.ndarray | None], check: bool, report: bool
+) -> EnergyReport | None:
+    """The comparison of the first and the last frame with ASE; the loop is not in Python, most of this is."""
+    if report:
+        import mdnum.report.drawing  # noqa: F401 it takes as long
+    if not check:
+        return None
     from mdnum.references.energy_check import check_energy
+
+    def named() -> Iterator[tuple[str, Atoms]]:
+        for name in ("initial", "last"):
+            if (positions := frames.get()) is not None:
+                atoms = simulation.system.atoms.copy()
+                atoms.set_positions(positions)
+                yield name, atoms
+
+    return check_energy(simulation, named())
+
+
+def _keep(folder: RunFolder, compared: EnergyReport | None) -> None:
+    """Puts the comparison with ASE into the summary."""
     from mdnum.verbs.check import energy_findings
 
-    frames = {}
-    for name, positions in zip(("initial", "last"), result.frames, strict=True):
-        frames[name] = result.simulation.system.atoms.copy()
-        frames[name].set_positions(positions)
-    compared = check_energy(result.simulation, frames)
+    assert compared is not None
     summary = folder.summary
     summary["ase"] = compared.worst
     summary["findings"] = [*summary["findings"], *map(plain, energy_findings(compared))]
