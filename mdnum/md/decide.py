@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from mdnum.errors import InputError
 from mdnum.md import foreign
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, pointer, registered, words_at
+from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, poke, registered
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
@@ -135,7 +135,7 @@ class PairDecider:
 
     def values(self) -> jax.Array:
         """Threshold values as an array of the decision's dtype, shape (types,)."""
-        return jnp.asarray([t.value for t in self.thresholds], np.dtype(self.dtype))
+        return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
         """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
@@ -288,6 +288,11 @@ def displacements(components, cell: Cell, j):
 # --- what changed from one pass to the next ---------------------------------------------------------------
 
 
+def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
+    """Zeros on the device, without the program that jnp's would compile for each shape."""
+    return jax.device_put(np.zeros(shape, dtype))
+
+
 class Changes(NamedTuple):
     """Decisions that changed, step after step, each seen from the atom that is sorted first.
 
@@ -304,7 +309,7 @@ class Changes(NamedTuple):
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
         """Room for so many."""
-        return cls(jnp.zeros((room, 4), jnp.int32), jnp.zeros((room, 12), dtype), jnp.zeros(2, jnp.int64))
+        return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(2, np.int64))
 
     def emptied(self) -> Changes:
         """The same room without any."""
@@ -381,7 +386,7 @@ def _note(frame):
     """`Changes.noted`; 0 for no error."""
     if not asked_to_run(frame):
         return 0
-    operands, results = words_at(words_at(frame)[9]), words_at(words_at(frame)[14])
+    operands, results = peek(frame, 9), peek(frame, 14)
     pairs_at, room, _ = buffer(results, 0)
     ends_at, _, _ = buffer(results, 1)
     count_at, _, _ = buffer(results, 2)
@@ -393,15 +398,13 @@ def _note(frame):
     row_at, _, _ = buffer(operands, 8)
     pairs = carray(pointer(pairs_at), (room, 4), np.int32)
     ends = carray(pointer(ends_at), (room, 12), np.float64)
-    count = words_at(count_at)
     size = words * atoms
     before = carray(pointer(before_at), (size // 8,), np.uint64)
     bits = carray(pointer(bits_at), (size // 8,), np.uint64)
     index = carray(pointer(index_at), (8 * size,), np.int32)
     x = carray(pointer(x_at), (3, atoms), np.float64)
     v = carray(pointer(v_at), (3, atoms), np.float64)
-    row = words_at(row_at)[0]
-    begun, both = count[0], count[1]
+    row, begun, both = peek(row_at, 0), peek(count_at, 0), peek(count_at, 1)
     found = begun
     # what is left of eight bytes at the end
     ahead, last = np.zeros(1, np.uint64), np.zeros(1, np.uint64)
@@ -431,5 +434,6 @@ def _note(frame):
         for axis in range(3):
             ends[at, axis], ends[at, 3 + axis] = x[axis, first], x[axis, second]
             ends[at, 6 + axis], ends[at, 9 + axis] = v[axis, first], v[axis, second]
-    count[0], count[1] = found, both
+    poke(count_at, 0, found)
+    poke(count_at, 1, both)
     return 0

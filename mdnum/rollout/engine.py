@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.decide import Tables
+from mdnum.md.decide import Tables, zeros
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -222,8 +222,8 @@ class Engine:
             simulation.force,
             simulation.propagator,
             simulation.cell.astype(np.float64),
-            jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2, jnp.float64),
+            jax.device_put(simulation.masses),
+            jax.device_put(np.float64(rule.skin / 2)),
             rule.every,
             rule.delay,
             rule.check,
@@ -314,7 +314,7 @@ class Engine:
         if look_back and not self.rows:
             # the same program as without a look back, so decisions that it does not read
             if self._unread is None or len(self._unread) != words:
-                self._unread = jnp.zeros((words, self.simulation.atoms), jnp.uint8)
+                self._unread = zeros((words, self.simulation.atoms), np.uint8)
             earlier = self._unread
         return run_epoch(
             self.leaves,

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
-from mdnum.md.decide import Changes, Tables
+from mdnum.md.decide import Changes, Tables, zeros
 from mdnum.md.integrators import Integrator
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
@@ -204,11 +204,11 @@ def empty_record(
     record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
     return EpochRecord(
-        x=jnp.zeros(shape, dtype),
-        v=jnp.zeros(shape, dtype),
-        images=jnp.zeros(shape, jnp.int32),
-        bits=jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
-        **{name: jnp.zeros(rows, jnp.float64) for name in _NUMBERS},
+        x=zeros(shape, dtype),
+        v=zeros(shape, dtype),
+        images=zeros(shape, np.int32),
+        bits=zeros((rows, words, atoms if record else 0), np.uint8),
+        **{name: zeros(rows, np.float64) for name in _NUMBERS},
         changes=None if changes is None else Changes.empty(changes, dtype),
     )
 

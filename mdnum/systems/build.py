@@ -248,14 +248,15 @@ def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, 
 def _pair_model(system: System) -> CutPotential:
     spec, species = system.spec, system.species
     assert spec.cutoff is not None
-    constants = {name: jnp.asarray(_per_type(t)) for name, t in pairs.pair_constants(spec, species).items()}
+    tables = pairs.pair_constants(spec, species)
+    constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
     radius, onset = pairs.cutoff_radii(spec, species)
-    r_cut = jnp.asarray(_per_type(radius))
+    r_cut = jax.device_put(_per_type(radius))
     return CutPotential(
         POTENTIALS[spec.potential.kind](**constants),
         CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
-        r_cut if onset is None else jnp.asarray(_per_type(onset)),
+        r_cut if onset is None else jax.device_put(_per_type(onset)),
     )
 
 
@@ -321,11 +322,11 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     check_radius(cell, max(decider.r_cut), spec.skin)
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
-    timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
+    timestep = jax.device_put(np.float64(spec.dynamics.timestep * units.time_factor))
     integrator: Integrator = VelocityVerlet(timestep)
     if isinstance(spec.dynamics, schema.LangevinTable):
-        friction = jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64)
-        kT = jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64)
+        friction = jax.device_put(np.float64(spec.dynamics.friction / units.time_factor))
+        kT = jax.device_put(np.float64(units.k_B * spec.dynamics.temperature))
         integrator = Langevin(timestep, friction, kT, jax.random.key(spec.dynamics.seed))
     simulation = Simulation(
         system,
@@ -498,7 +499,8 @@ class Evaluator:
         at = np.asarray(own.positions if positions is None else positions, np.float64)
         wrapped, _ = wrap_positions(here.cell, at)
         table, tables = self._list(here, wrapped)
-        return here, wrapped, table, tables, jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
+        x = wrapped[table.order].T.astype(here.policy.dtype("state"), order="C")
+        return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
         """The list in use, rebuilt where it no longer holds every pair inside."""
