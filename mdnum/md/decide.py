@@ -7,7 +7,7 @@ the ledger all compute them through this file, with the same bits.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +18,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md import foreign
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, known, peek, pointer, poke, registered
+from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, poke, registered
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
@@ -314,6 +315,14 @@ class Changes(NamedTuple):
         """The same room without any."""
         return self._replace(count=jnp.zeros_like(self.count))
 
+    def first(self, count: int) -> tuple[Int[np.ndarray, "count 4"], Float[np.ndarray, "count 12"]]:
+        """So many pairs and their ends, on the host; of a device's memory little more than these comes."""
+        room, parts = 1 << count.bit_length(), self[:2]
+        if room < len(self.pairs) and not foreign.known():
+            parts = _cut(parts, room)
+        pairs, ends = (np.asarray(part)[:count] for part in parts)
+        return pairs, ends
+
     def noted(
         self,
         before: UInt8[Array, "words atoms"],
@@ -330,7 +339,7 @@ class Changes(NamedTuple):
             most: how many may come at a time on a device other than a CPU, where each step takes the same
                 time however many they are. Where more come, `count` is beyond the room.
         """
-        if known() and x.dtype == np.float64:
+        if foreign.known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
         changed, index = before ^ bits, tables.index.astype(jnp.int32)
         slot, atom = jnp.arange(8, dtype=jnp.uint8)[None, :, None], jnp.arange(x.shape[1], dtype=jnp.int32)
@@ -358,6 +367,12 @@ class Changes(NamedTuple):
         call = jax.ffi.ffi_call(_noting(), shapes, input_output_aliases={0: 0, 1: 1, 2: 2})
         index = tables.index.astype(jnp.int32)
         return Changes(*call(*self, before, bits, index, x, v, row.astype(jnp.int64)))
+
+
+@partial(jax.jit, static_argnames="room")
+def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
+    """The first rows of each."""
+    return tuple(part[:room] for part in parts)
 
 
 @cache

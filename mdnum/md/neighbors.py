@@ -11,11 +11,12 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import CapacityError, InputError
 from mdnum.md.cell import Cell, displacement, strain_loss
@@ -27,7 +28,7 @@ _TOGETHER = 16
 
 # a pair at the edge of the list must not be lost to rounding: the skin criterion assumes that every
 # unlisted pair was at least r_list apart
-_SAFETY = 1.0 + 1e-12
+SAFETY = 1.0 + 1e-12
 
 # along an axis, before a dilute system gets fewer: a radius may be many orders smaller than the box
 _MOST_BINS = 1e9
@@ -221,14 +222,14 @@ def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
     return most
 
 
-def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
+def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
     """Number of bins and reach of the search along each axis."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
         width = fractional_extent[k]
         # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
-        fine = int(min(2 * width / (r_list * _SAFETY), _MOST_BINS))
+        fine = int(min(2 * width / (r_list * SAFETY), _MOST_BINS))
         if fine >= 5:
             bins[k], reach[k] = fine, 2
         # fewer: one bin along this axis, every atom meets every atom once
@@ -266,10 +267,10 @@ def neighbor_table(
                 fractional[k] -= outside
                 components = components - np.outer(np.asarray(cell.matrix)[k], outside)
         else:
-            # along a free axis the bins span the atoms; the direction is that of the axis itself,
-            # orthogonal to the periodic ones where the lattice vectors are (else one bin)
-            extent[k], fractional[k] = _free_axis(cell, components, k)
-    bins, reach = _grid(cell, extent, r_list, atoms)
+            low, high = components[k].min(), components[k].max()
+            extent[k] = free_extent(cell, low, high)
+            fractional[k] = (components[k] - low) / (extent[k] or np.inf)
+    bins, reach = grid(cell, extent, r_list, atoms)
     start = np.zeros(int(np.prod(bins)) + 1, np.int64)
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
@@ -282,7 +283,7 @@ def neighbor_table(
         bins,
         reach,
         start,
-        (r_list * _SAFETY) ** 2,
+        (r_list * SAFETY) ** 2,
         table,
     )
     return table, order, int(most)
@@ -308,15 +309,12 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
         return memory[first : first + size - 64].view(np.int32).reshape(room, atoms)
 
 
-def _free_axis(cell: Cell, components, k: int):
-    """Extent along a free axis, and the atoms' place in it from 0 to 1."""
-    if not cell.orthorhombic and any(cell.pbc):
-        return 0.0, np.zeros(components.shape[1])
-    low, high = float(components[k].min()), float(components[k].max())
-    extent = high - low
-    if extent <= 0:
-        return 0.0, np.zeros(components.shape[1])
-    return extent, (components[k] - low) / extent
+def free_extent(cell: Cell, low: float, high: float) -> float:
+    """What the bins along a free axis span, from the first to the last of the atoms; 0 where one bin has all.
+
+    The direction is that of the axis itself, orthogonal to the periodic ones where the lattice vectors are.
+    """
+    return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0
 
 
 # --- verlet skin lists: when they are rebuilt, how they are built, and what they hold -----------------
@@ -358,29 +356,40 @@ class PairTable:
     """The pairs of one list, both directions, as the force loop reads them.
 
     Attributes:
-        index: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
-            shape (slots, atoms).
-        order: sorted atom k is atom order[k].
+        found: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
+            shape (slots, atoms); where the search left it, on the host or on a device.
+        sorting: sorted atom k is atom sorting[k]; where the search left it.
         r_list: list radius, length.
         occupancy: largest number of neighbors of an atom.
         build_seconds: time the search took.
     """
 
-    index: Int[np.ndarray, "slots atoms"]
-    order: Int[np.ndarray, "atoms"]
+    found: Int[np.ndarray | Array, "slots atoms"]
+    sorting: Int[np.ndarray | Array, "atoms"]
     r_list: float
     occupancy: int
     build_seconds: float
 
+    @cached_property
+    def index(self) -> Int[np.ndarray, "slots atoms"]:
+        """`found`, on the host."""
+        return np.asarray(self.found)
+
+    @cached_property
+    def order(self) -> Int[np.ndarray, "atoms"]:
+        """`sorting`, on the host."""
+        return np.asarray(self.sorting)
+
     @property
     def slots(self) -> int:
         """Room per atom."""
-        return self.index.shape[0]
+        return self.found.shape[0]
 
-    @property
+    @cached_property
     def pairs(self) -> int:
         """Number of listed pairs, each counted once."""
-        return int(np.count_nonzero(self.index < self.index.shape[1])) // 2
+        module = self.found.__array_namespace__()
+        return int(module.count_nonzero(self.found < self.found.shape[1])) // 2
 
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
@@ -410,8 +419,8 @@ class ListBuilder(Protocol):
         ...
 
     def build(
-        self, positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
-    ) -> tuple[Int[np.ndarray, "slots atoms"], Int[np.ndarray, "atoms"], int]:
+        self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
+    ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
         """Index table in sorted labels, order, and the largest neighbor count (above slots: incomplete)."""
         ...
 
@@ -423,7 +432,7 @@ class HostBuilder:
     name: str = "host"
 
     def build(self, positions, cell, r_list, slots):
-        return neighbor_table(positions, cell, r_list, slots)
+        return neighbor_table(np.asarray(positions), cell, r_list, slots)
 
 
 @dataclass(frozen=True)
@@ -435,7 +444,7 @@ class JaxMdBuilder:
     def build(self, positions, cell, r_list, slots):
         from mdnum.md import jaxmd
 
-        rows = np.asarray(jaxmd.dense_pairs(positions, cell.matrix, cell.pbc, r_list))
+        rows = np.asarray(jaxmd.dense_pairs(np.asarray(positions), cell.matrix, cell.pbc, r_list))
         atoms = len(positions)
         occupancy = int((rows < atoms).sum(1).max(initial=0))
         table = np.full((slots, atoms), atoms, np.int32)
@@ -450,6 +459,7 @@ class JaxMdBuilder:
 BUILDERS: Registry[ListBuilder] = Registry("list builder", "mdnum.builders")
 BUILDERS.add("host", HostBuilder())
 BUILDERS.add("jax-md", JaxMdBuilder())
+BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
@@ -488,7 +498,7 @@ class VerletList:
     guard: float = 0.0
     slots: int = field(default=0)
 
-    def build(self, positions: Float[np.ndarray, "atoms 3"], cell: Cell) -> PairTable:
+    def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
         """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.
 
         Raises:
@@ -505,11 +515,10 @@ class VerletList:
             if most <= self.slots and first:
                 # every size of table is compiled for: settle on one with room before the first use
                 first, wanted = False, self._rounded(most * self.slack)
-                if wanted < self.slots:
-                    index = index[:wanted]
-                elif wanted > self.slots:
-                    index = np.concatenate([index, np.full((wanted - self.slots, atoms), atoms, np.int32)])
-                self.slots = wanted
+                if wanted > self.slots:
+                    self.slots = wanted
+                    continue
+                index, self.slots = index[:wanted], wanted
             if most <= self.slots:
                 return PairTable(index, order, r_list, most, time.perf_counter() - begin)
             if most >= atoms and atoms > 1:

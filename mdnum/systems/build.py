@@ -182,16 +182,18 @@ class Simulation:
 
     def tables(self, table: PairTable) -> Tables:
         """A pair table on the device, with pair types."""
-        atoms = table.index.shape[1]
+        index, order = table.found, table.sorting
+        atoms = index.shape[1]
         shape = (-1, SLOTS, atoms)
         types = None
         if self.pair_types > 1:
+            own = self.species if isinstance(index, np.ndarray) else jax.device_put(self.species)
             # padding borrows the last atom's species; its decision is no whatever its type
-            species = self.species[np.append(table.order, table.order[-1])]
-            kinds = pair_type(species[table.index], species[:atoms], len(self.system.species))
+            species = own[index.__array_namespace__().append(order, order[-1:])]
+            kinds = pair_type(species[index], species[:atoms], len(self.system.species))
             types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
         # not jnp.asarray, which compiles a program for every shape
-        return Tables(jax.device_put(table.index.reshape(shape)), types, jax.device_put(table.order))
+        return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
@@ -337,7 +339,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         decider,
         RebuildRule(spec.skin, rebuild.every, rebuild.delay, rebuild.check),
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
-        ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
+        ("host" if jax.default_backend() == "cpu" else "device") if builder == "auto" else builder,
         policy,
         REDUCTIONS.parse(precision.reduction),
         integrator,
