@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -14,6 +17,7 @@ from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, page
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 CHATTER_SHARE = 0.15
 #: Drift over the run, per atom and in units of k_B T, from which on it is worth a warning.
 DRIFT_SHARE = 0.01
+#: What compiles and keeps what the loop calls.
+COMPILE = "from mdnum.md import decide, kernel; kernel._driver(), decide._noting()"
 #: Steps of a run in fixed-point numbers that are made in float64 too.
 _BESIDE = 2000
 
@@ -67,6 +73,7 @@ def run(
         InputError: the system cannot be run. FolderError: the folder cannot be used.
         NumericalError: the run blew up; what came before is in the folder, with its report.
     """
+    _compile_beside()
     from mdnum.rollout.run import run as roll_out
     from mdnum.systems import BallSystem
 
@@ -106,6 +113,20 @@ def run(
         _keep(folder, compared[0].result())
         _beside_float64(folder, result)
     return finish(folder, report=report, result=result, progress=progress)
+
+
+def _compile_beside() -> None:
+    """Starts another process that compiles what the loop calls, where nothing is kept of earlier commands.
+
+    That is the first one after an installation, which compiles for most of its time; one process at a time
+    compiles for one processor.
+    """
+    kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    with contextlib.suppress(OSError):
+        if kept and not os.listdir(kept):
+            subprocess.Popen(
+                python("-c", COMPILE), env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
 
 
 def _beside_the_loop(

@@ -22,10 +22,11 @@ import mdnum
 from mdnum.errors import FolderError
 from mdnum.report import analysis, drawing
 from mdnum.rollout.summary import LineFit
+from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.store.files import write_text
 from mdnum.verbs import frame
-from mdnum.verbs.run import judge
+from mdnum.verbs.run import COMPILE, judge
 from mdnum.verbs.run_page import TABLE_ROWS, TEXTS, RunView, page
 
 TOML = """about = "Liquid argon (Rahman 1964), 864 atoms at 94.4 K, hard cutoff."
@@ -362,6 +363,12 @@ def test_a_time_that_has_no_slope(step):
     line = LineFit()
     line.add(step * np.arange(5), np.arange(5.0))
     assert line.slope is None
+
+
+def test_another_process_compiles_what_the_first_run_calls_and_keeps_it(tmp_path):
+    subprocess.run(python("-c", COMPILE), env=environment(NUMBA_CACHE_DIR=str(tmp_path)), check=True)
+    kept = {file.name.split("-")[0] for file in tmp_path.rglob("*.nbc")}
+    assert {"kernel._over_blocks", "kernel._help", "decide._note"} <= kept
 
 
 @pytest.mark.slow
