@@ -161,7 +161,7 @@ class Rollout:
         summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
-        self._show(self.done.last)
+        self._show(segment.last_positions.T)
         # after the checkpoint: a run that is continued goes on with this list, and drops the row
         if (row := self.done.health.last_row()) is not None:
             self.folder.append("epochs", row)
