@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 Flips = Mapping[str, np.ndarray]
 
+# flips that are followed pair by pair at a time, at least
+_AT_ONCE = 1_000_000
+
 
 @dataclass(frozen=True)
 class Stays:
@@ -68,13 +71,14 @@ class Scan:
         self.total = 0
         #: Pairs that entered and left at each step.
         self.entered, self.left = np.zeros(steps, np.int64), np.zeros(steps, np.int64)
-        #: Whether every pair's flips enter and leave in turn: one that does not has a flip missing.
-        self.alternates = True
+        self._alternates = True
         # (outside, inside): stays by their length
         self._lengths = np.zeros((2, steps), np.int64)
         # of each pair: its key, its flips, and the last of them
         self._key, self._count, self._step = (np.zeros(0, np.int64) for _ in range(3))
         self._inside = np.zeros(0, bool)
+        # pair, step and side of the flips that came since
+        self._recent: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self._ratios: list[np.ndarray] = []
         #: Rows nearest to their threshold in the order of the table, by column.
         self.nearest: dict[str, np.ndarray] = {}
@@ -98,7 +102,16 @@ class Scan:
         ratio = margins_in_bounds(flips)
         self._ratios.append(ratio)
         self._keep_nearest(flips, ratio)
-        self._follow(_pair_key(flips), step, came)
+        self._recent.append((_pair_key(flips), step, came))
+        # sorted with all pairs so far, so not before they are as many
+        if sum(len(part[0]) for part in self._recent) > max(_AT_ONCE, len(self._key)):
+            self._follow()
+
+    @property
+    def alternates(self) -> bool:
+        """Whether every pair's flips enter and leave in turn: one that does not has a flip missing."""
+        self._follow()
+        return self._alternates
 
     @property
     def ratios(self) -> Float[np.ndarray, "flips"]:
@@ -113,11 +126,13 @@ class Scan:
         The stay before a pair's first flip and after its last one are not seen whole and not counted,
         so that long stays are underrepresented in a run that is not much longer than they are.
         """
+        self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
 
     @property
     def busiest(self) -> PairCounts:
         """The pairs that flipped, those that did so most often first."""
+        self._follow()
         order = np.argsort(-self._count, kind="stable")
         key = self._key[order]
         return PairCounts(i=key >> 32, j=key & 0xFFFFFFFF, flips=self._count[order])
@@ -126,15 +141,19 @@ class Scan:
         """At each step, whether the table of flips has as many as the series counted there."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
-    def _follow(self, key: np.ndarray, step: np.ndarray, came: np.ndarray) -> None:
-        # the last flip of each pair so far comes before those of this part, whose steps are in order too
-        count = np.r_[self._count, np.ones(len(key), np.int64)]
-        key, step, came = np.r_[self._key, key], np.r_[self._step, step], np.r_[self._inside, came]
+    def _follow(self) -> None:
+        if not self._recent:
+            return
+        # the last flip of each pair so far comes before those since, whose steps are in order too
+        parts = [(self._key, self._step, self._inside), *self._recent]
+        key, step, came = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        count = np.concatenate([self._count, np.ones(len(key) - len(self._count), np.int64)])
+        self._recent = []
         order = np.argsort(key, kind="stable")
         key, step, came, count = key[order], step[order], came[order], count[order]
         same = key[1:] == key[:-1]
         length, inside, then = (step[1:] - step[:-1])[same], came[:-1][same], came[1:][same]
-        self.alternates = self.alternates and not np.any(inside == then)
+        self._alternates = self._alternates and not np.any(inside == then)
         for side in (0, 1):
             self._lengths[side] += np.bincount(length[inside == side], minlength=self._lengths.shape[1])
         last = np.r_[~same, True]

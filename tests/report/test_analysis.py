@@ -35,8 +35,10 @@ def test_a_table_seen_in_parts_says_what_a_loop_over_its_pairs_says(size, seed, 
                    for s in step])  # fmt: skip
     flips["margin"] = rng.normal(size=400)
     whole, parts = analysis.scan(flips, 50, 20), analysis.Scan(50, 20)
-    for first in range(0, 400, size):
-        parts.take({name: values[first : first + size] for name, values in flips.items()})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(analysis, "_AT_ONCE", 30)
+        for first in range(0, 400, size):
+            parts.take({name: values[first : first + size] for name, values in flips.items()})
     stays = {True: [], False: []}
     last: dict[tuple[int, int], list[tuple[int, bool]]] = {}
     turned = True
