@@ -7,6 +7,7 @@ import os
 import subprocess
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -137,14 +138,17 @@ def _beside_the_loop(
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
         return None
-    from mdnum.references.energy_check import check_energy
+    from mdnum.references.energy_check import SAMPLED, check_energy
 
     def named() -> Iterator[tuple[str, Atoms]]:
-        for name in ("initial", "last"):
-            if (positions := frames.get()) is not None:
-                atoms = simulation.system.atoms.copy()
-                atoms.set_positions(positions)
-                yield name, atoms
+        given = iter(frames.get, None)
+        if simulation.atoms > SAMPLED:
+            # what a large system takes of memory would come on top of the loop's
+            given = iter(list(islice(given, 2)))
+        for name, positions in zip(("initial", "last"), given, strict=False):
+            atoms = simulation.system.atoms.copy()
+            atoms.set_positions(positions)
+            yield name, atoms
 
     return check_energy(simulation, named())
 
