@@ -7,6 +7,7 @@ half the smallest perpendicular width.
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -33,6 +34,9 @@ _TOGETHER = 16
 # a pair at the edge of the list must not be lost to rounding: the skin criterion assumes that every
 # unlisted pair was at least r_list apart
 _SAFETY = 1.0 + 1e-12
+
+# atoms of a thread's share, about: fewer are found sooner than a thread begins
+_SHARED = 2000
 
 # along an axis, before a dilute system gets fewer: a radius may be many orders smaller than the box
 _MOST_BINS = 1e9
@@ -286,66 +290,69 @@ def _compressed(mask, label, first, atoms, out, place):
 
 
 @numba.njit(cache=True, nogil=True)
-def _transposed(rows, table, first, atoms):
+def _transposed(rows, table, first, begin, end):
     """The slots of consecutive atoms, which share cache lines: written together."""
     room, n = table.shape
-    if atoms == _TOGETHER and room % _WIDE == 0:
+    if end - begin == _TOGETHER and room % _WIDE == 0:
         for k in range(0, room, _WIDE):
             for i in range(0, _TOGETHER, _WIDE):
                 _turned(rows, i * rows.shape[1] + k, rows.shape[1], table, k * n + first + i, n)
         return
     for k in range(room):
-        for i in range(atoms):
+        for i in range(begin, end):
             table[k, first + i] = rows[i, k]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
-    """Neighbors of every (bin-sorted) atom; returns the largest number found, which may exceed the room."""
+def _fill(x, layered, box, inverse, start, r2_list, table, columns):
+    """Neighbors of the (bin-sorted) atoms in some columns of bins.
+
+    Returns:
+        the largest number found, which may exceed the room.
+    """
+    bins, reach, periodic, matrix = box
     room, n = table.shape
-    most = 0
+    most, begun, done = 0, start[columns[0] * bins[2]], start[columns[1] * bins[2]]
     by_pair = False
     for k in range(3):
         by_pair = by_pair or (periodic[k] and reach[k] == 0)
-    layered, box = _layered(x, start, bins), (bins, reach, periodic, matrix)
     run, shift = np.empty((15, 3), np.int64), np.empty((15, 3))
     layers = bins[2] + 2 * reach[2]
     begin, home = np.empty(layers + 1, np.int64), np.empty(layers, np.int64)
     capacity = 0
     near, label, mask = np.empty((3, _WIDE)), np.empty(_WIDE, np.int32), np.empty(_WIDE, np.uint8)
     rows = np.empty((_TOGETHER, room + _TOGETHER), np.int32)
-    for b0 in range(bins[0]):
-        for b1 in range(bins[1]):
-            column = (b0 * bins[1] + b1) * bins[2]
-            if start[column] == start[column + bins[2]]:
-                continue
-            found = _runs(b0, b1, box, run, shift)
-            while not _gather(layered, b1, run, shift, found, box, near, label, begin, home):
-                capacity = 2 * capacity + 1024
-                near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
-                mask = np.empty(capacity + _WIDE, np.uint8)
-                # rows a cache line further than a power of two apart: those share their places in a cache
-                wider = np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
-                wider[:, :room] = rows[:, :room]
-                rows = wider
-            for b2 in range(bins[2]):
-                here = column + b2
-                low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
-                px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
-                mask[high - low : high - low + _WIDE] = 0
-                for i in range(start[here], start[here + 1]):
-                    if by_pair:
-                        _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)
-                    else:
-                        _within(px, py, pz, x[0, i], x[1, i], x[2, i], r2_list, mask)
-                    mask[home[b2 + reach[2]] - low + i - start[here]] = 0  # the atom itself
-                    row = i % _TOGETHER
-                    filled = _compressed(mask, label, low, high - low, rows, row * rows.shape[1])
-                    most = max(most, filled)
-                    rows[row, filled:room] = n
-                    first = i - row
-                    if i - first == _TOGETHER - 1 or i == n - 1:
-                        _transposed(rows, table, first, i - first + 1)
+    for column in range(columns[0] * bins[2], columns[1] * bins[2], bins[2]):
+        b0, b1 = column // bins[2] // bins[1], column // bins[2] % bins[1]
+        if start[column] == start[column + bins[2]]:
+            continue
+        found = _runs(b0, b1, box, run, shift)
+        while not _gather(layered, b1, run, shift, found, box, near, label, begin, home):
+            capacity = 2 * capacity + 1024
+            near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
+            mask = np.empty(capacity + _WIDE, np.uint8)
+            # rows a cache line further than a power of two apart: those share their places in a cache
+            wider = np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
+            wider[:, :room] = rows[:, :room]
+            rows = wider
+        for b2 in range(bins[2]):
+            here = column + b2
+            low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
+            px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
+            mask[high - low : high - low + _WIDE] = 0
+            for i in range(start[here], start[here + 1]):
+                if by_pair:
+                    _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)
+                else:
+                    _within(px, py, pz, x[0, i], x[1, i], x[2, i], r2_list, mask)
+                mask[home[b2 + reach[2]] - low + i - start[here]] = 0  # the atom itself
+                row = i % _TOGETHER
+                filled = _compressed(mask, label, low, high - low, rows, row * rows.shape[1])
+                most = max(most, filled)
+                rows[row, filled:room] = n
+                first = i - row
+                if row == _TOGETHER - 1 or i == done - 1:
+                    _transposed(rows, table, first, max(begun - first, 0), row + 1)
     return most
 
 
@@ -402,18 +409,32 @@ def neighbor_table(
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
     table = _table(room, atoms)
-    most = _fill(
-        np.ascontiguousarray(components[:, order]),
-        np.asarray(cell.matrix, np.float64),
-        inverse,
-        np.array(cell.pbc),
-        bins,
-        reach,
-        start,
-        (r_list * _SAFETY) ** 2,
-        table,
-    )
-    return table, order, int(most)
+    x = np.ascontiguousarray(components[:, order])
+    matrix, periodic = np.asarray(cell.matrix, np.float64), np.array(cell.pbc)
+    layered = _layered(x, start, bins)
+    # shared among threads by atoms; columns of bins are whole
+    parts = max(1, min(_cores(), atoms // _SHARED))
+    ends = np.searchsorted(start[:: bins[2]], np.linspace(0, atoms, parts + 1)[1:-1])
+    edges = [0, *ends.tolist(), int(bins[0] * bins[1])]
+    most = [0] * parts
+
+    def fill(part: int) -> None:
+        columns = edges[part], edges[part + 1]
+        box, r2_list = (bins, reach, periodic, matrix), (r_list * _SAFETY) ** 2
+        most[part] = _fill(x, layered, box, inverse, start, r2_list, table, columns)
+
+    helpers = [threading.Thread(target=fill, args=(part,)) for part in range(1, parts)]
+    for helper in helpers:
+        helper.start()
+    fill(0)
+    for helper in helpers:
+        helper.join()
+    return table, order, max(most)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _used: list[np.ndarray] = []

@@ -10,6 +10,7 @@ import oracles
 import pytest
 
 from mdnum.errors import CapacityError, InputError
+from mdnum.md import neighbors
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
 from mdnum.references.conformance import ListLimits, NeighborListConformance
@@ -62,6 +63,24 @@ def test_the_search_of_jax_md_finds_the_same(atoms):
         positions[-1] = positions[0]
         here, there = (listed(name, positions, matrix, pbc, 3.4) for name in ("host", "jax-md"))
         assert set(map(tuple, here)) == set(map(tuple, there)) and (len(here) or atoms == 1)
+
+
+@pytest.mark.parametrize("pbc", [(True, True, True), (False, True, False)])
+def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
+    rng, cell = np.random.default_rng(3), Cell.create([20.0, 18.0, 22.0], pbc)
+    positions = rng.uniform(0, 1, (900, 3)) * [20.0, 18.0, 22.0]
+    monkeypatch.setattr(neighbors, "_SHARED", 100)
+    made = []
+    for cores in (1, 2, 3, 7):
+        monkeypatch.setattr(neighbors, "_cores", lambda cores=cores: cores)
+        index, order, most = neighbor_table(positions, cell, 4.0, 64)
+        # not the memory that the next search is given
+        made.append((index.copy(), order, most))
+    for index, order, most in made[1:]:
+        assert np.array_equal(index, made[0][0]) and np.array_equal(order, made[0][1]) and most == made[0][2]
+    assert {pair for pair in pairs_of(*made[0][:2], 900) if pair[0] < pair[1]} == oracles.minimum_image_pairs(
+        positions, np.diag([20.0, 18.0, 22.0]), cell.pbc, 4.0
+    )
 
 
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
