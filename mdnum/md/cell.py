@@ -155,23 +155,23 @@ def nearest_image(lattice, x, y, z):
     """`Cell.minimum_image` of one displacement in compiled loops over pairs, with the same bits.
 
     Args:
-        lattice: `HostCell.lattice`, in the dtype of the displacement.
+        lattice: `HostCell.numbers`, in the dtype of the displacement.
     """
     a, m, pbc, orthorhombic = lattice
     if not (pbc[0] or pbc[1] or pbc[2]):
         return x, y, z
     if orthorhombic:
-        f, g, h = np.rint(x * m[0, 0]), np.rint(y * m[1, 1]), np.rint(z * m[2, 2])
-        return x - f * a[0, 0], y - g * a[1, 1], z - h * a[2, 2]
-    f = np.rint(x * m[0, 0] + y * m[1, 0] + z * m[2, 0])
-    g = np.rint(x * m[0, 1] + y * m[1, 1] + z * m[2, 1])
-    h = np.rint(x * m[0, 2] + y * m[1, 2] + z * m[2, 2])
+        f, g, h = np.rint(x * m[0][0]), np.rint(y * m[1][1]), np.rint(z * m[2][2])
+        return x - f * a[0][0], y - g * a[1][1], z - h * a[2][2]
+    f = np.rint(x * m[0][0] + y * m[1][0] + z * m[2][0])
+    g = np.rint(x * m[0][1] + y * m[1][1] + z * m[2][1])
+    h = np.rint(x * m[0][2] + y * m[1][2] + z * m[2][2])
     if pbc[0]:
-        x, y, z = x - f * a[0, 0], y - f * a[0, 1], z - f * a[0, 2]
+        x, y, z = x - f * a[0][0], y - f * a[0][1], z - f * a[0][2]
     if pbc[1]:
-        x, y, z = x - g * a[1, 0], y - g * a[1, 1], z - g * a[1, 2]
+        x, y, z = x - g * a[1][0], y - g * a[1][1], z - g * a[1][2]
     if pbc[2]:
-        x, y, z = x - h * a[2, 0], y - h * a[2, 1], z - h * a[2, 2]
+        x, y, z = x - h * a[2][0], y - h * a[2][1], z - h * a[2][2]
     return x, y, z
 
 
@@ -181,12 +181,14 @@ class HostCell:
     Attributes:
         lattice: lattice vectors, their inverse (lengths and inverse lengths, in the dtype), periodicity and
             whether the vectors lie along x, y and z.
+        numbers: the same without arrays, whose users a compiled loop would count again and again.
     """
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
         matrix, inverse = np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype)
         self.lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
+        self.numbers = (tuple(map(tuple, matrix)), tuple(map(tuple, inverse)), *self.lattice[2:])
 
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]

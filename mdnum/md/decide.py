@@ -20,11 +20,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from mdnum.errors import InputError
 from mdnum.md import foreign
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, poke, registered
+from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, registered
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
-from mdnum.numerics.events import lowest_bit
+from mdnum.numerics.events import bits_set, lowest_bit
 from mdnum.numerics.exact import squared_norm
 from mdnum.numerics.rounding import unit_roundoff
 
@@ -299,17 +299,18 @@ class Changes(NamedTuple):
     Attributes:
         pairs: row, sorted atoms and whether inside now, shape (room, 4).
         ends: positions of both atoms, then velocities, shape (room, 12).
-        count: of changes seen so, and seen from both ends; more of them than room are not noted, shape (2,).
+        count: of changes seen so, and seen from both ends; more of them than room are not noted. Then of the
+            decisions of the last row that are yes; shape (3,).
     """
 
     pairs: Int[Array, "room 4"]
     ends: Float[Array, "room 12"]
-    count: Int[Array, "2"]
+    count: Int[Array, "3"]
 
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
         """Room for so many."""
-        return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(2, np.int64))
+        return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
         """The same room without any."""
@@ -318,7 +319,7 @@ class Changes(NamedTuple):
     def first(self, count: int) -> tuple[Int[np.ndarray, "count 4"], Float[np.ndarray, "count 12"]]:
         """So many pairs and their ends, on the host; of a device's memory little more than these comes."""
         room, parts = 1 << count.bit_length(), self[:2]
-        if room < len(self.pairs) and not foreign.known():
+        if isinstance(self.pairs, jax.Array) and room < len(self.pairs) and not foreign.known():
             parts = _cut(parts, room)
         pairs, ends = (np.asarray(part)[:count] for part in parts)
         return pairs, ends
@@ -344,14 +345,15 @@ class Changes(NamedTuple):
         changed, index = before ^ bits, tables.index.astype(jnp.int32)
         slot, atom = jnp.arange(8, dtype=jnp.uint8)[None, :, None], jnp.arange(x.shape[1], dtype=jnp.int32)
         each = ((changed[:, None] >> slot) & jnp.uint8(1) == 1) & (atom < index)
-        both = jnp.sum(jnp.bitwise_count(changed), dtype=jnp.int64)
+        # counted, not added up from the changes: it is what they are held against
+        both, inside = (jnp.sum(jnp.bitwise_count(one), dtype=jnp.int64) for one in (changed, bits))
         found = jnp.sum(each, dtype=jnp.int64)
         (at,) = jnp.nonzero(each.reshape(-1), size=most, fill_value=0)
         word, k, first = jnp.unravel_index(at, each.shape)
         second = index[word, k, first]
-        inside = (bits[word, first] >> k.astype(jnp.uint8)) & jnp.uint8(1)
+        now = (bits[word, first] >> k.astype(jnp.uint8)) & jnp.uint8(1)
         rows = jnp.full(most, row.astype(jnp.int32))
-        pairs = jnp.stack([column.astype(jnp.int32) for column in (rows, first, second, inside)], axis=1)
+        pairs = jnp.stack([column.astype(jnp.int32) for column in (rows, first, second, now)], axis=1)
         ends = jnp.concatenate([x[:, first], x[:, second], v[:, first], v[:, second]]).T
         start = (self.count[0], jnp.zeros((), jnp.int64))
         # more than there may be is more than there is room for
@@ -359,7 +361,7 @@ class Changes(NamedTuple):
         return Changes(
             lax.dynamic_update_slice(self.pairs, pairs, start),
             lax.dynamic_update_slice(self.ends, ends.astype(self.ends.dtype), start),
-            self.count + jnp.stack([seen, both]),
+            jnp.stack([self.count[0] + seen, self.count[1] + both, inside]),
         )
 
     def _noted_by_host(self, before, bits, tables: Tables, x, v, row) -> Changes:
@@ -396,44 +398,76 @@ def _note(frame):
     x_at, _, _ = buffer(operands, 6)
     v_at, _, _ = buffer(operands, 7)
     row_at, _, _ = buffer(operands, 8)
-    pairs = carray(pointer(pairs_at), (room, 4), np.int32)
-    ends = carray(pointer(ends_at), (room, 12), np.float64)
-    size = words * atoms
-    before = carray(pointer(before_at), (size // 8,), np.uint64)
-    bits = carray(pointer(bits_at), (size // 8,), np.uint64)
-    index = carray(pointer(index_at), (8 * size,), np.int32)
-    x = carray(pointer(x_at), (3, atoms), np.float64)
-    v = carray(pointer(v_at), (3, atoms), np.float64)
-    row, begun, both = peek(row_at, 0), peek(count_at, 0), peek(count_at, 1)
-    found = begun
-    # what is left of eight bytes at the end
-    ahead, last = np.zeros(1, np.uint64), np.zeros(1, np.uint64)
-    for k in range(size // 8 * 8, size):
-        ahead[0] |= np.uint64(carray(pointer(before_at), (size,), np.uint8)[k]) << np.uint64(8 * (k % 8))
-        last[0] |= np.uint64(carray(pointer(bits_at), (size,), np.uint8)[k]) << np.uint64(8 * (k % 8))
+    note(
+        carray(pointer(before_at), (words, atoms), np.uint8),
+        carray(pointer(bits_at), (words, atoms), np.uint8),
+        carray(pointer(index_at), (8 * words, atoms), np.int32),
+        carray(pointer(x_at), (3, atoms), np.float64),
+        carray(pointer(v_at), (3, atoms), np.float64),
+        peek(row_at, 0),
+        carray(pointer(pairs_at), (room, 4), np.int32),
+        carray(pointer(ends_at), (room, 12), np.float64),
+        carray(pointer(count_at), (3,), np.int64),
+    )
+    return 0
+
+
+# words of 64 bits that are gone through together
+_TOGETHER = 128
+
+
+@numba.njit(cache=True, nogil=True)
+def note(before, bits, index, x, v, row, pairs, ends, count):
+    """Add what changed in a row to the parts of `Changes`; what there is no room for is counted.
+
+    Stretch after stretch of words, each in passes of their own: found, looked up and kept one by one, every
+    change costs a branch that is guessed wrong and waits for its neighbor to be read.
+    """
+    words, atoms = bits.shape
+    size, flat = words * atoms, index.reshape(-1)
+    whole = size // 8
+    bytes_before, bytes_now = before.reshape(-1), bits.reshape(-1)
+    ahead, now = bytes_before[: 8 * whole].view(np.uint64), bytes_now[: 8 * whole].view(np.uint64)
+    places, changes = np.empty(_TOGETHER + 8, np.int64), np.empty(_TOGETHER + 8, np.uint64)
+    most = 64 * (_TOGETHER + 1)
+    firsts, slots, values = np.empty(most, np.int32), np.empty(most, np.int64), np.empty(most, np.int32)
+    inside, begun, found = 0, count[0], count[0]
     word, begin = 0, 0
-    for chunk in range(-(-size // 8)):
-        now = bits[chunk] if chunk < size // 8 else last[0]
-        changed = now ^ (before[chunk] if chunk < size // 8 else ahead[0])
-        while changed:
-            bit = np.int64(lowest_bit(changed))
-            changed &= changed - np.uint64(1)
-            place = 8 * chunk + (bit >> 3)
-            while place >= begin + atoms:
-                word, begin = word + 1, begin + atoms
-            first = place - begin
-            second = index[(8 * word + (bit & 7)) * atoms + first]
+    for start in range(0, whole + 1, _TOGETHER):
+        # the words with a change, and the bytes behind the last word
+        n, end = 0, min(start + _TOGETHER, whole)
+        for k in range(start, end):
+            inside += np.int64(bits_set(now[k]))
+            places[n], changes[n] = 8 * k, now[k] ^ ahead[k]
+            n += np.int64(changes[n] != 0)
+        if start + _TOGETHER > whole:
+            for k in range(8 * whole, size):
+                inside += np.int64(bits_set(np.uint64(bytes_now[k])))
+                places[n], changes[n] = k, np.uint64(bytes_now[k] ^ bytes_before[k])
+                n += np.int64(changes[n] != 0)
+        # their bits: atom, place in the list and decision
+        m = 0
+        for k in range(n):
+            changed = changes[k]
+            while changed:
+                bit = np.int64(lowest_bit(changed))
+                changed &= changed - np.uint64(1)
+                place = places[k] + (bit >> 3)
+                while place >= begin + atoms:
+                    word, begin = word + 1, begin + atoms
+                firsts[m], slots[m] = place - begin, (8 * word + (bit & 7)) * atoms + place - begin
+                values[m] = (bytes_now[place] >> (bit & 7)) & 1
+                m += 1
+        count[1] += m
+        for k in range(m):
+            second = flat[slots[k]]
             # written always and kept where it is seen from its first end, which half of them are
-            at = min(found, room - 1)
-            pairs[at, 0], pairs[at, 1], pairs[at, 2] = row, first, second
-            pairs[at, 3] = (now >> np.uint64(bit)) & np.uint64(1)
-            found += np.int64(second > first)
-            both += 1
-    for at in range(min(begun, room), min(found, room)):
+            at = min(found, len(pairs) - 1)
+            pairs[at, 0], pairs[at, 1], pairs[at, 2], pairs[at, 3] = row, firsts[k], second, values[k]
+            found += np.int64(second > firsts[k])
+    for at in range(min(begun, len(pairs)), min(found, len(pairs))):
         first, second = pairs[at, 1], pairs[at, 2]
         for axis in range(3):
             ends[at, axis], ends[at, 3 + axis] = x[axis, first], x[axis, second]
             ends[at, 6 + axis], ends[at, 9 + axis] = v[axis, first], v[axis, second]
-    poke(count_at, 0, found)
-    poke(count_at, 1, both)
-    return 0
+    count[0], count[2] = found, inside

@@ -14,6 +14,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import cache
 from itertools import count
 from threading import Lock
@@ -133,7 +134,7 @@ class _Written(NamedTuple):
     terms: int
 
 
-# VEC, BOOL and BYTE are vectors of WIDE numbers, decisions and bytes
+# VEC, BOOL, BYTE and LONG are vectors of WIDE numbers, decisions, bytes and 64 bits
 _OPERATIONS = {
     "add": "fadd VEC {}, {}",
     "add_any": "fadd VEC {}, {}",
@@ -205,11 +206,14 @@ def _written(
         return put(f"load {kind}, ptr {put(f'getelementptr {single}, ptr %r{row}, i64 {at}').name}, align 1")
 
     def rule(equation: Any, inputs: list[Any]) -> Sequence[Any]:
-        name, made = equation.primitive.name, equation.outvars[0].aval
+        name, result = equation.primitive.name, equation.outvars[0].aval
         if not any(isinstance(value, _Value) for value in inputs):
-            # the same for all pairs: made once, outside
+            # the same for all pairs: made once, outside; what is known now, such as a zero, is written down
+            known = not any(isinstance(value, Tracer | jax.Array) for value in inputs)
             try:
-                return bound(equation, inputs)
+                with jax.ensure_compile_time_eval() if known else nullcontext():
+                    made = bound(equation, inputs)
+                return [np.asarray(value) for value in made] if known else made
             except TypeError as error:
                 raise _NotKnown(str(error)) from None
         if name == "dynamic_slice" and np.ndim(inputs[0]) == 1 and equation.params["slice_sizes"] == (1,):
@@ -226,13 +230,13 @@ def _written(
             for _ in range(abs(power) - 1):
                 product = put(f"fmul VEC {product}, {base}").name
             return [put(f"fdiv VEC {_number(1)}, {product}") if power < 0 else _Value(product)]
-        same = name == "convert_element_type" and made.dtype == equation.invars[0].aval.dtype
+        same = name == "convert_element_type" and result.dtype == equation.invars[0].aval.dtype
         if same or name in _SHAPES:
             return [inputs[0]]
         halves_to_even = name != "round" or equation.params["rounding_method"] == 1
         if name not in _OPERATIONS or not halves_to_even:
             raise _NotKnown(name)
-        kind = "BOOL" if made.dtype == np.bool_ else "VEC"
+        kind = "BOOL" if result.dtype == np.bool_ else "VEC"
         decisions = len(inputs) if name in ("and", "or", "xor", "not") else int(name == "select_n")
         kinds = ["BOOL"] * decisions + [kind if name == "select_n" else "VEC"] * (len(inputs) - decisions)
         return [put(_OPERATIONS[name].format(*map(text, inputs, kinds), kind=kind), kind)]
@@ -240,19 +244,21 @@ def _written(
     # once for eight slots: what is summed and kept, by kind of vector and of number, row, and start
     own = [load(row, "VEC", "double") for row in range(columns)]
     told = [load(columns + k, "BYTE", "i8").name for k in range(flags)]
+    told = [put(f"zext BYTE {byte} to LONG").name for byte in told]
     summed = range(columns + flags, columns + flags + terms)
     kept = [("VEC", "double", row, load(row, "VEC", "double").name) for row in summed]
     if margins:
         kept.append(("VEC", "double", rows - 2, load(rows - 2, "VEC", "double").name))
-        kept.append(("BYTE", "i8", rows - 5, "zeroinitializer"))
+        # a number of 64 bits for each atom, as its margin is one: the processor has a mask for both
+        kept.append(("LONG", "i8", rows - 5, "zeroinitializer"))
     once, lines = lines, []
 
     # for each of them
     given = [*own, *(_Value(f"%other{k}.WIDE") for k in range(columns))]
     if types:
         given.append(put(f"uitofp BYTE {load(rows - 4, 'BYTE', 'i8', '%from.WIDE').name} to VEC"))
-    bits = [put(f"and BYTE {byte}, %bit.WIDE").name for byte in told]
-    given += [put(f"icmp ne BYTE {bit}, zeroinitializer", "BOOL") for bit in bits]
+    bits = [put(f"and LONG {byte}, %bit.WIDE").name for byte in told]
+    given += [put(f"icmp ne LONG {bit}, zeroinitializer", "BOOL") for bit in bits]
     results = list(map(text, interpreted(program, given, rule)))
     after = [put(f"fadd VEC %kept{k}.WIDE, {results[k]}").name for k in range(terms)]
     if margins:
@@ -262,12 +268,15 @@ def _written(
         nearer = put(f"fcmp olt VEC {size}, {nearest}").name
         after.append(put(f"select BOOL {nearer}, VEC {size}, VEC {nearest}").name)
         inside = put(f"fcmp {_COMPARISONS[margins]} VEC {margin}, {_number(0)}").name
-        bit = put(f"select BOOL {inside}, BYTE %bit.WIDE, BYTE zeroinitializer").name
-        after.append(put(f"or BYTE {byte}, {bit}").name)
+        bit = put(f"select BOOL {inside}, LONG %bit.WIDE, LONG zeroinitializer").name
+        after.append(put(f"or LONG {byte}, {bit}").name)
     held, ends = [], []
     for k, ((kind, single, row, first), last) in enumerate(zip(kept, after, strict=True)):
         held.append(f"%kept{k}.WIDE = phi {kind} [{first}, %begin.WIDE], [{last}, %slot.WIDE]")
         ends.append(f"%end{k}.WIDE = getelementptr {single}, ptr %r{row}, i64 %k.WIDE")
+        if kind == "LONG":
+            ends.append(f"%byte{k}.WIDE = trunc LONG {last} to BYTE")
+            kind, last = "BYTE", f"%byte{k}.WIDE"
         ends.append(f"store {kind} {last}, ptr %end{k}.WIDE, align 1")
 
     starts = []
@@ -285,7 +294,6 @@ def _written(
                 behind=behind,
                 once="\n  ".join(once),
                 held="\n  ".join(held),
-                bit=_same("i8", "%bit.WIDE.k", "%bit.WIDE", "BYTE"),
                 others="\n  ".join(_others(wide, columns, rows)),
                 each="\n  ".join(lines),
                 ends="\n  ".join(ends),
@@ -320,7 +328,7 @@ def _same(single: str, value: str, name: str, kind: str) -> str:
 def _of_width(text: str, wide: int) -> str:
     """Lines for vectors of so many atoms."""
     text = re.sub(r"ALL\[(.+?)\]", lambda one: "<" + ", ".join([one[1]] * wide) + ">", text)
-    kinds = {"VEC": "double", "BOOL": "i1", "BYTE": "i8"}
+    kinds = {"VEC": "double", "BOOL": "i1", "BYTE": "i8", "LONG": "i64"}
     for name, kind in kinds.items():
         text = text.replace(name, f"<{wide} x {kind}>")
     return text.replace("WIDE", str(wide))
@@ -357,15 +365,17 @@ def _others(wide: int, columns: int, rows: int) -> list[str]:
             for row in here:
                 shuffled(f"other{row}", 4, loaded[0], "poison", [row - 4 * part])
             continue
-        # x y z w of the atoms k and k + 4; x x z z and y y w w of two and two; then of all eight
-        pair = [shuffled(f"pair{part}_{k}", 4, loaded[k], loaded[k + 4], range(8)) for k in range(4)]
+        # x y z w of two atoms; x x z z and y y w w of two and two; then of all eight. Paired so that whole
+        # quarters are moved in the end, which needs no register to say where
+        two_by_two = enumerate(((0, 2), (1, 3), (4, 6), (5, 7)))
+        pair = [shuffled(f"pair{part}_{k}", 4, loaded[a], loaded[b], range(8)) for k, (a, b) in two_by_two]
         for odd in range(min(2, len(here))):
             two = [odd + k for k in (0, 8, 2, 10, 4, 12, 6, 14)]
             low = shuffled(f"low{part}_{odd}", 8, pair[0], pair[1], two)
             high = shuffled(f"high{part}_{odd}", 8, pair[2], pair[3], two)
             for row in range(4 * part + odd, here.stop, 2):
                 shift = row - 4 * part - odd
-                shuffled(f"other{row}", 8, low, high, [shift + k for k in (0, 1, 8, 9, 4, 5, 12, 13)])
+                shuffled(f"other{row}", 8, low, high, [shift + k for k in (0, 1, 4, 5, 8, 9, 12, 13)])
     return lines
 
 
@@ -392,10 +402,9 @@ begin.WIDE:
   br label %slot.WIDE
 slot.WIDE:
   %slot.WIDE.k = phi i64 [0, %begin.WIDE], [%later.WIDE, %slot.WIDE]
+  %bit.WIDE = phi LONG [ALL[i64 1], %begin.WIDE], [%nextbit.WIDE, %slot.WIDE]
   {held}
-  %shift.WIDE = trunc i64 %slot.WIDE.k to i8
-  %bit.WIDE.k = shl i8 1, %shift.WIDE
-  {bit}
+  %nextbit.WIDE = add LONG %bit.WIDE, %bit.WIDE
   %row.WIDE = mul i64 %slot.WIDE.k, %atoms
   %from.WIDE = add i64 %row.WIDE, %k.WIDE
   {others}

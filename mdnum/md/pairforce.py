@@ -134,8 +134,9 @@ class PairForce(eqx.Module):
         d = self.cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
         r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         quantity = jnp.sqrt(r2) if self.decider.space == "r" else r2
-        threshold = of_type(self.thresholds, types)
-        return d, r2, self.decider.inside(quantity, threshold), threshold - quantity
+        # compared as what is recorded: once for both, and differences of unequal numbers are not zero
+        margin = of_type(self.thresholds, types) - quantity
+        return d, r2, margin >= 0 if self._inside == ">=" else margin > 0, margin
 
     def __call__(
         self,
@@ -268,8 +269,9 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
         d, r2, inside, margin = force._geometry(own, other, types)
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
-        # a slot of padding is nowhere
-        terms = terms_of([jnp.where(inside, c, 0) for c in d], r2, inside, types)
+        *force_terms, energy, virial = terms_of(d, r2, inside, types)
+        # a slot of padding is nowhere, and no number times nothing is no number
+        terms = (*(jnp.where(inside, term, 0) for term in force_terms), energy, virial)
         return (*terms, margin) if decisions else terms
 
     flags = [one for one in (given, where) if one is not None]

@@ -11,7 +11,6 @@ from mdnum.numerics.events import (
     changes_in_time,
     count_set,
     set_bits,
-    sort_rows,
 )
 from mdnum.numerics.roles import PrecisionPolicy, RolePrecision
 from mdnum.numerics.rounding import (
@@ -42,7 +41,6 @@ __all__ = [
     "neighbor",
     "ordinal",
     "set_bits",
-    "sort_rows",
     "squared_distance_bound",
     "ulp_distance",
     "unit_roundoff",

@@ -151,35 +151,6 @@ class Ledger:
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)
 
 
-def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
-    """Order of rows by step, then by the labels of the subject, first label first."""
-    order = np.arange(len(step))
-    for column in (*subject.T[::-1], step):
-        low, high = int(column.min(initial=0)), int(column.max(initial=0))
-        # a pass over as many places as there are labels; where rows are few beside those, comparing is less
-        if high - low < 8 * len(step):
-            order = _counted(column, low, high - low + 1, order)
-        else:
-            order = order[np.argsort(column[order], kind="stable")]
-    return order
-
-
-@numba.njit(cache=True, nogil=True)
-def _counted(column, low, size, order):
-    """An order sorted by a column of integers from low to low + size - 1; rows that are equal keep theirs."""
-    start = np.zeros(size + 1, np.int64)
-    for value in column:
-        start[value - low + 1] += 1
-    for k in range(size):
-        start[k + 1] += start[k]
-    out = np.empty_like(order)
-    for q in order:
-        k = column[q] - low
-        out[start[k]] = q
-        start[k] += 1
-    return out
-
-
 # --- packed bits: eight slots to a byte --------------------------------------------------------------
 #
 # A step of a list with W*8 slots for each of C columns leaves a (W, C) array of bytes; slot k of column c is
@@ -197,6 +168,12 @@ def lowest_bit(typingctx: Any, word: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(types.uint64), generate
+
+
+@_intrinsic
+def bits_set(typingctx: Any, word: Any) -> Any:
+    """How many of 64 bits are set, unsigned."""
+    return types.uint64(types.uint64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -314,9 +314,8 @@ def run_epoch(
             if program.rows:
                 values |= {"x": x, "v": v, "images": images, "bits": d.bits}
             else:
-                # counted, not added up from the changes: it is what they are held against
-                values["inside"] = inside_of(d.bits)
                 changes = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
+                values["inside"] = changes.count[2]
                 record, earlier = record._replace(changes=changes), d.bits
         record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
-from mdnum.md.decide import Changes
+from mdnum.md.decide import Changes, note
 from mdnum.md.neighbors import PairTable
-from mdnum.numerics import Ledger, changes_in_time, count_set, sort_rows
+from mdnum.md.potentials import pair_type
+from mdnum.numerics import Ledger, count_set
 from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
 
@@ -54,80 +55,102 @@ def _fingerprint_of_keys(keys):
 
 
 @numba.njit(cache=True, nogil=True)
-def _from_first_end(row, slot, column, values, index):
-    """The changes seen from the atom that is sorted first, as `Changes.pairs`.
-
-    There are as many as from the other end; more of either are counted and not noted.
-    """
-    kept, room = 0, row.shape[0] // 2
-    pairs = np.empty((room + 1, 4), np.int32)
-    for q in range(row.shape[0]):
-        c = column[q]
-        n = index[slot[q], c]
-        # written always and kept where c < n: half of the branches would be mispredicted
-        at = min(kept, room)
-        pairs[at, 0], pairs[at, 1], pairs[at, 2], pairs[at, 3] = row[q], c, n, values[q]
-        kept += np.int64(c < n)
-    return kept, pairs[:room]
+def _note_rows(before, rows, index, x, v, pairs, ends, count):
+    """`Changes` of consecutive rows of one list."""
+    for r in range(len(rows)):
+        if r == 0:
+            note(before, rows[r], index, x[r], v[r], r, pairs, ends, count)
+        else:
+            note(rows[r - 1], rows[r], index, x[r], v[r], r, pairs, ends, count)
 
 
 @numba.njit(cache=True, nogil=True)
-def _ends(x, v, pairs):
-    """Positions and velocities of both atoms, as `Changes.ends`."""
-    ends = np.empty((pairs.shape[0], 12), x.dtype)
-    for f in range(pairs.shape[0]):
-        r, a, b = pairs[f, 0], pairs[f, 1], pairs[f, 2]
-        for axis in range(3):
-            ends[f, axis], ends[f, 3 + axis] = x[r, axis, a], x[r, axis, b]
-            ends[f, 6 + axis], ends[f, 9 + axis] = v[r, axis, a], v[r, axis, b]
-    return ends
+def _placed(column, size, order):
+    """An order sorted by a column of numbers below a size; rows that are equal keep theirs."""
+    start = np.zeros(size + 1, np.int64)
+    for value in column:
+        start[value + 1] += 1
+    for k in range(size):
+        start[k + 1] += start[k]
+    out = np.empty_like(order)
+    for q in order:
+        out[start[column[q]]] = q
+        start[column[q]] += 1
+    return out
 
 
 # atoms in one place have no radial speed: not a number, as in numpy
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _measure(ends, chosen, row, entered, kind, by_type, bounds, root, narrow, lattice):
-    """Margin, bound, energy jump, distance, radial speed and force jump of each flip, shape (6, flips).
+def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice, narrow, first, factor):
+    """Columns of a ledger from `Changes`, sorted, and whether a margin contradicts its decision.
 
     Args:
-        ends: of changes, of which some are chosen.
+        labels: of sorted atoms. species: by label. kinds: pair type of two species.
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
-        root: whether distances are compared, not their squares.
-        narrow, lattice: of the cell in the dtype of the decision, and in float64.
+        rule: whether distances are compared, not their squares; and whether a margin of 0 is inside.
+        lattice, narrow: `HostCell.numbers` in float64, and in float32 where decisions are made in that.
+        first: step of the first row. factor: from velocities to those of the ledger.
+
+    Returns:
+        step, labels and decision; then margin, bound, energy jump, distance, radial speed and force jump,
+        shape (6, flips).
     """
-    out = np.empty((6, row.shape[0]))
-    small, wide = narrow[0].dtype.type, np.float64
-    for f in range(row.shape[0]):
-        r, k, at = row[f], kind[f], ends[chosen[f]]
-        x0, y0, z0, x1, y1, z1 = at[0], at[1], at[2], at[3], at[4], at[5]
+    flips, (root, inclusive) = len(pairs), rule
+    i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
+    for q in range(flips):
+        one, other = labels[pairs[q, 1]], labels[pairs[q, 2]]
+        i[q], j[q] = min(one, other), max(one, other)
+    order = _placed(pairs[:, 0], len(bounds), _placed(i, len(labels), np.arange(flips)))
+    # an atom has few flips in a step
+    for f in range(1, flips):
+        q, at = order[f], f
+        while at > 0:
+            p = order[at - 1]
+            if i[p] != i[q] or j[p] < j[q] or pairs[p, 0] != pairs[q, 0]:
+                break
+            order[at] = p
+            at -= 1
+        order[at] = q
+    place = np.empty(flips, np.int64)
+    for f in range(flips):
+        place[order[f]] = f
+    step, subject = np.empty(flips, np.int64), np.empty((flips, 2), np.int64)
+    entered, out, contradicted = np.empty(flips, np.bool_), np.empty((6, flips)), False
+    small, wide = np.float32, np.float64
+    # as they were noted: they come from further away than their places, which are near one another
+    for q in range(flips):
+        f = place[q]
+        row, now, k = pairs[q, 0], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
+        x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
         dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz
         distance = np.sqrt(r2)
         quantity = distance if root else r2
-        if narrow[0].itemsize < 8:
+        if narrow is not None:
             sx, sy, sz = nearest_image(
                 narrow, small(x1) - small(x0), small(y1) - small(y0), small(z1) - small(z0)
             )
             short = sx * sx + sy * sy + sz * sz
             quantity = wide(np.sqrt(short) if root else short)
-        u0, u1, u2 = at[9] - at[6], at[10] - at[7], at[11] - at[8]
+        u0, u1, u2 = ends[q, 9] - ends[q, 6], ends[q, 10] - ends[q, 7], ends[q, 11] - ends[q, 8]
         approach = wide(u0) * dx + wide(u1) * dy + wide(u2) * dz
-        sign = 1.0 if entered[f] else -1.0
-        out[0, f], out[1, f], out[2, f] = by_type[0, k] - quantity, bounds[r, k], sign * by_type[1, k]
-        out[3, f], out[4, f], out[5, f] = distance, approach / distance, sign * by_type[2, k]
-    return out
+        sign, margin = 1.0 if now else -1.0, by_type[0, k] - quantity
+        contradicted |= now != (margin >= 0 if inclusive else margin > 0)
+        step[f], subject[f, 0], subject[f, 1], entered[f] = first + row, i[q], j[q], now
+        out[0, f], out[1, f], out[2, f] = margin, bounds[row, k], sign * by_type[1, k]
+        out[3, f], out[4, f], out[5, f] = distance, approach / distance * factor, sign * by_type[2, k]
+    return step, subject, entered, out, contradicted
 
 
-_ONE_END = "a flip was recorded from one end only"
-
-
-def _noted(segment: Segment, changes: Changes) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs and ends of the changes in a segment's rows."""
-    found, both = np.asarray(changes.count).tolist()
-    pairs, ends = changes.first(min(found, len(changes.pairs)))
-    if 2 * found != both:
-        raise MdnumError(_ONE_END, remedy="Report this as a bug")
-    kept = np.searchsorted(pairs[:, 0], segment.rows)
-    return pairs[:kept], ends[:kept]
+def _noted(before, bits, index, x, v) -> Changes:
+    """The changes in consecutive rows of one list, as the loop notes them."""
+    room = len(bits) * max(64, bits.shape[2] // 4)
+    while True:
+        made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
+        _note_rows(before, bits, index, x, v, *made)
+        if made[2][0] <= room:
+            return Changes(*made)  # type: ignore[arg-type]
+        room = int(made[2][0])
 
 
 class AmbiguousPairs(NamedTuple):
@@ -179,7 +202,11 @@ class PairRecorder:
         self.missed = 0
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
-        self._inclusive = decider.compare.endswith("<=")
+        self._narrow = None if decider.dtype == "float64" else self._decision_cell.numbers
+        self._rule = decider.space == "r", decider.compare.endswith("<=")
+        types = len(simulation.system.species) if simulation.pair_types > 1 else 1
+        self._kinds = pair_type(np.arange(types)[:, None], np.arange(types), types)
+        self._species = simulation.species if types > 1 else np.zeros(simulation.atoms, np.int64)
         thresholds = np.array([threshold.value for threshold in decider.thresholds])
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
@@ -205,7 +232,7 @@ class PairRecorder:
         """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
         decider = self.simulation.decider
         if not decider.grows:
-            return np.tile(np.array(decider.bounds), (segment.rows, 1))
+            return np.repeat([decider.bounds], segment.rows, axis=0)
         return decider.bounds_at(segment.rows_of("x"))
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
@@ -231,7 +258,7 @@ class PairRecorder:
             margin = self.simulation.decider.host_margin(d, kind)
             bound = bounds[row][kind]
             at = np.flatnonzero(np.abs(margin) <= bound)
-            at = at[sort_rows(np.zeros(len(at), np.int64), np.stack([i[at], j[at]], axis=1))]
+            at = at[np.lexsort((j[at], i[at]))]
             step = np.full(len(at), segment.first + row, np.int64)
             parts.append(
                 AmbiguousPairs(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
@@ -250,20 +277,22 @@ class PairRecorder:
         """
         table, changes = segment.table, segment.record.changes
         replaced = self._replace(segment)
-        if changes is not None and replaced is None:
-            pairs, ends = _noted(segment, changes)
-        else:
-            bits = segment.rows_of("bits")
-            changed = changes_in_time(np.asarray(segment.before) if replaced is None else bits[0], bits)
-            found, pairs = _from_first_end(*changed, table.index)
-            if 2 * found != len(changed[0]):
-                raise MdnumError(_ONE_END, remedy="Report this as a bug")
-            if replaced is not None:
-                keys, now = replaced
-                atoms = np.argsort(table.order)[np.stack(np.divmod(keys, self.simulation.atoms))]
-                added = np.stack([np.zeros(len(keys), np.int64), *atoms, now], axis=1).astype(np.int32)
-                pairs = np.concatenate([added, pairs])
-            ends = _ends(segment.rows_of("x"), segment.rows_of("v"), pairs)
+        if changes is None or replaced is not None:
+            bits, x, v = (segment.rows_of(name) for name in ("bits", "x", "v"))
+            before = np.asarray(segment.before) if replaced is None else bits[0]
+            changes = _noted(before, bits, table.index, x, v)
+        found, both, _ = np.asarray(changes.count).tolist()
+        if 2 * found != both:
+            raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
+        pairs, ends = changes.first(min(found, len(changes.pairs)))
+        kept = np.searchsorted(pairs[:, 0], segment.rows)
+        pairs, ends = pairs[:kept], ends[:kept]
+        if replaced is not None:
+            keys, now = replaced
+            a, b = np.argsort(table.order)[np.stack(np.divmod(keys, self.simulation.atoms))]
+            added = np.stack([np.zeros(len(keys), np.int64), a, b, now], axis=1).astype(np.int32)
+            pairs = np.concatenate([added, pairs])
+            ends = np.concatenate([np.concatenate([x[0][:, a], x[0][:, b], v[0][:, a], v[0][:, b]]).T, ends])
         if segment.closes:
             if segment.held is None:
                 bits = np.array(segment.rows_of("bits")[-1])
@@ -271,10 +300,20 @@ class PairRecorder:
             else:
                 self._held_segment = table, segment.held, int(segment.rows_of("inside")[-1])
             self._held_keys = None
-        i, j = table.order[pairs[:, 1]], table.order[pairs[:, 2]]
-        labels = np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)
-        order = sort_rows(pairs[:, 0], labels)
-        return self._ledger(segment, ends, order, pairs[order, 0], pairs[order, 3], labels[order])
+        step, labels, entered, numbers, contradicted = _columns(
+            pairs, ends, table.order, self._species, self._kinds, self._by_type, self.bounds(segment),
+            self._rule, self._cell.numbers, self._narrow, segment.first,
+            # user units of time: the ledger is for people
+            self.simulation.units.time_factor,
+        )  # fmt: skip
+        if contradicted:
+            raise MdnumError(
+                "a recorded margin contradicts its decision",
+                remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
+            )
+        margin, bound, jump, distance, speed, force_jump = numbers
+        extra = {"distance": distance, "radial_speed": speed, "force_jump": force_jump}
+        return Ledger("pair", step, labels, entered, margin, bound, jump, extra)
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""
@@ -312,25 +351,6 @@ class PairRecorder:
         self.missed = len(np.setdiff1d(looked_back, held, assume_unique=True))
         keys = np.setxor1d(held, now, assume_unique=True)
         return keys, np.isin(keys, now, assume_unique=True)
-
-    def _ledger(self, segment: Segment, ends, chosen, row, entered, labels) -> Ledger:
-        entered = entered.astype(bool)
-        kind = self.simulation.type_of(labels[:, 0], labels[:, 1])
-        measured = _measure(
-            ends, chosen, row, entered, kind, self._by_type, self.bounds(segment),
-            self.simulation.decider.space == "r", self._decision_cell.lattice, self._cell.lattice,
-        )  # fmt: skip
-        margin, bound, jump, distance, speed, force_jump = measured
-        if not np.array_equal(margin >= 0 if self._inclusive else margin > 0, entered):
-            raise MdnumError(
-                "a recorded margin contradicts its decision",
-                remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
-            )
-        # user units of time: the ledger is for people
-        speed = speed * self.simulation.units.time_factor
-        extra = {"distance": distance, "radial_speed": speed, "force_jump": force_jump}
-        step = segment.first + row.astype(np.int64)
-        return Ledger("pair", step, labels.astype(np.int64), entered, margin, bound, jump, extra)
 
 
 def flip_columns(ledger: Ledger) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ import oracles
 import pytest
 
 from mdnum.errors import CapacityError, InputError
-from mdnum.md import device_search
+from mdnum.md import device_search, neighbors
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
 from mdnum.references.conformance import ListLimits, NeighborListConformance
@@ -95,6 +95,24 @@ def test_a_search_on_a_device_makes_the_same_table(name, monkeypatch):
     right = oracles.minimum_image_pairs(wrapped, matrix, cell.pbc, r_list)
     index, order = (np.asarray(part) for part in BUILDERS["device"].build(wrapped, cell, r_list, 112)[:2])
     assert {(i, j) for i, j in pairs_of(index, order, atoms) if i < j} == right
+
+
+@pytest.mark.parametrize("pbc", [(True, True, True), (False, True, False)])
+def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
+    rng, cell = np.random.default_rng(3), Cell.create([20.0, 18.0, 22.0], pbc)
+    positions = rng.uniform(0, 1, (900, 3)) * [20.0, 18.0, 22.0]
+    monkeypatch.setattr(neighbors, "_SHARED", 100)
+    made = []
+    for cores in (1, 2, 3, 7):
+        monkeypatch.setattr(neighbors, "_cores", lambda cores=cores: cores)
+        index, order, most = neighbor_table(positions, cell, 4.0, 64)
+        # not the memory that the next search is given
+        made.append((index.copy(), order, most))
+    for index, order, most in made[1:]:
+        assert np.array_equal(index, made[0][0]) and np.array_equal(order, made[0][1]) and most == made[0][2]
+    assert {pair for pair in pairs_of(*made[0][:2], 900) if pair[0] < pair[1]} == oracles.minimum_image_pairs(
+        positions, np.diag([20.0, 18.0, 22.0]), cell.pbc, 4.0
+    )
 
 
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
