@@ -334,7 +334,10 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
             mask = np.empty(capacity + _WIDE, np.uint8)
             # rows a cache line further than a power of two apart: those share their places in a cache
             wider = np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
-            wider[:, :room] = rows[:, :room]
+            # not as slices: numba compiles the message of what cannot be assigned for two seconds
+            for k in range(_TOGETHER):
+                for q in range(room):
+                    wider[k, q] = rows[k, q]
             rows = wider
         for b2 in range(bins[2]):
             here = column + b2
