@@ -185,7 +185,7 @@ _GROUP_ROWS = 262_144
 # every page carries a checksum, which whoever reads the file can ask for
 _WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
-_DISTINCT = frozenset({"i", "j", "distance", "margin", "radial_speed"})
+_DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before", "radial_speed"})
 
 
 class TableStream:
