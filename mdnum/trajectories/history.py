@@ -167,7 +167,9 @@ def contacts(history: History) -> Contacts:
     """
     room = int(np.count_nonzero(history.inside)) + int(np.count_nonzero(history.entered))
     of, begin, end = np.empty((3, room), np.int64)
-    if not _stays(history.inside, history.rows, history.frame, history.entered, history.frames, of, begin, end):
+    if not _stays(
+        history.inside, history.rows, history.frame, history.entered, history.frames, of, begin, end
+    ):
         raise ValueError("flips are missing: a pair enters while inside, or leaves while outside")
     # flips are of frames after the first
     ids, began = (history.i[of], history.j[of], history.rank[of]), begin > 0
@@ -222,7 +224,9 @@ class Strides(Sums):
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
         """Counts them: of the flips of a pair between two frames that are kept, an odd one is left."""
-        counts = [_thinned(history.rows, history.frame, history.ambiguous, history.frames, n) for n in strides]
+        counts = [
+            _thinned(history.rows, history.frame, history.ambiguous, history.frames, n) for n in strides
+        ]
         kept, total, doubtful = np.array(counts, np.int64).reshape(-1, 3).T
         return cls(np.array(strides, np.int64), kept, total, doubtful)
 
