@@ -100,6 +100,7 @@ class _ProcessPart:
         os.unlink(name)
         vars(self).update(state, flips=[FlipTable(*columns)] * bool(count))
 
+
 @dataclass(frozen=True)
 class _Failure:
     """Why a part ended before its last frame: whether reading failed, or what was read was wrong."""

@@ -8,6 +8,7 @@ every other pair of that frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,15 @@ class Frame:
     box: Box
     velocities: Float[np.ndarray, "atoms 3"] | None = None  # length per time, where the file has them
     labels: np.ndarray | None = None  # names, elements or types, where the file has them in every frame
+
+    @cached_property
+    def furthest(self) -> float:
+        """The largest coordinate in size, length: not finite where one is not, 0 without any."""
+        return furthest(self.positions)
+
+    def furthest_of(self, atoms: AtomIndices) -> float:
+        """The same of some atoms."""
+        return self.furthest if atoms is None else furthest(self.positions[atoms])
 
 
 class FrameError(InputError):
@@ -132,10 +142,8 @@ class FrameCheck:
                     f": the box repeats along {'abc'[axis]}, but its vector there is {vector.tolist()}",
                     "Give the frames a box, or say that this direction does not repeat",
                 )
-        # a sum is finite unless a term is not, or the terms are of no use anyway
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = x.sum()
-        if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
+        if not np.isfinite(frame.furthest_of(atoms)):
+            bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
             raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
         if (found := far_out(frame, atoms, self.radius, self.bits)) is not None:
             atom, many, why = found
@@ -183,7 +191,7 @@ def far_out(
         return None
     # how far a distance is off between coordinates of size 1, twice over
     unit = 2 * 4 * float(np.sqrt(3)) * _UNIT[bits]
-    top, box = furthest(x), _box(frame)
+    top, box = frame.furthest_of(atoms), _box(frame)
     if ((box and top <= _FAR_BOXES * box / 2) or not top) and unit * top <= radius:
         return None
     away = np.abs(x - np.median(x, axis=0)).max(axis=1)
@@ -223,7 +231,7 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
 
 
 def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
-    """The largest coordinate in size, length; 0 without any."""
+    """The largest number in size; 0 without any."""
     # twice as fast as through their absolute values, and six times as by atom
     return float(max(x.max(initial=0.0), -x.min(initial=0.0)))
 

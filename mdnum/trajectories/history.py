@@ -106,19 +106,6 @@ class History:
         """The pair of each flip."""
         return np.repeat(np.arange(len(self)), self.flips)
 
-    @property
-    def last(self) -> Bool[np.ndarray, "pairs"]:
-        """Whether each pair is inside at the last frame."""
-        return self.inside ^ (self.flips % 2 == 1)
-
-    def broken(self) -> Int[np.ndarray, "broken"]:
-        """Pairs that enter while inside or leave while outside: a flip of theirs is missing."""
-        pair = self.pair
-        # the nth flip of a pair enters if the pair was outside and n is even, or inside and n is odd
-        turn = np.arange(len(self.frame)) - self.rows[:-1][pair]
-        expected = self.inside[pair] ^ (turn % 2 == 0)
-        return np.unique(pair[expected != self.entered])
-
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """A stable order that sorts by all columns, and in that order which rows differ from the one before."""
@@ -163,7 +150,7 @@ def contacts(history: History) -> Contacts:
     """The stays inside of every pair.
 
     Raises:
-        ValueError: flips of a pair do not enter and leave in turn (see `History.broken`).
+        ValueError: flips of a pair do not enter and leave in turn: one is missing.
     """
     room = int(np.count_nonzero(history.inside)) + int(np.count_nonzero(history.entered))
     of, begin, end = np.empty((3, room), np.int64)

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
+from mdnum.trajectories.frame import AtomIndices, Box, Frame
 
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
@@ -76,17 +76,14 @@ class Resolution:
 
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
-        x = frame.positions if atoms is None else frame.positions[atoms]
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = x.sum()
-        if not np.isfinite(total):
+        if atoms is not None or not np.isfinite(frame.furthest):
+            x = frame.positions if atoms is None else frame.positions[atoms]
             # atoms that are nowhere have no distances
-            x = x[np.isfinite(x).all(axis=1)]
-        frame = frame if x is frame.positions else replace(frame, positions=x, velocities=None)
-        largest, rows = furthest(x), frame.box.matrix[frame.box.pbc]
+            frame = replace(frame, positions=x[np.isfinite(x).all(axis=1)], velocities=None)
+        largest, rows = frame.furthest, frame.box.matrix[frame.box.pbc]
         # the largest sum of the lattice's components along an axis
         lattice = float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
-        coordinate, box = self._half(frame, largest), 0.0
+        coordinate, box = self._half(frame), 0.0
         if self._narrow:
             # the box comes through the same reader
             coordinate += _ROUNDINGS * _UNIT[32] * largest
@@ -116,15 +113,15 @@ class Resolution:
     def _narrow(self) -> bool:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
-    def _half(self, frame: Frame, furthest: float) -> float:
-        """Half a step along an axis at worst, length; the largest coordinate in size is known."""
+    def _half(self, frame: Frame) -> float:
+        """Half a step along an axis at worst, length."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
             largest = np.abs(_fractions_of(frame)).max(axis=0) if self.digits else np.ones(3)
             steps = steps_of(largest, self.step, self.digits)
             return float((steps[:, None] * np.abs(frame.box.matrix)).sum(axis=0).max()) / 2
-        return float(steps_of(np.array(furthest), self.step, self.digits)) / 2
+        return float(steps_of(np.array(frame.furthest), self.step, self.digits)) / 2
 
 
 def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:

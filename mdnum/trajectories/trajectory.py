@@ -275,7 +275,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     from mdnum.trajectories import mdanalysis_source, text
 
     own = dict.fromkeys(("lammpsdump", "lammpstrj", "lammps-dump-text"), text.LammpsDump)
-    own["gro"] = text.GroTrajectory
+    own |= {"gro": text.GroTrajectory}
     library = partial(mdanalysis_source.MDAnalysisTrajectory, format=format)
     known: set[str] = set(MDAnalysis._READERS)
     if format is not None and word in own:

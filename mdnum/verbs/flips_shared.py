@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
-# rows that wait to be handed over together: a call costs more than a row
-_ROWS_HELD = 20_000
+# rows that wait to be handed over together: a call costs more than many rows
+_ROWS_HELD = 100_000
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
