@@ -213,7 +213,7 @@ def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("ends", ["finished", "closed", "full"])
 def test_a_table_that_nobody_resumes_is_written_as_it_grows(tmp_path, monkeypatch, ends):
-    """Whole or not at all; of a disk that is full meanwhile one is told while rows are appended, or at the end."""
+    """Whole or not at all; of a disk that is full one is told while rows are appended, or at the end."""
     monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
     monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
     folder = RunFolder.create(tmp_path / "ball", world="ball")

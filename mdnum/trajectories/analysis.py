@@ -83,11 +83,10 @@ class _ProcessPart:
 
     def __getstate__(self) -> dict[str, Any]:
         """To another process, which would wait for flips to come through a pipe: those go through a file."""
-        whole = FlipTable.concatenate([FlipTable.none(), *self.flips])
         with NamedTemporaryFile(prefix="mdnum-flips-", delete=False) as file:
-            for column in vars(whole).values():
-                file.write(column.data)
-        return {**vars(self), "flips": (file.name, len(whole))}
+            for name in vars(FlipTable.none()):
+                file.writelines(getattr(one, name).data for one in self.flips)
+        return {**vars(self), "flips": (file.name, sum(map(len, self.flips)))}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         name, count = state["flips"]

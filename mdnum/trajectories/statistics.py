@@ -354,10 +354,6 @@ class AgainSums(Sums):
     once: Int[np.ndarray, "lags"]
     stays: int
 
-    def __add__(self, other: Any) -> Any:
-        # one part of the pairs is a sample of all of them, and enough
-        return self if self.stays >= _AGAIN_STAYS // 2 else super().__add__(other)
-
 
 @dataclass(frozen=True)
 class Statistics(Sums):
@@ -376,8 +372,10 @@ class Statistics(Sums):
     again: AgainSums
 
     @classmethod
-    def of(cls, history: History, labels: Labels, directed: bool, window: int) -> tuple[Statistics, Contacts]:
-        """Those of some of the pairs, and their contacts.
+    def of(
+        cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
+    ) -> tuple[Statistics, Contacts]:
+        """Those of some of the pairs, added to those of others before, and their contacts.
 
         Within a window of frames a flip that is reversed is chatter, and a stay outside is overlooked in an
         intermittent contact.
@@ -385,7 +383,10 @@ class Statistics(Sums):
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
         some, among = stays, -(-len(stays) // _AGAIN_STAYS)
-        if among > 1:
+        if before is not None and before.again.stays >= _AGAIN_STAYS // 2:
+            # one part of the pairs is a sample of all of them, and enough
+            some = stays[:0]
+        elif among > 1:
             # all stays of some of the pairs: enough for an average, however many there are
             mine = (stays.i.astype(np.int64) * 7 + stays.j * 13) % among == 0
             some = stays[mine]
@@ -402,7 +403,7 @@ class Statistics(Sums):
             images=int(np.count_nonzero((history.rank > 0) | (history.i == history.j))),
             again=AgainSums(*again(some, lags_of(frames), frames), len(some)),
         )
-        return counted, stays
+        return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
         """Columns of a table of lifetimes by lag, from the numbers of pairs inside at each frame.

@@ -304,9 +304,8 @@ def _rule_told(
         folder.append(table, {"rule": np.full(length, number), **columns})
 
     for part, parts, history in histories(folder, number, found.frames):
-        counted, stays = Statistics.of(history, labels, one.rule.directed, window)
+        total, stays = Statistics.of(history, labels, one.rule.directed, window, total)
         append("contacts", vars(stays))
-        total = counted if total is None else total + counted
         log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
     assert total is not None, "there is at least one part"
     rows = {name: values[frames["rule"] == number] for name, values in frames.items()}
