@@ -3,11 +3,13 @@
 The Lennard-Jones liquid of LAMMPS's bench/in.lj (density 0.8442, r_cut 2.5, skin 0.3, float64), recorded,
 from 4,000 to 1,000,000 atoms. Every size is a process of its own on one core: a warm-up, then steps whose
 CPU time counts, with their flips decoded to ledger rows; the peak of its memory; and one neighbor search.
-Then the smallest size once more in as many processes at a time as there are cores.
+Then the smallest size once more in as many processes at a time as there are cores, and every size once more
+in one process that has two cores.
 
 How to read it. What is flat is linear in the number of atoms: the slope over all sizes is the exponent of the
 growth, 1 for linear. Times depend on the machine and on what else it does, slopes hardly. `together` is the
-time of a step with all processes at work over that of one alone: above 1 they wait for memory.
+time of a step with all processes at work over that of one alone: above 1 they wait for memory. `two cores`
+is how many times as many steps an hour one process makes with two cores.
 """
 
 from __future__ import annotations
@@ -48,12 +50,12 @@ def measure(atoms: int, seconds: float) -> dict[str, float]:
         found = len(recorder.flips(segment))
         if began is None:
             # the first stretch holds the compilation
-            began = time.process_time()
+            began = time.process_time(), time.perf_counter()
             continue
         flips, rows = flips + found, rows + segment.rows
     if began is None or not rows:
         raise ValueError(f"{last} steps are over before the first list is")
-    taken = time.process_time() - began
+    taken, elapsed = time.process_time() - began[0], time.perf_counter() - began[1]
     wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
     verlet = simulation.verlet_list()
     verlet.build(wrapped, simulation.cell)
@@ -63,15 +65,15 @@ def measure(atoms: int, seconds: float) -> dict[str, float]:
     return {
         "atoms": count, "steps": rows, "us_per_atom_step": 1e6 * taken / rows / count,
         "us_per_flip": 1e6 * taken / max(flips, 1), "search_us_per_atom": 1e6 * search / count,
-        "peak_mb": peak_mb(),
+        "peak_mb": peak_mb(), "ms_per_step": 1e3 * elapsed / rows,
     }  # fmt: skip
 
 
-def children(sizes: list[int], seconds: float, cores: list[int]) -> list[dict[str, float]]:
-    """Sizes measured at the same time, each in a process on a core of its own."""
+def children(sizes: list[int], seconds: float, cores: list[list[int]]) -> list[dict[str, float]]:
+    """Sizes measured at the same time, each in a process on cores of its own."""
     runs = []
-    for atoms, core in zip(sizes, cores, strict=True):
-        words = [sys.executable, __file__, "--child", str(atoms), str(seconds), str(core)]
+    for atoms, own in zip(sizes, cores, strict=True):
+        words = [sys.executable, __file__, "--child", str(atoms), str(seconds), *map(str, own)]
         runs.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
     answers = [run.communicate()[0] for run in runs]
     if any(run.returncode for run in runs):
@@ -116,9 +118,9 @@ def _options() -> argparse.Namespace:
 def main() -> None:
     """Measure each size alone, then the smallest on all cores, print and draw."""
     if sys.argv[1:2] == ["--child"]:
-        atoms, seconds, core = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+        atoms, seconds, own = int(sys.argv[2]), float(sys.argv[3]), set(map(int, sys.argv[4:]))
         if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {core})
+            os.sched_setaffinity(0, own)
         print(json.dumps(measure(atoms, seconds)))
         return
     chosen = _options()
@@ -126,9 +128,12 @@ def main() -> None:
     rows = []
     for atoms in sorted(chosen.sizes):
         say(f"N = {atoms:,}")
-        rows += children([atoms], chosen.seconds, cores[:1])
+        rows += children([atoms], chosen.seconds, [cores[:1]])
+        if len(cores) > 1:
+            (both,) = children([atoms], chosen.seconds, [cores[:2]])
+            rows[-1]["two_cores"] = rows[-1]["ms_per_step"] / both["ms_per_step"]
     say(f"N = {min(chosen.sizes):,}, {len(cores)} at a time")
-    beside = children([min(chosen.sizes)] * len(cores), chosen.seconds, cores)
+    beside = children([min(chosen.sizes)] * len(cores), chosen.seconds, [[core] for core in cores])
     together = float(np.mean([row["us_per_atom_step"] for row in beside])) / rows[0]["us_per_atom_step"]
     result: dict[str, Any] = {"sizes": rows, "cores": len(cores), "together": together}
     if len(rows) > 1:
@@ -139,8 +144,20 @@ def main() -> None:
         print(json.dumps(result, indent=2))
     else:
         print("on " + result["machine"])
-        cells = [[f"{row['atoms']:,.0f}", *(float(row[name]) for name in _COLUMNS[1:])] for row in rows]
-        table("growth", ("N", "steps", "µs/atom/step", "µs/flip", "search µs/atom", "peak MB"), cells)
+        cells = [
+            [f"{row['atoms']:,.0f}", *(float(row.get(name, np.nan)) for name in (*_COLUMNS[1:], "two_cores"))]
+            for row in rows
+        ]
+        columns = (
+            "N",
+            "steps",
+            "µs/atom/step",
+            "µs/flip",
+            "search µs/atom",
+            "peak MB",
+            "two cores (wanted >= 1.7)",
+        )
+        table("growth", columns, cells)
         print(f"\n{len(cores)} at a time: a step takes {together:.2f} of one alone")
         if "flat" in result:
             print(f"cost of an atom's step, largest over smallest: {result['flat']:.2f} (wanted <= 1.3)")

@@ -160,6 +160,18 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     assert is_png(tmp_path / "b.png")
 
 
+def test_no_table_and_no_row_of_positions_leaves_an_accelerator(tmp_path: Path) -> None:
+    words = ["--sizes", "500", "1372", "--steps", "60", "--json"]
+    made = json.loads(study("accelerator", *words, cwd=tmp_path))["sizes"]
+    for one in made:
+        # the numbers of a stretch's steps come with it: seven of 128 steps, read once
+        numbers = 9_000 * (one["stretches"] + 1)
+        assert one["to_host"] <= 2 * 112 * one["flips"] + 8 * one["atoms"] * one["lists"] + numbers
+        assert one["to_host"] >= 112 * one["flips"] and one["flips"] > one["steps"] > 50 and one["lists"] > 2
+    # what goes there does not grow with the system
+    assert all(one["to_device"] <= 500 * (one["lists"] + one["stretches"] + 1) for one in made)
+
+
 @pytest.mark.nightly
 def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
     made = json.loads(study("flips_benchmark", "--quick", "--json", "-o", "b.png", cwd=tmp_path))

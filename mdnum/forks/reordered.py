@@ -85,13 +85,13 @@ class FormattedList(VerletList):
         own = table.order[None, :]
         real = labels < atoms
         if self.format != "ordered-sparse":
-            return replace(table, index=_first(table.index, labels, real, table.slots))
+            return replace(table, found=_first(table.index, labels, real, table.slots))
         parts = real & (labels > own), real & (labels < own)
         most = max(int(part.sum(axis=0).max(initial=0)) for part in parts)
         if most > self.half:
             self.half = self._rounded(self.slack * most)
         halves = [_first(table.index, labels, part, self.half) for part in parts]
-        return replace(table, index=np.concatenate(halves))
+        return replace(table, found=np.concatenate(halves))
 
 
 def _first(
@@ -131,7 +131,7 @@ class ShuffledBuilder:
     def build(self, positions, cell, r_list, slots):
         """The inner search's table with the neighbors of each atom in another order, padding at the end."""
         table, order, most = self.inner.build(positions, cell, r_list, slots)
-        atoms = table.shape[1]
+        table, atoms = np.asarray(table), table.shape[1]
         keys = np.random.default_rng(self.seed).random(table.shape)
         keys[table == atoms] = 2.0
         return np.take_along_axis(table, np.argsort(keys, axis=0, kind="stable"), axis=0), order, most

@@ -7,8 +7,8 @@ the ledger all compute them through this file, with the same bits.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from typing import NamedTuple
+from functools import cache, cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md import foreign
 from mdnum.md.cell import Cell
-from mdnum.md.foreign import asked_to_run, buffer, carray, known, pointer, registered, words_at
+from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, registered
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
@@ -134,7 +135,7 @@ class PairDecider:
 
     def values(self) -> jax.Array:
         """Threshold values as an array of the decision's dtype, shape (types,)."""
-        return jnp.asarray([t.value for t in self.thresholds], np.dtype(self.dtype))
+        return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
         """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
@@ -287,6 +288,11 @@ def displacements(components, cell: Cell, j):
 # --- what changed from one pass to the next ---------------------------------------------------------------
 
 
+def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
+    """Zeros on the device, without the program that jnp's would compile for each shape."""
+    return jax.device_put(np.zeros(shape, dtype))
+
+
 class Changes(NamedTuple):
     """Decisions that changed, step after step, each seen from the atom that is sorted first.
 
@@ -304,11 +310,19 @@ class Changes(NamedTuple):
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
         """Room for so many."""
-        return cls(jnp.zeros((room, 4), jnp.int32), jnp.zeros((room, 12), dtype), jnp.zeros(3, jnp.int64))
+        return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
         """The same room without any."""
         return self._replace(count=jnp.zeros_like(self.count))
+
+    def first(self, count: int) -> tuple[Int[np.ndarray, "count 4"], Float[np.ndarray, "count 12"]]:
+        """So many pairs and their ends, on the host; of a device's memory little more than these comes."""
+        room, parts = 1 << count.bit_length(), self[:2]
+        if isinstance(self.pairs, jax.Array) and room < len(self.pairs) and not foreign.known():
+            parts = _cut(parts, room)
+        pairs, ends = (np.asarray(part)[:count] for part in parts)
+        return pairs, ends
 
     def noted(
         self,
@@ -326,7 +340,7 @@ class Changes(NamedTuple):
             most: how many may come at a time on a device other than a CPU, where each step takes the same
                 time however many they are. Where more come, `count` is beyond the room.
         """
-        if known() and x.dtype == np.float64:
+        if foreign.known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
         changed, index = before ^ bits, tables.index.astype(jnp.int32)
         slot, atom = jnp.arange(8, dtype=jnp.uint8)[None, :, None], jnp.arange(x.shape[1], dtype=jnp.int32)
@@ -357,6 +371,12 @@ class Changes(NamedTuple):
         return Changes(*call(*self, before, bits, index, x, v, row.astype(jnp.int64)))
 
 
+@partial(jax.jit, static_argnames="room")
+def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
+    """The first rows of each."""
+    return tuple(part[:room] for part in parts)
+
+
 @cache
 def _noting() -> str:
     """The name by which XLA knows `_note`."""
@@ -368,7 +388,7 @@ def _note(frame):
     """`Changes.noted`; 0 for no error."""
     if not asked_to_run(frame):
         return 0
-    operands, results = words_at(words_at(frame)[9]), words_at(words_at(frame)[14])
+    operands, results = peek(frame, 9), peek(frame, 14)
     pairs_at, room, _ = buffer(results, 0)
     ends_at, _, _ = buffer(results, 1)
     count_at, _, _ = buffer(results, 2)
@@ -384,7 +404,7 @@ def _note(frame):
         carray(pointer(index_at), (8 * words, atoms), np.int32),
         carray(pointer(x_at), (3, atoms), np.float64),
         carray(pointer(v_at), (3, atoms), np.float64),
-        words_at(row_at)[0],
+        peek(row_at, 0),
         carray(pointer(pairs_at), (room, 4), np.int32),
         carray(pointer(ends_at), (room, 12), np.float64),
         carray(pointer(count_at), (3,), np.int64),

@@ -82,26 +82,55 @@ malloc = types.ExternalFunction("malloc", types.intp(types.intp))
 free = types.ExternalFunction("free", types.void(types.intp))
 
 
-@numba.njit(cache=True, nogil=True)
-def words_at(address):
-    """Memory as 64-bit words, as many as a frame has or fewer."""
-    return carray(pointer(address), (32,), np.int64)
+def _place(builder: Any, address: Any, k: Any) -> Any:
+    """Where the k-th of the 64-bit numbers at an address is."""
+    return builder.gep(builder.inttoptr(address, ir.IntType(64).as_pointer()), [k])
 
 
-@numba.njit(cache=True, nogil=True)
-def buffer(buffers, k):
-    """Where the data of a frame's k-th operand or result begin, and its first two dimensions."""
-    words = words_at(buffers[k])
-    size = words_at(words[5])
-    return words[3], size[0], size[1]
+# not arrays and functions of numba's, each of which takes a tenth of a second to compile
+@_intrinsic
+def peek(typingctx: Any, address: Any, k: Any) -> Any:
+    """The k-th of the 64-bit numbers at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load(_place(builder, *args))
+
+    return types.intp(types.intp, types.intp), generate
+
+
+@_intrinsic
+def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
+    """Make the k-th of the 64-bit numbers at an address a value."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store(args[2], _place(builder, *args[:2]))
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, types.intp), generate
+
+
+@_intrinsic
+def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
+    """Where the data of the k-th of a frame's operands or results begin, and its first two dimensions."""
+    made = types.UniTuple(types.intp, 3)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def read(address: Any, k: int) -> Any:
+            return builder.load(_place(builder, address, ir.Constant(ir.IntType(64), k)))
+
+        one = builder.load(_place(builder, *args))
+        shape = read(one, 5)
+        return context.make_tuple(builder, made, [read(one, 3), read(shape, 0), read(shape, 1)])
+
+    return made(types.intp, types.intp), generate
 
 
 @numba.njit(cache=True, nogil=True)
 def asked_to_run(frame):
     """Whether a call is more than a question or a preparation; a question is answered."""
-    words = words_at(frame)
-    if words[1] != 0 and words_at(words[1])[1] & 0xFFFFFFFF == 1:
+    asked = peek(frame, 1)
+    if asked != 0 and peek(asked, 1) & 0xFFFFFFFF == 1:
         # for which version of the interface was this written?
-        words_at(words_at(words[1])[3])[3] = VERSION[0] | (VERSION[1] << 32)
+        poke(peek(asked, 3), 3, VERSION[0] | (VERSION[1] << 32))
         return False
-    return words[4] & 0xFFFFFFFF == 3
+    return peek(frame, 4) & 0xFFFFFFFF == 3

@@ -38,9 +38,10 @@ from mdnum.md.foreign import (
     carray,
     free,
     malloc,
+    peek,
     pointer,
+    poke,
     registered,
-    words_at,
 )
 from mdnum.numerics.exact import bound, interpreted
 
@@ -465,12 +466,12 @@ def _interleaved(columns_at, columns, atoms, table_at, apart):
 
 
 @numba.njit(cache=True, nogil=True)
-def _least(values_at, n):
+def _least(values_at, n, out_at):
     values = carray(pointer(values_at), (n,), np.float64)
     least = np.inf
     for k in range(n):
         least = min(least, values[k])
-    return least
+    carray(pointer(out_at), (1,), np.float64)[0] = least
 
 
 # A call is a job: 64-bit words that outlive it, since a thread may look for work when none is left. How many
@@ -482,12 +483,11 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 @numba.njit(cache=True, nogil=True)
 def _work(job):
     """Take one block of a job after the other, until none is left."""
-    words = words_at(job)
-    block, blocks = added(job + 8 * _NEXT, 1), words[_BLOCKS]
+    block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return
-    frame = words_at(words[_FRAME])
-    operands, results = words_at(frame[9]), words_at(frame[14])
+    frame = peek(job, _FRAME)
+    operands, results = peek(frame, 9), peek(frame, 14)
     index, slots, atoms = buffer(operands, 0)
     own, columns, _ = buffer(operands, 1)
     told, flags, _ = buffer(operands, 2)
@@ -501,7 +501,7 @@ def _work(job):
     room = malloc(8 * (named + _BLOCK))
     rows = carray(pointer(room), (named,), np.int64)
     closest = room + 8 * named
-    rows[named - 2], rows[named - 1] = closest, words[_TABLE]
+    rows[named - 2], rows[named - 1] = closest, peek(job, _TABLE)
     while block < blocks:
         start = block * _BLOCK
         n = min(_BLOCK, atoms - start)
@@ -517,8 +517,8 @@ def _work(job):
             rows[named - 5] = bits + word * atoms + start
             rows[named - 4] = types_of + 8 * word * atoms + start
             rows[named - 3] = index + 4 * (8 * word * atoms + start)
-            call(words[_WORD], (n, constants, room, atoms))
-        _filled(job + 8 * (_NEAREST + block), 1, _least(closest, n))
+            call(peek(job, _WORD), (n, constants, room, atoms))
+        _least(closest, n, job + 8 * (_NEAREST + block))
         added(job + 8 * _DONE, 1)
         block = added(job + 8 * _NEXT, 1)
     free(room)
@@ -541,14 +541,18 @@ def _help(job):
 @numba.njit(cache=True, nogil=True)
 def _helped(job, frame, helpers, task):
     """Ask XLA's threads for help; without any the work is done all the same."""
-    words, api = words_at(job), words_at(frame[2])
-    schedule, ask, asked = api[17], api[18], job + 8 * _ASKED
-    words[_ASKED], words[_ASKED + 1], words[_ASKED + 2] = 32, 0, frame[3]
-    words[_ASKED + 3] = job + 8 * _THREADS
+    api, asked = peek(frame, 2), job + 8 * _ASKED
+    schedule, ask = peek(api, 17), peek(api, 18)
+    poke(asked, 0, 32)
+    poke(asked, 1, 0)
+    poke(asked, 2, peek(frame, 3))
+    poke(asked, 3, job + 8 * _THREADS)
     if call(ask, (asked,)) != 0:
         return
-    words[_ASKED], words[_ASKED + 3], words[_ASKED + 4] = 40, task, job
-    for _ in range(min(helpers, words[_THREADS] - 1)):
+    poke(asked, 0, 40)
+    poke(asked, 3, task)
+    poke(asked, 4, job)
+    for _ in range(min(helpers, peek(job, _THREADS) - 1)):
         added(job + 8 * _USERS, 1)
         if call(schedule, (asked,)) != 0:
             added(job + 8 * _USERS, -1)
@@ -563,24 +567,27 @@ def _over_blocks(frame, word, task):
     """
     if not asked_to_run(frame):
         return 0
-    words = words_at(frame)
-    own, columns, atoms = buffer(words_at(words[9]), 1)
-    nearest, _, _ = buffer(words_at(words[14]), 2)
+    own, columns, atoms = buffer(peek(frame, 9), 1)
+    nearest, _, _ = buffer(peek(frame, 14), 2)
     blocks = -(-atoms // _BLOCK)
     apart = 4 * -(-columns // 4)
     job = malloc(8 * (_NEAREST + blocks + (atoms + 1) * apart) + 64)
-    mine = words_at(job)
-    mine[_USERS], mine[_NEXT], mine[_DONE], mine[_BLOCKS] = 1, 0, 0, blocks
-    mine[_FRAME], mine[_WORD] = frame, word
     # whole lines of the cache
-    mine[_TABLE] = (job + 8 * (_NEAREST + blocks) + 63) // 64 * 64
-    _interleaved(own, columns, atoms, mine[_TABLE], apart)
+    table = (job + 8 * (_NEAREST + blocks) + 63) // 64 * 64
+    poke(job, _USERS, 1)
+    poke(job, _NEXT, 0)
+    poke(job, _DONE, 0)
+    poke(job, _BLOCKS, blocks)
+    poke(job, _FRAME, frame)
+    poke(job, _WORD, word)
+    poke(job, _TABLE, table)
+    _interleaved(own, columns, atoms, table, apart)
     if blocks > 1:
-        _helped(job, words, blocks - 1, task)
+        _helped(job, frame, blocks - 1, task)
     _work(job)
     while added(job + 8 * _DONE, 0) < blocks:
         pass
-    _filled(nearest, 1, _least(job + 8 * _NEAREST, blocks))
+    _least(job + 8 * _NEAREST, blocks, nearest)
     _leave(job)
     return 0
 

@@ -7,16 +7,18 @@ half the smallest perpendicular width.
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import llvmlite.binding as llvm
 import numba
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -32,7 +34,10 @@ _TOGETHER = 16
 
 # a pair at the edge of the list must not be lost to rounding: the skin criterion assumes that every
 # unlisted pair was at least r_list apart
-_SAFETY = 1.0 + 1e-12
+SAFETY = 1.0 + 1e-12
+
+# atoms of a thread's share, about: fewer are found sooner than a thread begins
+_SHARED = 2000
 
 # along an axis, before a dilute system gets fewer: a radius may be many orders smaller than the box
 _MOST_BINS = 1e9
@@ -286,78 +291,81 @@ def _compressed(mask, label, first, atoms, out, place):
 
 
 @numba.njit(cache=True, nogil=True)
-def _transposed(rows, table, first, atoms):
+def _transposed(rows, table, first, begin, end):
     """The slots of consecutive atoms, which share cache lines: written together."""
     room, n = table.shape
-    if atoms == _TOGETHER and room % _WIDE == 0:
+    if end - begin == _TOGETHER and room % _WIDE == 0:
         for k in range(0, room, _WIDE):
             for i in range(0, _TOGETHER, _WIDE):
                 _turned(rows, i * rows.shape[1] + k, rows.shape[1], table, k * n + first + i, n)
         return
     for k in range(room):
-        for i in range(atoms):
+        for i in range(begin, end):
             table[k, first + i] = rows[i, k]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
-    """Neighbors of every (bin-sorted) atom; returns the largest number found, which may exceed the room."""
+def _fill(x, layered, box, inverse, start, r2_list, table, columns):
+    """Neighbors of the (bin-sorted) atoms in some columns of bins.
+
+    Returns:
+        the largest number found, which may exceed the room.
+    """
+    bins, reach, periodic, matrix = box
     room, n = table.shape
-    most = 0
+    most, begun, done = 0, start[columns[0] * bins[2]], start[columns[1] * bins[2]]
     by_pair = False
     for k in range(3):
         by_pair = by_pair or (periodic[k] and reach[k] == 0)
-    layered, box = _layered(x, start, bins), (bins, reach, periodic, matrix)
     run, shift = np.empty((15, 3), np.int64), np.empty((15, 3))
     layers = bins[2] + 2 * reach[2]
     begin, home = np.empty(layers + 1, np.int64), np.empty(layers, np.int64)
     capacity = 0
     near, label, mask = np.empty((3, _WIDE)), np.empty(_WIDE, np.int32), np.empty(_WIDE, np.uint8)
     rows = np.empty((_TOGETHER, room + _TOGETHER), np.int32)
-    for b0 in range(bins[0]):
-        for b1 in range(bins[1]):
-            column = (b0 * bins[1] + b1) * bins[2]
-            if start[column] == start[column + bins[2]]:
-                continue
-            found = _runs(b0, b1, box, run, shift)
-            while not _gather(layered, b1, run, shift, found, box, near, label, begin, home):
-                capacity = 2 * capacity + 1024
-                near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
-                mask = np.empty(capacity + _WIDE, np.uint8)
-                # rows a cache line further than a power of two apart: those share their places in a cache
-                narrow, rows = rows, np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
-                for k in range(_TOGETHER):
-                    for i in range(room):
-                        rows[k, i] = narrow[k, i]
-            for b2 in range(bins[2]):
-                here = column + b2
-                low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
-                px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
-                mask[high - low : high - low + _WIDE] = 0
-                for i in range(start[here], start[here + 1]):
-                    if by_pair:
-                        _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)
-                    else:
-                        _within(px, py, pz, x[0, i], x[1, i], x[2, i], r2_list, mask)
-                    mask[home[b2 + reach[2]] - low + i - start[here]] = 0  # the atom itself
-                    row = i % _TOGETHER
-                    filled = _compressed(mask, label, low, high - low, rows, row * rows.shape[1])
-                    most = max(most, filled)
-                    rows[row, filled:room] = n
-                    first = i - row
-                    if i - first == _TOGETHER - 1 or i == n - 1:
-                        _transposed(rows, table, first, i - first + 1)
+    for column in range(columns[0] * bins[2], columns[1] * bins[2], bins[2]):
+        b0, b1 = column // bins[2] // bins[1], column // bins[2] % bins[1]
+        if start[column] == start[column + bins[2]]:
+            continue
+        found = _runs(b0, b1, box, run, shift)
+        while not _gather(layered, b1, run, shift, found, box, near, label, begin, home):
+            capacity = 2 * capacity + 1024
+            near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
+            mask = np.empty(capacity + _WIDE, np.uint8)
+            # rows a cache line further than a power of two apart: those share their places in a cache
+            narrow, rows = rows, np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
+            for k in range(_TOGETHER):
+                for i in range(room):
+                    rows[k, i] = narrow[k, i]
+        for b2 in range(bins[2]):
+            here = column + b2
+            low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
+            px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
+            mask[high - low : high - low + _WIDE] = 0
+            for i in range(start[here], start[here + 1]):
+                if by_pair:
+                    _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)
+                else:
+                    _within(px, py, pz, x[0, i], x[1, i], x[2, i], r2_list, mask)
+                mask[home[b2 + reach[2]] - low + i - start[here]] = 0  # the atom itself
+                row = i % _TOGETHER
+                filled = _compressed(mask, label, low, high - low, rows, row * rows.shape[1])
+                most = max(most, filled)
+                rows[row, filled:room] = n
+                first = i - row
+                if row == _TOGETHER - 1 or i == done - 1:
+                    _transposed(rows, table, first, max(begun - first, 0), row + 1)
     return most
 
 
-def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
+def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
     """Number of bins and reach of the search along each axis."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
         width = fractional_extent[k]
         # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
-        fine = int(min(2 * width / (r_list * _SAFETY), _MOST_BINS))
+        fine = int(min(2 * width / (r_list * SAFETY), _MOST_BINS))
         if fine >= 5:
             bins[k], reach[k] = fine, 2
         # fewer: one bin along this axis, every atom meets every atom once
@@ -395,26 +403,40 @@ def neighbor_table(
                 fractional[k] -= outside
                 components = components - np.outer(np.asarray(cell.matrix)[k], outside)
         else:
-            # along a free axis the bins span the atoms; the direction is that of the axis itself,
-            # orthogonal to the periodic ones where the lattice vectors are (else one bin)
-            extent[k], fractional[k] = _free_axis(cell, components, k)
-    bins, reach = _grid(cell, extent, r_list, atoms)
+            low, high = components[k].min(), components[k].max()
+            extent[k] = free_extent(cell, low, high)
+            fractional[k] = (components[k] - low) / (extent[k] or np.inf)
+    bins, reach = grid(cell, extent, r_list, atoms)
     start = np.zeros(int(np.prod(bins)) + 1, np.int64)
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
     table = _table(room, atoms)
-    most = _fill(
-        np.ascontiguousarray(components[:, order]),
-        np.asarray(cell.matrix, np.float64),
-        inverse,
-        np.array(cell.pbc),
-        bins,
-        reach,
-        start,
-        (r_list * _SAFETY) ** 2,
-        table,
-    )
-    return table, order, int(most)
+    x = np.ascontiguousarray(components[:, order])
+    matrix, periodic = np.asarray(cell.matrix, np.float64), np.array(cell.pbc)
+    layered = _layered(x, start, bins)
+    # shared among threads by atoms; columns of bins are whole
+    parts = max(1, min(_cores(), atoms // _SHARED))
+    ends = np.searchsorted(start[:: bins[2]], np.linspace(0, atoms, parts + 1)[1:-1])
+    edges = [0, *ends.tolist(), int(bins[0] * bins[1])]
+    most = [0] * parts
+
+    def fill(part: int) -> None:
+        columns = edges[part], edges[part + 1]
+        box, r2_list = (bins, reach, periodic, matrix), (r_list * SAFETY) ** 2
+        most[part] = _fill(x, layered, box, inverse, start, r2_list, table, columns)
+
+    helpers = [threading.Thread(target=fill, args=(part,)) for part in range(1, parts)]
+    for helper in helpers:
+        helper.start()
+    fill(0)
+    for helper in helpers:
+        helper.join()
+    return table, order, max(most)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _used: list[np.ndarray] = []
@@ -437,15 +459,12 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
         return memory[first : first + size - 64].view(np.int32).reshape(room, atoms)
 
 
-def _free_axis(cell: Cell, components, k: int):
-    """Extent along a free axis, and the atoms' place in it from 0 to 1."""
-    if not cell.orthorhombic and any(cell.pbc):
-        return 0.0, np.zeros(components.shape[1])
-    low, high = float(components[k].min()), float(components[k].max())
-    extent = high - low
-    if extent <= 0:
-        return 0.0, np.zeros(components.shape[1])
-    return extent, (components[k] - low) / extent
+def free_extent(cell: Cell, low: float, high: float) -> float:
+    """What the bins along a free axis span, from the first to the last of the atoms; 0 where one bin has all.
+
+    The direction is that of the axis itself, orthogonal to the periodic ones where the lattice vectors are.
+    """
+    return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0
 
 
 # --- verlet skin lists: when they are rebuilt, how they are built, and what they hold -----------------
@@ -487,29 +506,40 @@ class PairTable:
     """The pairs of one list, both directions, as the force loop reads them.
 
     Attributes:
-        index: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
-            shape (slots, atoms).
-        order: sorted atom k is atom order[k].
+        found: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
+            shape (slots, atoms); where the search left it, on the host or on a device.
+        sorting: sorted atom k is atom sorting[k]; where the search left it.
         r_list: list radius, length.
         occupancy: largest number of neighbors of an atom.
         build_seconds: time the search took.
     """
 
-    index: Int[np.ndarray, "slots atoms"]
-    order: Int[np.ndarray, "atoms"]
+    found: Int[np.ndarray | Array, "slots atoms"]
+    sorting: Int[np.ndarray | Array, "atoms"]
     r_list: float
     occupancy: int
     build_seconds: float
 
+    @cached_property
+    def index(self) -> Int[np.ndarray, "slots atoms"]:
+        """`found`, on the host."""
+        return np.asarray(self.found)
+
+    @cached_property
+    def order(self) -> Int[np.ndarray, "atoms"]:
+        """`sorting`, on the host."""
+        return np.asarray(self.sorting)
+
     @property
     def slots(self) -> int:
         """Room per atom."""
-        return self.index.shape[0]
+        return self.found.shape[0]
 
-    @property
+    @cached_property
     def pairs(self) -> int:
         """Number of listed pairs, each counted once."""
-        return int(np.count_nonzero(self.index < self.index.shape[1])) // 2
+        module = self.found.__array_namespace__()
+        return int(module.count_nonzero(self.found < self.found.shape[1])) // 2
 
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
@@ -539,8 +569,8 @@ class ListBuilder(Protocol):
         ...
 
     def build(
-        self, positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
-    ) -> tuple[Int[np.ndarray, "slots atoms"], Int[np.ndarray, "atoms"], int]:
+        self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
+    ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
         """Index table in sorted labels, order, and the largest neighbor count (above slots: incomplete)."""
         ...
 
@@ -552,7 +582,7 @@ class HostBuilder:
     name: str = "host"
 
     def build(self, positions, cell, r_list, slots):
-        return neighbor_table(positions, cell, r_list, slots)
+        return neighbor_table(np.asarray(positions), cell, r_list, slots)
 
 
 @dataclass(frozen=True)
@@ -564,7 +594,7 @@ class JaxMdBuilder:
     def build(self, positions, cell, r_list, slots):
         from mdnum.md import jaxmd
 
-        rows = np.asarray(jaxmd.dense_pairs(positions, cell.matrix, cell.pbc, r_list))
+        rows = np.asarray(jaxmd.dense_pairs(np.asarray(positions), cell.matrix, cell.pbc, r_list))
         atoms = len(positions)
         occupancy = int((rows < atoms).sum(1).max(initial=0))
         table = np.full((slots, atoms), atoms, np.int32)
@@ -579,6 +609,7 @@ class JaxMdBuilder:
 BUILDERS: Registry[ListBuilder] = Registry("list builder", "mdnum.builders")
 BUILDERS.add("host", HostBuilder())
 BUILDERS.add("jax-md", JaxMdBuilder())
+BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
@@ -617,7 +648,7 @@ class VerletList:
     guard: float = 0.0
     slots: int = field(default=0)
 
-    def build(self, positions: Float[np.ndarray, "atoms 3"], cell: Cell) -> PairTable:
+    def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
         """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.
 
         Raises:
@@ -634,11 +665,10 @@ class VerletList:
             if most <= self.slots and first:
                 # every size of table is compiled for: settle on one with room before the first use
                 first, wanted = False, self._rounded(most * self.slack)
-                if wanted < self.slots:
-                    index = index[:wanted]
-                elif wanted > self.slots:
-                    index = np.concatenate([index, np.full((wanted - self.slots, atoms), atoms, np.int32)])
-                self.slots = wanted
+                if wanted > self.slots:
+                    self.slots = wanted
+                    continue
+                index, self.slots = index[:wanted], wanted
             if most <= self.slots:
                 return PairTable(index, order, r_list, most, time.perf_counter() - begin)
             if most >= atoms and atoms > 1:

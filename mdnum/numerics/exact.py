@@ -29,7 +29,7 @@ def integer_of(dtype):
 
 def zero_bits(dtype) -> jax.Array:
     """An integer zero of the width of dtype; pass it into jit as an argument, so that XLA cannot fold it."""
-    return jnp.zeros((), integer_of(dtype))
+    return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
 def _through_integers(x, zero):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.decide import Tables
+from mdnum.md.decide import Tables, zeros
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -51,7 +51,7 @@ class Segment:
     Attributes:
         first: step of the first row.
         rows: number of rows.
-        record: one row per step (host arrays; valid until the next segment but one is asked for).
+        record: one row per step (on the device; valid until the next segment but one is asked for).
         before: decisions of this list at the step before `first`, shape (words, atoms).
         table: the list.
         epoch: number of the list's life.
@@ -62,8 +62,10 @@ class Segment:
         due: the list must not be used for the step after the last row.
         moved: largest displacement since the list was built, at that step, length.
         state: where the rollout goes on.
-        reference: wrapped positions at which the list was built, shape (atoms, 3).
+        home: wrapped positions at which the list was built, shape (3, atoms).
         start: where the rollout stood before.
+        inside, leap: of `EpochOutcome`: decisions of `before` that are yes, and the longest way of an atom
+            from there to the first row, length.
         held: decisions at the last row that was made, shape (words, atoms); None with rows.
         again: the record with rows, made anew where it was made without.
     """
@@ -71,7 +73,7 @@ class Segment:
     first: int
     rows: int
     record: EpochRecord
-    before: UInt8[np.ndarray, "words atoms"] | None
+    before: UInt8[Array | np.ndarray, "words atoms"] | None
     table: PairTable
     epoch: int
     built: int
@@ -80,9 +82,11 @@ class Segment:
     due: bool
     moved: float
     state: EpochState
-    reference: Float[np.ndarray, "atoms 3"]
+    home: Float[Array, "3 atoms"]
     start: EpochState
-    held: UInt8[np.ndarray, "words atoms"] | None
+    inside: Int[Array, ""]
+    leap: Float[Array, ""]
+    held: UInt8[Array, "words atoms"] | None
     again: Callable[[], EpochRecord]
 
     @property
@@ -95,11 +99,16 @@ class Segment:
         lacks = self.record.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
+    @property
+    def last_positions(self) -> Float[Array | np.ndarray, "3 atoms"]:
+        """Wrapped positions at the last row, in the user's order of atoms."""
+        return self.unsorted("x", self.rows - 1).T if self.closes == "blow-up" else self.state.x_before
+
     def unsorted(self, name: str, row: int) -> np.ndarray:
         """A row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
         if name == "x" and row == 0:
             return np.asarray(self.start.x).T
-        if name == "x" and self.first + row + 1 == int(self.state.step):
+        if name == "x" and row == self.rows - 1 and self.closes != "blow-up":
             return np.asarray(self.state.x_before).T
         sorted_row = self.rows_of(name)[row]
         out = np.empty((sorted_row.shape[1], 3), sorted_row.dtype)
@@ -113,17 +122,22 @@ class Start:
 
     Attributes:
         state: the state to go on from.
-        reference: wrapped positions at which the list in use was built, shape (atoms, 3).
+        home: wrapped positions at which the list in use was built, shape (3, atoms).
         built: step at which it was built.
         epoch: number of its life.
         slots: its capacity; 0 lets the density decide.
     """
 
     state: EpochState
-    reference: Float[np.ndarray, "atoms 3"]
+    home: Float[Array, "3 atoms"]
     built: int = 0
     epoch: int = 0
     slots: int = 0
+
+    @property
+    def reference(self) -> Float[np.ndarray, "atoms 3"]:
+        """`home` on the host, an atom a row, in float64."""
+        return np.asarray(self.home, np.float64).T
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays for a checkpoint."""
@@ -139,7 +153,7 @@ class Start:
         state = EpochState(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
         return cls(
             state,
-            np.asarray(arrays["reference"]),
+            jnp.asarray(arrays["reference"].T, state.x.dtype),
             int(arrays["built"]),
             int(arrays["epoch"]),
             int(arrays["slots"]),
@@ -152,18 +166,12 @@ def first_state(simulation: Simulation) -> Start:
     positions, velocities = simulation.first_frame()
     wrapped, images = wrap_positions(simulation.cell, positions)
     wrapped = wrapped.astype(dtype)
-    x = jnp.asarray(wrapped.T)
-    bath = jnp.zeros((3, simulation.atoms), jnp.int64) if simulation.has_bath else None
-    state = EpochState(
-        jnp.zeros((), jnp.int64),
-        x,
-        jnp.asarray(velocities.T, dtype),
-        jnp.asarray(images.T, jnp.int32),
-        x,
-        jnp.zeros((), jnp.float64),
-        bath,
-    )
-    return Start(state, np.asarray(wrapped, np.float64))
+    x = np.ascontiguousarray(wrapped.T)
+    bath = np.zeros((3, simulation.atoms), np.int64) if simulation.has_bath else None
+    v, taken_off = velocities.T.astype(dtype), images.T.astype(np.int32)
+    # numpy's arrays: jnp would compile a program for each
+    state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0), bath)))
+    return Start(state, state.x)
 
 
 def room_for(rows: int, per_row: int) -> int:
@@ -174,14 +182,6 @@ def room_for(rows: int, per_row: int) -> int:
     """
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
-
-
-class _Listed(NamedTuple):
-    """A list on the host and on the device, and the positions it was built at, shape (3, atoms)."""
-
-    table: PairTable
-    tables: Tables
-    home: Float[Array, "3 atoms"]
 
 
 class Engine:
@@ -222,8 +222,8 @@ class Engine:
             simulation.force,
             simulation.propagator,
             simulation.cell.astype(np.float64),
-            jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2, jnp.float64),
+            jax.device_put(simulation.masses),
+            jax.device_put(np.float64(rule.skin / 2)),
             rule.every,
             rule.delay,
             rule.check,
@@ -233,6 +233,7 @@ class Engine:
         # a liquid has one change for ten atoms a step; where there are more, room is doubled
         self._room_for_changes(0 if self.rows else max(64, simulation.atoms // 4))
         self._records: list[EpochRecord | None] = [None, None]
+        self._unread: Array | None = None
 
     def _room_for_changes(self, most: int) -> None:
         self.program = replace(self.program, most=most)
@@ -280,9 +281,7 @@ class Engine:
                 return
             here = replace(here, state=waiting.state)
             if waiting.closes:
-                state = waiting.state
-                reference = np.asarray(state.x, np.float64).T.copy()
-                here, held = Start(state, reference, waiting.last + 1, here.epoch + 1), None
+                here, held = Start(waiting.state, waiting.state.x, waiting.last + 1, here.epoch + 1), None
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
@@ -297,51 +296,52 @@ class Engine:
         self._records[0] = made.record
         return made
 
-    def _listed(self, start: Start) -> _Listed:
-        """The list of a start, searched for."""
-        table = self.verlet.build(start.reference, self.simulation.cell)
-        home = jnp.asarray(start.reference.T, self.simulation.policy.dtype("state"))
-        return _Listed(table, self.simulation.tables(table), home)
+    def _listed(self, start: Start) -> tuple[PairTable, Tables]:
+        """The list of a start, searched for, and as the loop reads it."""
+        table = self.verlet.build(start.home.T, self.simulation.cell)
+        return table, self.simulation.tables(table)
 
-    def _advance(self, listed: _Listed, start: Start, held, turn: int):
+    def _advance(self, listed: tuple[PairTable, Tables], start: Start, held, turn: int):
         """Start the compiled loop on the device.
 
         Args:
             held: decisions of the list at the step before; None where it has to look back.
         """
-        words = listed.table.slots // 8
-        told = self._pinned(listed.table, int(start.state.step), words) or (None, None)
-        look_back, earlier = held is None, None
-        if not self.rows:
-            earlier = jnp.zeros((words, self.simulation.atoms), jnp.uint8) if look_back else jnp.asarray(held)
+        table, tables = listed
+        words = table.slots // 8
+        told = self._pinned(table, int(start.state.step), words) or (None, None)
+        look_back, earlier = held is None, held
+        if look_back and not self.rows:
+            # the same program as without a look back, so decisions that it does not read
+            if self._unread is None or len(self._unread) != words:
+                self._unread = zeros((words, self.simulation.atoms), np.uint8)
+            earlier = self._unread
         return run_epoch(
             self.leaves,
             self.structure,
-            listed.tables,
+            tables,
             start.state,
-            listed.home,
-            jnp.asarray(start.built, jnp.int64),
-            jnp.asarray(self.last, jnp.int64),
-            jnp.asarray(look_back),
+            start.home,
+            *jax.device_put((np.int64(start.built), np.int64(self.last), np.bool_(look_back))),
             self.take(turn, words),
             *told,
-            earlier,
+            None if self.rows else earlier,
         )
 
     def _segment(
-        self, listed: _Listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
+        self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
         """What the loop left behind, and the decisions at its last row; waits for it."""
         outcome, record = begun
         rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         changes = record.changes
-        while changes is not None and finite and int(changes.count[0]) > len(changes.pairs):
+        while changes is not None and finite and np.asarray(changes.count)[0] > len(changes.pairs):
             # a step had more changes than there was room for
             self._room_for_changes(4 * self.program.most)
             outcome, record = self._advance(listed, start, held, turn)
             rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
             changes = record.changes
-        first, table = int(start.state.step), listed.table
+        first, table = int(start.state.step), listed[0]
         before = held if outcome.before is None or held is not None else outcome.before
         if self.rows:
             last = np.array(np.asarray(record.bits)[rows - 1]) if self.record and rows else None
@@ -352,7 +352,7 @@ class Engine:
             first,
             rows,
             record,
-            None if before is None else np.asarray(before),
+            before,
             table,
             start.epoch,
             start.built,
@@ -361,9 +361,11 @@ class Engine:
             bool(rebuild),
             float(outcome.moved),
             outcome.state,
-            start.reference,
+            start.home,
             start.state,
-            None if self.rows or last is None else np.asarray(last),
+            outcome.inside,
+            outcome.leap,
+            outcome.held,
             cache(partial(self._with_rows, replace(start, slots=table.slots), first + rows - 1)),
         )
         return segment, last
@@ -398,11 +400,10 @@ class Engine:
 
 def resume_point(segment: Segment) -> Start:
     """Where a rollout goes on after a segment: with its list, or with a new one where its list is used up."""
-    state = segment.state
+    state, slots = segment.state, segment.table.slots
     if segment.due:
-        reference = np.asarray(state.x, np.float64).T.copy()
-        return Start(state, reference, segment.last + 1, segment.epoch + 1, segment.table.slots)
-    return Start(state, segment.reference, segment.built, segment.epoch, segment.table.slots)
+        return Start(state, state.x, segment.last + 1, segment.epoch + 1, slots)
+    return Start(state, segment.home, segment.built, segment.epoch, slots)
 
 
 def unwrapped(

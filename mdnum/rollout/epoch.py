@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
-from mdnum.md.decide import Changes, Tables
+from mdnum.md.decide import Changes, Tables, zeros
 from mdnum.md.integrators import Integrator
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
@@ -179,6 +179,8 @@ class EpochOutcome(NamedTuple):
         moved: largest displacement since the list was built, at the step that comes next, length.
         before: decisions of the list at the step before, for the count check and the first flips of a new
             list; where they were not asked for, those that were held. None without recording.
+        inside: how many of those are yes.
+        leap: how far an atom came at most from the step before to the first row, length.
         held: decisions at the last row, None with rows.
     """
 
@@ -186,6 +188,8 @@ class EpochOutcome(NamedTuple):
     flags: Int[Array, "4"]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
+    inside: Int[Array, ""]
+    leap: Float[Array, ""]
     held: UInt8[Array, "words atoms"] | None = None
 
 
@@ -200,13 +204,18 @@ def empty_record(
     record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
     return EpochRecord(
-        x=jnp.zeros(shape, dtype),
-        v=jnp.zeros(shape, dtype),
-        images=jnp.zeros(shape, jnp.int32),
-        bits=jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
-        **{name: jnp.zeros(rows, jnp.float64) for name in _NUMBERS},
+        x=zeros(shape, dtype),
+        v=zeros(shape, dtype),
+        images=zeros(shape, np.int32),
+        bits=zeros((rows, words, atoms if record else 0), np.uint8),
+        **{name: zeros(rows, np.float64) for name in _NUMBERS},
         changes=None if changes is None else Changes.empty(changes, dtype),
     )
+
+
+def inside_of(bits: UInt8[Array, "words atoms"]) -> Int[Array, ""]:
+    """How many decisions are yes; a pair has two."""
+    return jnp.sum(jnp.bitwise_count(bits), dtype=jnp.int64)
 
 
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
@@ -264,7 +273,7 @@ def run_epoch(
     half_step = (0.5 * program.integrator.timestep).astype(dtype)
     mass_row = masses.astype(dtype)
 
-    before = None
+    before, inside = None, jnp.zeros((), jnp.int64)
     if program.record:
         words = tables.index.shape[0]
         before = lax.cond(
@@ -273,9 +282,10 @@ def run_epoch(
             lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8) if held is None else held,
             state.x_before[:, order],
         )
+        inside = inside_of(before)
 
-    def moved(x):
-        d = cell.minimum_image(*(x - home))
+    def longest(start, end):
+        d = cell.minimum_image(*(end - start))
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def body(carry):
@@ -320,7 +330,7 @@ def run_epoch(
         runaway = jnp.max(jnp.abs(jnp.stack(n))) > 1
         after, images = jnp.stack(wrapped), images + jnp.stack(n).astype(jnp.int32)
         step = step + 1
-        largest = moved(after)
+        largest = longest(home, after)
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
@@ -349,7 +359,7 @@ def run_epoch(
         jnp.zeros((), bool),
         jnp.ones((), bool),
         jnp.zeros((), bool),
-        moved(x),
+        longest(home, x),
         record if record.changes is None else record._replace(changes=record.changes.emptied()),
         None if program.rows else before,
     )
@@ -363,4 +373,5 @@ def run_epoch(
     if bath is not None:
         end = end._replace(bath=unsorted(bath))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    return EpochOutcome(end, flags, largest, before, earlier), record
+    leap = longest(state.x_before, state.x)
+    return EpochOutcome(end, flags, largest, before, inside, leap, earlier), record

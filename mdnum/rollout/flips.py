@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
@@ -142,17 +142,6 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     return step, subject, entered, out, contradicted
 
 
-@numba.njit(cache=True, nogil=True)
-def _longest(start, end, lattice):
-    """The longest way of an atom between two configurations, each of shape (3, atoms)."""
-    longest = 0.0
-    for i in range(start.shape[1]):
-        x, y, z = end[0, i] - start[0, i], end[1, i] - start[1, i], end[2, i] - start[2, i]
-        x, y, z = nearest_image(lattice, np.float64(x), np.float64(y), np.float64(z))
-        longest = max(longest, x * x + y * y + z * z)
-    return np.sqrt(longest)
-
-
 def _noted(before, bits, index, x, v) -> Changes:
     """The changes in consecutive rows of one list, as the loop notes them."""
     room = len(bits) * max(64, bits.shape[2] // 4)
@@ -208,8 +197,8 @@ class PairRecorder:
     def __init__(self, simulation: Simulation, held: Int[np.ndarray, "pairs"] | None = None):
         self.simulation = simulation
         self._held_keys = held
-        self._held_segment: tuple[PairTable, UInt8[np.ndarray, "words atoms"]] | None = None
-        self._held_positions: np.ndarray | None = None
+        # the list that has ended, its last decisions and how many are yes
+        self._held_segment: tuple[PairTable, UInt8[Array | np.ndarray, "words atoms"], int] | None = None
         self.missed = 0
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
@@ -286,17 +275,17 @@ class PairRecorder:
             MdnumError: a flip was recorded from one end only, or a margin contradicts its decision: the
                 compiled program and the host would disagree about arithmetic.
         """
-        before, table, changes = segment.before, segment.table, segment.record.changes
-        assert before is not None
-        replaced = self._replace(segment, before)
+        table, changes = segment.table, segment.record.changes
+        replaced = self._replace(segment)
         if changes is None or replaced is not None:
             bits, x, v = (segment.rows_of(name) for name in ("bits", "x", "v"))
-            changes = _noted(before if replaced is None else bits[0], bits, table.index, x, v)
+            before = np.asarray(segment.before) if replaced is None else bits[0]
+            changes = _noted(before, bits, table.index, x, v)
         found, both, _ = np.asarray(changes.count).tolist()
         if 2 * found != both:
             raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
-        pairs, ends = np.asarray(changes.pairs), np.asarray(changes.ends)
-        kept = np.searchsorted(pairs[:found, 0], segment.rows)
+        pairs, ends = changes.first(min(found, len(changes.pairs)))
+        kept = np.searchsorted(pairs[:, 0], segment.rows)
         pairs, ends = pairs[:kept], ends[:kept]
         if replaced is not None:
             keys, now = replaced
@@ -305,9 +294,12 @@ class PairRecorder:
             pairs = np.concatenate([added, pairs])
             ends = np.concatenate([np.concatenate([x[0][:, a], x[0][:, b], v[0][:, a], v[0][:, b]]).T, ends])
         if segment.closes:
-            last = segment.rows_of("bits")[-1] if segment.held is None else segment.held
-            self._held_segment, self._held_keys = (table, np.array(last)), None
-            self._held_positions = segment.unsorted("x", segment.rows - 1)
+            if segment.held is None:
+                bits = np.array(segment.rows_of("bits")[-1])
+                self._held_segment = table, bits, count_set(bits)
+            else:
+                self._held_segment = table, segment.held, int(segment.rows_of("inside")[-1])
+            self._held_keys = None
         step, labels, entered, numbers, contradicted = _columns(
             pairs, ends, table.order, self._species, self._kinds, self._by_type, self.bounds(segment),
             self._rule, self._cell.numbers, self._narrow, segment.first,
@@ -326,27 +318,28 @@ class PairRecorder:
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""
         if self._held_segment is not None:
-            self._held_keys = _keys(self.simulation, *self._held_segment)
+            table, bits, _ = self._held_segment
+            self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
-    def _cannot_differ(self, segment: Segment, before) -> bool:
+    def _cannot_differ(self, segment: Segment) -> bool:
         """Whether the two lists hold the same pairs inside for certain."""
         rule = self.simulation.rule
-        if self._held_segment is None or self._held_positions is None or not rule.safe:
+        if self._held_segment is None or not rule.safe:
             return False
-        longest = _longest(self._held_positions.T, segment.unsorted("x", 0).T, self._cell.numbers)
-        return bool(2 * longest < rule.skin) and self.inside(self._held_segment[1]) == self.inside(before)
+        return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
-    def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
+    def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
         """Where a new list and the one before it disagree on the step before: the flips between the two."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
-        if self._cannot_differ(segment, before):
+        if self._cannot_differ(segment):
             return None
+        before = np.asarray(segment.before)
         if self._held_segment is not None:
-            table, bits = self._held_segment
-            old = fingerprint_of_bits(bits, table.index, table.order)
+            table, bits, _ = self._held_segment
+            old = fingerprint_of_bits(np.asarray(bits), table.index, table.order)
         else:
             old = _fingerprint_of_keys(self._held_keys)
         if old == fingerprint_of_bits(before, segment.table.index, segment.table.order):

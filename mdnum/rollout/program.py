@@ -151,8 +151,8 @@ class MdProgram:
             noise = rng.standard_normal(x.shape)
             noise *= max(size, ulp) / np.sqrt((noise**2).sum(axis=0)).max()
             moved = (x.astype(np.float64) + noise).astype(x.dtype)
-            state = self.start.state._replace(x=jnp.asarray(moved), x_before=jnp.asarray(moved))
-            start = replace(self.start, state=state, reference=moved.T.astype(np.float64))
+            here = jnp.asarray(moved)
+            start = replace(self.start, state=self.start.state._replace(x=here, x_before=here), home=here)
             programs.append(replace(self, begin=start))
         return programs
 

@@ -67,7 +67,7 @@ class _Progress:
     health: ListHealth
     budget: EnergyBudget
     first: np.ndarray | None = None
-    last: np.ndarray | None = None
+    last: Any = None  # shape (3, atoms), on the device until somebody asks
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -112,7 +112,7 @@ class Rollout:
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
             saved.get("first"),
-            saved.get("last"),
+            saved["last"].T if "last" in saved else None,
         )
         self._earlier_seconds = self.done.tally.seconds
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
@@ -189,7 +189,7 @@ class Rollout:
         done.tally.take(segment, rows, ledger, self.recorder.bounds(segment))
         if done.first is None:
             done.first = segment.unsorted("x", 0)
-        done.last = segment.unsorted("x", segment.rows - 1)
+        done.last = segment.last_positions
         self._save_frames(segment)
         self._close_budget(segment, ledger, interval)
         self._log(segment, pairs, ledger)
@@ -229,7 +229,8 @@ class Rollout:
     def _to_dict(self, point: Start, new_list: bool = False) -> dict[str, Any]:
         """Everything that a resumed run needs to go on from a point as if nothing had happened."""
         held = self.recorder.held() if new_list else None
-        frames = {"first": self.done.first, "last": self.done.last, "held": held}
+        last = None if self.done.last is None else np.asarray(self.done.last).T
+        frames = {"first": self.done.first, "last": last, "held": held}
         return {
             **point.to_arrays(),
             **{name: values for name, values in frames.items() if values is not None},
@@ -267,7 +268,7 @@ class Rollout:
         self.progress(step, self.steps, info)
 
     def _fail(self, blown: Segment, summary: dict[str, Any]) -> dict[str, Any]:
-        step, positions = blown.last, np.asarray(self.done.last, np.float64)
+        step, positions = blown.last, np.asarray(self.done.last, np.float64).T
         if blown.closes == "runaway":
             kept, what = step, f"an atom moved by more than the box in the step after {step}"
         else:
@@ -343,7 +344,7 @@ def run(
         raise
     done = rollout.done
     assert done.first is not None and done.last is not None
-    frames = (np.asarray(done.first, np.float64), np.asarray(done.last, np.float64))
+    frames = (np.asarray(done.first, np.float64), np.asarray(done.last, np.float64).T)
     return RunResult(rollout.folder.path, summary, rollout.simulation, frames)
 
 

@@ -250,12 +250,12 @@ class Handed:
             # of the same shape, so that nothing is compiled anew; what comes around is never reached
             told = jnp.roll(told, -row, axis=0)
         if self._shares:
-            table, reference, built = segment.table, segment.reference, segment.built
+            table, home, built = segment.table, segment.home, segment.built
             if self._led is not table:
                 self._led, self._tables = table, simulation.tables(table)
             tables = self._tables
         else:
-            table, reference, built, tables, place = self._list(segment)
+            table, home, built, tables, place = self._list(segment)
             told = _mapped(told, place)
         held, self._record = self._record, None
         if held is None or held.bits.shape != told.shape:
@@ -266,7 +266,7 @@ class Handed:
             structure,
             tables,
             self.state,
-            jnp.asarray(reference.T, dtype),
+            jnp.asarray(home, dtype),
             jnp.asarray(built, jnp.int64),
             jnp.asarray(segment.last, jnp.int64),
             jnp.asarray(False),
@@ -308,16 +308,15 @@ class Handed:
         """This run's own list, and where the leader's decision of each of its slots stands."""
         simulation = self.simulation
         if self._own is None:
-            reference = np.asarray(self.state.x, np.float64).T.copy()
-            table = simulation.verlet_list().build(reference, simulation.cell)
-            self._own = table, reference, int(self.state.step)
+            home = self.state.x
+            self._own = simulation.verlet_list().build(home.T, simulation.cell), home, int(self.state.step)
             self._led = None
-        table, reference, built = self._own
+        table, home, built = self._own
         if self._led is not segment.table:
             self._led = segment.table
             self._place = jnp.asarray(_places(table, segment.table, self.frame.labels))
             self._tables = simulation.tables(table)
-        return table, reference, built, self._tables, self._place
+        return table, home, built, self._tables, self._place
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "species species"]:

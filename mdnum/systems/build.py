@@ -182,16 +182,18 @@ class Simulation:
 
     def tables(self, table: PairTable) -> Tables:
         """A pair table on the device, with pair types."""
-        atoms = table.index.shape[1]
+        index, order = table.found, table.sorting
+        atoms = index.shape[1]
         shape = (-1, SLOTS, atoms)
         types = None
         if self.pair_types > 1:
+            own = self.species if isinstance(index, np.ndarray) else jax.device_put(self.species)
             # padding borrows the last atom's species; its decision is no whatever its type
-            species = self.species[np.append(table.order, table.order[-1])]
-            kinds = pair_type(species[table.index], species[:atoms], len(self.system.species))
+            species = own[index.__array_namespace__().append(order, order[-1:])]
+            kinds = pair_type(species[index], species[:atoms], len(self.system.species))
             types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
         # not jnp.asarray, which compiles a program for every shape
-        return Tables(jax.device_put(table.index.reshape(shape)), types, jax.device_put(table.order))
+        return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
@@ -246,14 +248,15 @@ def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, 
 def _pair_model(system: System) -> CutPotential:
     spec, species = system.spec, system.species
     assert spec.cutoff is not None
-    constants = {name: jnp.asarray(_per_type(t)) for name, t in pairs.pair_constants(spec, species).items()}
+    tables = pairs.pair_constants(spec, species)
+    constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
     radius, onset = pairs.cutoff_radii(spec, species)
-    r_cut = jnp.asarray(_per_type(radius))
+    r_cut = jax.device_put(_per_type(radius))
     return CutPotential(
         POTENTIALS[spec.potential.kind](**constants),
         CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
-        r_cut if onset is None else jnp.asarray(_per_type(onset)),
+        r_cut if onset is None else jax.device_put(_per_type(onset)),
     )
 
 
@@ -319,11 +322,11 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     check_radius(cell, max(decider.r_cut), spec.skin)
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
-    timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
+    timestep = jax.device_put(np.float64(spec.dynamics.timestep * units.time_factor))
     integrator: Integrator = VelocityVerlet(timestep)
     if isinstance(spec.dynamics, schema.LangevinTable):
-        friction = jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64)
-        kT = jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64)
+        friction = jax.device_put(np.float64(spec.dynamics.friction / units.time_factor))
+        kT = jax.device_put(np.float64(units.k_B * spec.dynamics.temperature))
         integrator = Langevin(timestep, friction, kT, jax.random.key(spec.dynamics.seed))
     simulation = Simulation(
         system,
@@ -336,7 +339,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         decider,
         RebuildRule(spec.skin, rebuild.every, rebuild.delay, rebuild.check),
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
-        ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
+        ("host" if jax.default_backend() == "cpu" else "device") if builder == "auto" else builder,
         policy,
         REDUCTIONS.parse(precision.reduction),
         integrator,
@@ -496,7 +499,8 @@ class Evaluator:
         at = np.asarray(own.positions if positions is None else positions, np.float64)
         wrapped, _ = wrap_positions(here.cell, at)
         table, tables = self._list(here, wrapped)
-        return here, wrapped, table, tables, jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
+        x = wrapped[table.order].T.astype(here.policy.dtype("state"), order="C")
+        return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
         """The list in use, rebuilt where it no longer holds every pair inside."""

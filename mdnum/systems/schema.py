@@ -344,7 +344,8 @@ class NeighborsTable(TomlTable):
         default=None, description="extra radius of the list (Å or σ); default 1.0 Å for metal, 0.3 σ for lj"
     )
     builder: Annotated[str, Named("mdnum.md.neighbors:BUILDERS", "auto")] = Field(
-        default="auto", description="who searches for neighbors"
+        default="auto",
+        description="who searches for neighbors; auto: host on a CPU, device on an accelerator",
     )
     rebuild: RebuildTable = Field(default_factory=lambda: RebuildTable())
 

@@ -10,6 +10,7 @@ import oracles
 import pytest
 
 from mdnum.errors import CapacityError, InputError
+from mdnum.md import device_search, neighbors
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
 from mdnum.references.conformance import ListLimits, NeighborListConformance
@@ -62,6 +63,56 @@ def test_the_search_of_jax_md_finds_the_same(atoms):
         positions[-1] = positions[0]
         here, there = (listed(name, positions, matrix, pbc, 3.4) for name in ("host", "jax-md"))
         assert set(map(tuple, here)) == set(map(tuple, there)) and (len(here) or atoms == 1)
+
+
+BOXES = {
+    "box": (np.diag([12.0, 13.0, 14.0]), (True, True, True), 3.0, 600),
+    "tilted": (np.array([[12.0, 0, 0], [3.0, 12.0, 0], [-2.0, 4.0, 15.0]]), (True, True, True), 3.0, 600),
+    "slab": (np.diag([14.0, 13.0, 9.0]), (True, True, False), 3.1, 400),
+    "tilted slab": (np.array([[12.0, 0, 0], [3.0, 12.0, 0], [-2.0, 4, 15]]), (True, True, False), 3.0, 300),
+    "cluster": (np.diag([9.0, 8.0, 9.0]), (False, False, False), 2.0, 300),
+    "one bin along an axis": (np.diag([7.0, 18.0, 18.0]), (True, True, True), 3.4, 300),
+    "one bin": (np.diag([7.0, 7.0, 7.0]), (True, True, True), 3.4, 150),
+    "dilute": (np.diag([100.0, 100.0, 100.0]), (True, True, True), 3.4, 50),
+}
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_a_search_on_a_device_makes_the_same_table(name, monkeypatch):
+    matrix, pbc, r_list, atoms = BOXES[name]
+    rng, cell = np.random.default_rng(atoms), Cell.create(matrix, pbc)
+    positions = rng.uniform(-0.5, 1.5, (atoms, 3)) @ matrix
+    # two in one place, and one that wrapping puts at the far face
+    positions[-1], positions[5] = positions[0], -1e-17
+    wrapped, _ = wrap_positions(cell, positions)
+    # in several blocks, the last of which is not full
+    monkeypatch.setattr(device_search, "_AT_A_TIME", 200_000)
+    for slots in (112, 8):
+        here, there = (BUILDERS[one].build(wrapped, cell, r_list, slots) for one in ("host", "device"))
+        assert isinstance(there[0], jax.Array) and np.array_equal(here[1], there[1]) and here[2] == there[2]
+        # what does not fit is left out in its own way
+        assert here[2] > slots or np.array_equal(here[0], there[0])
+    right = oracles.minimum_image_pairs(wrapped, matrix, cell.pbc, r_list)
+    index, order = (np.asarray(part) for part in BUILDERS["device"].build(wrapped, cell, r_list, 112)[:2])
+    assert {(i, j) for i, j in pairs_of(index, order, atoms) if i < j} == right
+
+
+@pytest.mark.parametrize("pbc", [(True, True, True), (False, True, False)])
+def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
+    rng, cell = np.random.default_rng(3), Cell.create([20.0, 18.0, 22.0], pbc)
+    positions = rng.uniform(0, 1, (900, 3)) * [20.0, 18.0, 22.0]
+    monkeypatch.setattr(neighbors, "_SHARED", 100)
+    made = []
+    for cores in (1, 2, 3, 7):
+        monkeypatch.setattr(neighbors, "_cores", lambda cores=cores: cores)
+        index, order, most = neighbor_table(positions, cell, 4.0, 64)
+        # not the memory that the next search is given
+        made.append((index.copy(), order, most))
+    for index, order, most in made[1:]:
+        assert np.array_equal(index, made[0][0]) and np.array_equal(order, made[0][1]) and most == made[0][2]
+    assert {pair for pair in pairs_of(*made[0][:2], 900) if pair[0] < pair[1]} == oracles.minimum_image_pairs(
+        positions, np.diag([20.0, 18.0, 22.0]), cell.pbc, 4.0
+    )
 
 
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])

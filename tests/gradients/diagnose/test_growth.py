@@ -49,7 +49,7 @@ def test_each_row_is_the_gradient_of_a_run_that_starts_there(problem, grown):
     *_, segment = Engine(simulation, step - 1).segments()
     state = segment.state
     assert int(state.step) == step
-    start = Start(state, np.asarray(state.x, np.float64).T.copy(), built=step)
+    start = Start(state, state.x, built=step)
 
     def loss(sigma: float) -> float:
         *_, end = Engine(with_values(simulation, {"potential.sigma": sigma}), STEPS, start=start).segments()
