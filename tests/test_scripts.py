@@ -181,6 +181,9 @@ def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
         # the same pairs, found by two searches that share nothing
         assert ours["flips"] == merged["flips"] > 0
         assert ours["cpu_ms"] > 0 and speeds[frames, "MDAnalysis, sets"]["count"] == 4
+    taken = {(one["what"], one["frames"]): one["cpu_seconds"] for one in made["file"]}
+    # a command begins with what reading alone does not need, whatever the machine is busy with
+    assert all(taken["command", frames] > taken["reading", frames] > 0 for frames in (60, 240))
     assert len(made["memory"]) == 4
     assert {one["atoms"] for one in made["many"]} == {1000}
     assert is_png(tmp_path / "b.png")

@@ -211,6 +211,39 @@ def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
     assert len(RunFolder.open(folder.path).read("series")["step"]) == 150
 
 
+@pytest.mark.parametrize("ends", ["finished", "closed", "full"])
+def test_a_table_that_nobody_resumes_is_written_as_it_grows(tmp_path, monkeypatch, ends):
+    """Whole or not at all; of a disk that is full one is told while rows are appended, or at the end."""
+    monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
+    monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
+    folder = RunFolder.create(tmp_path / "ball", world="ball")
+    rows = {"step": np.arange(150), "ball": np.zeros(150), "y": np.linspace(0, 1, 150), "v": np.zeros(150)}
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if ends == "full":
+        monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+        with pytest.raises(FolderError, match="the disk is full"):
+            for _ in range(9):
+                folder.append("heights", rows)
+            folder.finalize()
+    else:
+        for _ in range(9):
+            folder.append("heights", rows)
+    if ends == "finished":
+        folder.merge()
+        with pytest.raises(ValueError, match="whole"):
+            folder.append("heights", rows)
+        np.testing.assert_array_equal(folder.read("heights")["y"], np.tile(rows["y"], 9))
+        assert pq.read_metadata(folder.path / "heights.parquet").row_group(0).num_rows == 64
+        assert not folder.damaged()
+    folder.close()
+    # no part, and nothing of a file that did not become whole
+    left = [path.name for path in folder.path.rglob("*") if "parquet" in path.name or "part" in path.name]
+    assert left == ["heights.parquet"] * (ends == "finished")
+
+
 def test_row_groups_do_not_depend_on_the_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
     for name, chunk in (("a", 10), ("b", 50)):

@@ -100,7 +100,7 @@ class PairDecider:
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
-    @property
+    @cached_property
     def grows(self) -> bool:
         """Whether bounds may grow with the positions."""
         narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))

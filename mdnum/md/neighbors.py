@@ -333,12 +333,10 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
             near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
             mask = np.empty(capacity + _WIDE, np.uint8)
             # rows a cache line further than a power of two apart: those share their places in a cache
-            wider = np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
-            # not as slices: numba compiles the message of what cannot be assigned for two seconds
+            narrow, rows = rows, np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
             for k in range(_TOGETHER):
-                for q in range(room):
-                    wider[k, q] = rows[k, q]
-            rows = wider
+                for i in range(room):
+                    rows[k, i] = narrow[k, i]
         for b2 in range(bins[2]):
             here = column + b2
             low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]

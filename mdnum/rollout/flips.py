@@ -97,21 +97,21 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     """
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
+    rows, order, place = np.empty_like(i), np.empty_like(i), np.empty_like(i)
     for q in range(flips):
         one, other = labels[pairs[q, 1]], labels[pairs[q, 2]]
-        i[q], j[q] = min(one, other), max(one, other)
-    order = _placed(pairs[:, 0], len(bounds), _placed(i, len(labels), np.arange(flips)))
+        i[q], j[q], rows[q], order[q] = min(one, other), max(one, other), pairs[q, 0], q
+    order = _placed(rows, len(bounds), _placed(i, len(labels), order))
     # an atom has few flips in a step
     for f in range(1, flips):
         q, at = order[f], f
         while at > 0:
             p = order[at - 1]
-            if i[p] != i[q] or j[p] < j[q] or pairs[p, 0] != pairs[q, 0]:
+            if i[p] != i[q] or j[p] < j[q] or rows[p] != rows[q]:
                 break
             order[at] = p
             at -= 1
         order[at] = q
-    place = np.empty(flips, np.int64)
     for f in range(flips):
         place[order[f]] = f
     step, subject = np.empty(flips, np.int64), np.empty((flips, 2), np.int64)
@@ -120,7 +120,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     # as they were noted: they come from further away than their places, which are near one another
     for q in range(flips):
         f = place[q]
-        row, now, k = pairs[q, 0], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
+        row, now, k = rows[q], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
         x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
         dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz

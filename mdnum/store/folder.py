@@ -220,8 +220,9 @@ class RunFolder:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
             self._write_checkpoint(self._pending[0])
-        for name in dict.fromkeys((*TABLES[self.world], *self._streams)):
-            self._stream(name).merge()
+        for name in TABLES[self.world]:
+            self._stream(name)
+        self.merge()
         self._owner = True
         self._list_files(finished=True)
         parts = self.path / "parts"
@@ -229,9 +230,16 @@ class RunFolder:
             parts.rmdir()
         self.close()
 
+    def merge(self) -> None:
+        """Makes one file of each table that has rows; they can be read before the folder is finished."""
+        for stream in self._streams.values():
+            stream.merge()
+
     def close(self) -> None:
         """Closes files and gives up the lock; rows after the last checkpoint are dropped."""
         self._frames.close()
+        for stream in self._streams.values():
+            stream.close()
         for file in (self._log, self._lock):
             if file is not None:
                 file.close()
@@ -252,10 +260,6 @@ class RunFolder:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
             names -= {*self._foreign, *SUBFOLDERS, "log.txt", manifest.NAME}
             manifest.update(self.path, manifest.listed_files(self.path, names))
-
-    def drop_checkpoint(self) -> None:
-        """Removes the checkpoint of what is finished and would never be resumed."""
-        manifest.remove(self.path / "checkpoint.npz")
 
     # -- resuming --------------------------------------------------------------------------------
 

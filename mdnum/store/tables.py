@@ -1,11 +1,16 @@
-"""A table that grows by part files named after their first row, and is merged into one file at the end."""
+"""A table that grows by part files named after their first row, and is merged into one file at the end.
+
+That of a folder which nobody resumes needs no parts: a thread writes its file as rows come.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from queue import Full, Queue
 from types import MappingProxyType
 from typing import Any
 
@@ -178,6 +183,8 @@ VERBS: Mapping[str, str] = MappingProxyType(
     }
 )  # fmt: skip
 
+# the worlds of folders that are resumed from the rows they have
+_RESUMED = frozenset({"md"})
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
@@ -185,7 +192,7 @@ _GROUP_ROWS = 262_144
 # every page carries a checksum, which whoever reads the file can ask for
 _WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
-_DISTINCT = frozenset({"i", "j", "distance", "margin", "radial_speed"})
+_DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before", "radial_speed"})
 
 
 class TableStream:
@@ -208,6 +215,8 @@ class TableStream:
         self.parts_folder = root / "parts"
         self._buffer: list[pa.Table] = []
         self._buffered = 0
+        self._in_parts = world in _RESUMED
+        self._writing: _Writing | None = None
         self._schema: pa.Schema | None = None
         files = self.files()
         self.flushed = sum(rows for _, rows in files)
@@ -262,12 +271,19 @@ class TableStream:
             self.flush()
 
     def flush(self) -> None:
-        """Writes what is in memory as one part file."""
+        """Writes what is in memory as one part file, or hands it to the thread that writes the table."""
         if not self._buffered:
             return
         table = pa.concat_tables(self._buffer).combine_chunks()
-        subfolder(self._root, "parts")
-        self._replace(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table])
+        if self._in_parts:
+            subfolder(self._root, "parts")
+            self._replace(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table])
+        else:
+            if self._writing is None:
+                if self.flushed:
+                    raise ValueError(f"table {self.name!r} is whole: no rows can be appended")
+                self._writing = _Writing(self._write_merged)
+            self._writing.put(table)
         self.flushed += self._buffered
         self._buffer, self._buffered = [], 0
 
@@ -302,11 +318,15 @@ class TableStream:
     def merge(self) -> None:
         """Writes all rows into one file and removes the parts; a table without a row gets an empty file."""
         self.flush()
-        if not self.parts() and self.merged_path.exists():
+        if self._writing is not None:
+            self._writing.end()
+            self._writing = None
+        elif not self.parts() and self.merged_path.exists():
             return
-        if self._schema is None:
-            self._schema = pa.schema(list(self._known.items()))
-        self._replace(self.merged_path, _regroup(self.batches(), _GROUP_ROWS))
+        else:
+            if self._schema is None:
+                self._schema = pa.schema(list(self._known.items()))
+            self._write_merged(self.batches())
         parts = [path for _, path in self.parts()]
         merged = self.merged_path.name
         # rows of parts that are in the merged file are not looked at any more
@@ -314,6 +334,12 @@ class TableStream:
         with disk_errors(self.parts_folder):
             for path in parts:
                 path.unlink()
+
+    def close(self) -> None:
+        """Leaves a table that is not whole as it was before."""
+        if self._writing is not None:
+            self._writing.end(whole=False)
+            self._writing = None
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """The rows on disk in order, a file or row group at a time."""
@@ -340,9 +366,13 @@ class TableStream:
         if not tables:
             fields = self._known
             names = fields if columns is None else columns
-            return pa.schema([(name, fields[name]) for name in names]).empty_table()
+            # as_arrow: an empty table of pyarrow's own imports pandas
+            return pa.table({name: as_arrow([], fields[name]) for name in names})
         table = pa.concat_tables(tables)
         return table if rows is None else table.slice(0, rows)
+
+    def _write_merged(self, tables: Iterator[pa.Table]) -> None:
+        self._replace(self.merged_path, _regroup(tables, _GROUP_ROWS))
 
     def _row_count(self, path: Path) -> int:
         if self._check is not None:
@@ -394,6 +424,40 @@ class TableStream:
             raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
         self._schema = schema
         return pa.Table.from_arrays(arrays, schema=schema)
+
+
+class _Writing:
+    """A file that a thread writes of the tables it is given, most of the time outside of Python's lock."""
+
+    def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
+        # with a limit: where the disk is slower than what makes the rows, that waits
+        self._tables: Queue[pa.Table | None] = Queue(4)
+        self._whole = True
+        # its thread keeps no process alive, as one of concurrent.futures would
+        self._pool = ThreadPool(1)
+        self._done = self._pool.apply_async(write, [self._given()])
+
+    def _given(self) -> Iterator[pa.Table]:
+        while (table := self._tables.get()) is not None:
+            yield table
+        if not self._whole:
+            raise RuntimeError("rows are missing")
+
+    def put(self, table: pa.Table | None) -> None:
+        """Waits until there is room; raises what has ended the writing."""
+        while not self._done.ready():
+            with suppress(Full):
+                self._tables.put(table, timeout=1.0)
+                return
+        self._done.get()
+
+    def end(self, whole: bool = True) -> None:
+        """Waits until all is written; a file that is not whole is removed, and nothing raised."""
+        self._whole = whole
+        with nullcontext() if whole else suppress(Exception):
+            self.put(None)
+            self._done.get()
+        self._pool.terminate()
 
 
 def as_arrow(values: Any, kind: pa.DataType) -> pa.Array:

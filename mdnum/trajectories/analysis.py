@@ -8,9 +8,11 @@ those of one process to the last bit. What two parts found at the frame that bot
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -78,6 +80,24 @@ class _ProcessPart:
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
     first: Members | None = None  # the pairs inside at the first; of later parts, at the frame before it
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
+
+    def __getstate__(self) -> dict[str, Any]:
+        """To another process, which would wait for flips to come through a pipe: those go through a file."""
+        with NamedTemporaryFile(prefix="mdnum-flips-", delete=False) as file:
+            for name in vars(FlipTable.none()):
+                file.writelines(getattr(one, name).data for one in self.flips)
+        return {**vars(self), "flips": (file.name, sum(map(len, self.flips)))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        name, count = state["flips"]
+        columns, at = [], 0
+        for none in vars(FlipTable.none()).values():
+            size = count * none.itemsize
+            mapped = np.memmap(name, none.dtype, "c", at, count) if count else none
+            columns.append(mapped.view(np.ndarray))
+            at += size
+        os.unlink(name)
+        vars(self).update(state, flips=[FlipTable(*columns)] * bool(count))
 
 
 @dataclass(frozen=True)

@@ -89,26 +89,27 @@ class NeighborCounts:
         self._directed, self._now = directed, np.zeros(atoms, np.int64)
         # by number of neighbors, atoms and frames at which an atom had as many
         self.seen = np.zeros(1, np.int64)
-        self._add(members.i, members.j, np.ones(len(members)))
+        self._add(members.i, members.j, np.ones(len(members), np.int64))
 
     def step(self, flips: FlipTable) -> None:
         """After the flips of a frame."""
-        self._add(flips.i, flips.j, np.where(flips.entered, 1.0, -1.0))
+        self._add(flips.i, flips.j, np.where(flips.entered, 1, -1))
 
     def _add(self, i: np.ndarray, j: np.ndarray, sign: np.ndarray) -> None:
         first, second = self._sides
         for one, other in ((i, j),) if self._directed else ((i, j), (j, i)):
             # between two groups an atom of the first counts those of the second
             counts = sign if first is None or second is None else sign * (first[one] & second[other])
-            self._now += np.bincount(one, counts, len(self._now)).astype(np.int64)
+            np.add.at(self._now, one, counts)
 
     def count(self) -> tuple[int, float, int]:
         """(fewest, mean, most) over the atoms at this frame, which is added to what was seen."""
-        numbers = self._now[self._atoms]
-        here = np.bincount(numbers)
-        self.seen = np.pad(self.seen, (0, max(len(here) - len(self.seen), 0)))
+        here = np.bincount(self._now[self._atoms])
+        if len(here) > len(self.seen):
+            self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
         self.seen[: len(here)] += here
-        return int(numbers.min()), float(numbers.mean()), int(numbers.max())
+        total = int(here @ np.arange(len(here)))
+        return int(np.flatnonzero(here)[0]), total / len(self._atoms), len(here) - 1
 
 
 @dataclass

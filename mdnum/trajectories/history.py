@@ -16,13 +16,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.ledger import Columns, FlipTable, Members
+from mdnum.trajectories.ledger import Columns, FlipTable, Members, in_order
 
-# a pair's three numbers are packed into one where they fit: sorting one column is ten times as fast
+# a pair's three numbers are packed into one where they fit: sorting one column is far faster
 _ROOM = 2**62
 # share of the flips below which those that a stride of 2 loses are too few to see a trend in
 _FEW = 5e-3
@@ -105,19 +106,6 @@ class History:
         """The pair of each flip."""
         return np.repeat(np.arange(len(self)), self.flips)
 
-    @property
-    def last(self) -> Bool[np.ndarray, "pairs"]:
-        """Whether each pair is inside at the last frame."""
-        return self.inside ^ (self.flips % 2 == 1)
-
-    def broken(self) -> Int[np.ndarray, "broken"]:
-        """Pairs that enter while inside or leave while outside: a flip of theirs is missing."""
-        pair = self.pair
-        # the nth flip of a pair enters if the pair was outside and n is even, or inside and n is odd
-        turn = np.arange(len(self.frame)) - self.rows[:-1][pair]
-        expected = self.inside[pair] ^ (turn % 2 == 0)
-        return np.unique(pair[expected != self.entered])
-
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """A stable order that sorts by all columns, and in that order which rows differ from the one before."""
@@ -126,7 +114,9 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     sizes = [int(column.max()) + 1 for column in columns]
     if sizes[0] * sizes[1] * sizes[2] < _ROOM and min(int(column.min()) for column in columns) >= 0:
         packed = (columns[0] * sizes[1] + columns[1]) * sizes[2] + columns[2]
-        order = np.argsort(packed, kind="stable")
+        room = np.empty((4, len(packed)), np.int64)
+        room[0] = packed
+        order = in_order(room, len(packed), sizes[0] * sizes[1] * sizes[2])
         changed = np.diff(packed[order]) != 0
     else:
         order = np.lexsort(columns[::-1])
@@ -160,23 +150,36 @@ def contacts(history: History) -> Contacts:
     """The stays inside of every pair.
 
     Raises:
-        ValueError: flips of a pair do not enter and leave in turn (see `History.broken`).
+        ValueError: flips of a pair do not enter and leave in turn: one is missing.
     """
-    if len(history.broken()):
+    room = int(np.count_nonzero(history.inside)) + int(np.count_nonzero(history.entered))
+    of, begin, end = np.empty((3, room), np.int64)
+    if not _stays(
+        history.inside, history.rows, history.frame, history.entered, history.frames, of, begin, end
+    ):
         raise ValueError("flips are missing: a pair enters while inside, or leaves while outside")
-    pair = history.pair
-    there, stayed = np.flatnonzero(history.inside), np.flatnonzero(history.last)
-    enters, leaves = history.entered, ~history.entered
-    # a pair inside at the first frame has one begin more, before its others; one inside at the last, one end
-    begin_pair = np.concatenate([there, pair[enters]])
-    begin = np.concatenate([np.zeros(len(there), np.int64), history.frame[enters]])
-    end_pair = np.concatenate([pair[leaves], stayed])
-    end = np.concatenate([history.frame[leaves], np.full(len(stayed), history.frames)])
-    first, second = (np.argsort(one, kind="stable") for one in (begin_pair, end_pair))
-    of = begin_pair[first]
-    ended = second < len(pair) - int(np.count_nonzero(enters))
-    ids = (history.i[of], history.j[of], history.rank[of])
-    return Contacts(*ids, begin[first], end[second], first >= len(there), ended)
+    # flips are of frames after the first
+    ids, began = (history.i[of], history.j[of], history.rank[of]), begin > 0
+    return Contacts(*ids, begin, end, began, end < history.frames)
+
+
+@numba.njit(cache=True, nogil=True)
+def _stays(inside, rows, frame, entered, frames, of, begin, end):
+    """Write the pair, begin and end of each stay; whether every pair enters and leaves in turn."""
+    count = 0
+    for pair in range(inside.shape[0]):
+        here, since = inside[pair], 0
+        for at in range(rows[pair], rows[pair + 1]):
+            if entered[at] == here:
+                return False
+            if here:
+                of[count], begin[count], end[count] = pair, since, frame[at]
+                count += 1
+            here, since = not here, frame[at]
+        if here:
+            of[count], begin[count], end[count] = pair, since, frames
+            count += 1
+    return True
 
 
 def mended(stays: Contacts, gap: int) -> Contacts:
@@ -208,18 +211,9 @@ class Strides(Sums):
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
         """Counts them: of the flips of a pair between two frames that are kept, an odd one is left."""
-        pair, counts = history.pair, []
-        for stride in strides:
-            reach = (history.frames - 1) // stride * stride
-            seen = history.frame <= reach
-            block = -(-history.frame[seen] // stride)
-            new = np.flatnonzero(
-                np.concatenate([[True], (np.diff(block) != 0) | (np.diff(pair[seen]) != 0)])[: len(block)]
-            )
-            sizes = np.diff(np.append(new, len(block)))
-            unsure = np.add.reduceat(history.ambiguous[seen].astype(np.int64), new) if len(new) else sizes
-            left_out = sizes // 2 * 2
-            counts.append((len(block) - left_out.sum(), len(block), np.minimum(left_out, unsure).sum()))
+        counts = [
+            _thinned(history.rows, history.frame, history.ambiguous, history.frames, n) for n in strides
+        ]
         kept, total, doubtful = np.array(counts, np.int64).reshape(-1, 3).T
         return cls(np.array(strides, np.int64), kept, total, doubtful)
 
@@ -227,6 +221,26 @@ class Strides(Sums):
     def share(self) -> Float[np.ndarray, "strides"]:
         """Share of the flips that are left at each stride; nan where there were none."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _thinned(rows, frame, ambiguous, frames, stride):
+    """(flips left at a stride, all flips as far as it reaches, doubtful ones among those left out)."""
+    reach = (frames - 1) // stride * stride
+    total, out, doubtful = 0, 0, 0
+    for pair in range(rows.shape[0] - 1):
+        at = rows[pair]
+        while at < rows[pair + 1] and frame[at] <= reach:
+            # up to the next frame that is kept
+            end, first, unsure = -(-frame[at] // stride) * stride, at, 0
+            while at < rows[pair + 1] and frame[at] <= end:
+                unsure += ambiguous[at]
+                at += 1
+            left_out = (at - first) // 2 * 2
+            total += at - first
+            out += left_out
+            doubtful += min(left_out, unsure)
+    return total - out, total, doubtful
 
 
 @dataclass(frozen=True)

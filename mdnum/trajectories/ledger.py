@@ -133,14 +133,26 @@ class LedgerRows:
 
 @numba.njit(cache=True, nogil=True)
 def _ordered(changed, labels, atoms, ranks, directed, room):
-    """Numbers of the flips, sorted by the file's numbers and rank: digit by digit, the last first."""
-    count, most, bits = changed.i.shape[0], atoms * atoms * ranks, 1
-    keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
+    """Numbers of the flips, sorted by the file's numbers and rank."""
+    count, keys = changed.i.shape[0], room[0]
     for k in range(count):
         one, other = labels[changed.i[k]], labels[changed.j[k]]
         if not directed:
             one, other = min(one, other), max(one, other)
-        keys[k], numbers[k] = (one * atoms + other) * ranks + changed.rank[k], k
+        keys[k] = (one * atoms + other) * ranks + changed.rank[k]
+    return in_order(room, count, atoms * atoms * ranks)
+
+
+@numba.njit(cache=True, nogil=True)
+def in_order(room, count, most):
+    """A stable order of so many keys, whole numbers from 0 to below the most: digit by digit, the last first.
+
+    They are in the first row of the room, which is used up: int64, (4, count or more).
+    """
+    keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
+    bits = 1
+    for k in range(count):
+        numbers[k] = k
     while most >> bits:
         bits += 1
     digits = (bits + 10) // 11

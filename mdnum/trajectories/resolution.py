@@ -76,14 +76,11 @@ class Resolution:
 
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
-        x = frame.positions if atoms is None else frame.positions[atoms]
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = x.sum()
-        if not np.isfinite(total):
+        if atoms is not None or not np.isfinite(frame.furthest):
+            x = frame.positions if atoms is None else frame.positions[atoms]
             # atoms that are nowhere have no distances
-            x = x[np.isfinite(x).all(axis=1)]
-        frame = frame if x is frame.positions else replace(frame, positions=x, velocities=None)
-        largest, rows = float(np.abs(x).max(initial=0.0)), frame.box.matrix[frame.box.pbc]
+            frame = replace(frame, positions=x[np.isfinite(x).all(axis=1)], velocities=None)
+        largest, rows = frame.furthest, frame.box.matrix[frame.box.pbc]
         # the largest sum of the lattice's components along an axis
         lattice = float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
         coordinate, box = self._half(frame), 0.0
@@ -124,8 +121,7 @@ class Resolution:
             largest = np.abs(_fractions_of(frame)).max(axis=0) if self.digits else np.ones(3)
             steps = steps_of(largest, self.step, self.digits)
             return float((steps[:, None] * np.abs(frame.box.matrix)).sum(axis=0).max()) / 2
-        largest = np.abs(frame.positions).max(keepdims=True)
-        return float(steps_of(largest, self.step, self.digits).max()) / 2
+        return float(steps_of(np.array(frame.furthest), self.step, self.digits)) / 2
 
 
 def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:

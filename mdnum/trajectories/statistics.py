@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -148,25 +149,27 @@ def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[
         by lag, pairs of frames at which a pair was inside both times, and at which it was the first time.
     """
     both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
-    if not len(stays):
-        return both, once
-    pair = np.cumsum(_new_pairs(stays)) - 1
-    # one line of time for all pairs, each with room after it for the largest lag
-    room = 2 * (frames + 1)
-    begin, end = pair * room + stays.begin, pair * room + stays.end
-    before = np.concatenate([[0], np.cumsum(stays.length)])
-
-    def inside_until(time: np.ndarray) -> np.ndarray:
-        """Frames inside before a time, over all pairs."""
-        at = np.searchsorted(begin, time, side="right")
-        last = np.maximum(at - 1, 0)
-        over = np.maximum(0, np.minimum(time, end[last]) - begin[last])
-        return before[last] + np.where(at > 0, over, 0)
-
-    for place, lag in enumerate(lags.tolist()):
-        both[place] = int((inside_until(end + lag) - inside_until(begin + lag)).sum())
-        once[place] = int(np.maximum(0, np.minimum(stays.end, frames - lag) - stays.begin).sum())
+    pairs = np.append(np.flatnonzero(_new_pairs(stays)), len(stays))
+    _again(pairs, stays.begin, stays.end, lags, frames, both, once)
     return both, once
+
+
+@numba.njit(cache=True, nogil=True)
+def _again(pairs, begin, end, lags, frames, both, once):
+    for place in range(lags.shape[0]):
+        lag = lags[place]
+        for pair in range(pairs.shape[0] - 1):
+            later = pairs[pair]
+            for stay in range(pairs[pair], pairs[pair + 1]):
+                low, high = begin[stay] + lag, end[stay] + lag
+                once[place] += max(0, min(end[stay], frames - lag) - begin[stay])
+                # the next one begins after this one's end
+                while later < pairs[pair + 1] and end[later] <= low:
+                    later += 1
+                other = later
+                while other < pairs[pair + 1] and begin[other] < high:
+                    both[place] += min(end[other], high) - max(begin[other], low)
+                    other += 1
 
 
 def _new_pairs(stays: Contacts) -> np.ndarray:
@@ -351,10 +354,6 @@ class AgainSums(Sums):
     once: Int[np.ndarray, "lags"]
     stays: int
 
-    def __add__(self, other: Any) -> Any:
-        # one part of the pairs is a sample of all of them, and enough
-        return self if self.stays >= _AGAIN_STAYS // 2 else super().__add__(other)
-
 
 @dataclass(frozen=True)
 class Statistics(Sums):
@@ -373,8 +372,10 @@ class Statistics(Sums):
     again: AgainSums
 
     @classmethod
-    def of(cls, history: History, labels: Labels, directed: bool, window: int) -> tuple[Statistics, Contacts]:
-        """Those of some of the pairs, and their contacts.
+    def of(
+        cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
+    ) -> tuple[Statistics, Contacts]:
+        """Those of some of the pairs, added to those of others before, and their contacts.
 
         Within a window of frames a flip that is reversed is chatter, and a stay outside is overlooked in an
         intermittent contact.
@@ -382,7 +383,10 @@ class Statistics(Sums):
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
         some, among = stays, -(-len(stays) // _AGAIN_STAYS)
-        if among > 1:
+        if before is not None and before.again.stays >= _AGAIN_STAYS // 2:
+            # one part of the pairs is a sample of all of them, and enough
+            some = stays[:0]
+        elif among > 1:
             # all stays of some of the pairs: enough for an average, however many there are
             mine = (stays.i.astype(np.int64) * 7 + stays.j * 13) % among == 0
             some = stays[mine]
@@ -399,7 +403,7 @@ class Statistics(Sums):
             images=int(np.count_nonzero((history.rank > 0) | (history.i == history.j))),
             again=AgainSums(*again(some, lags_of(frames), frames), len(some)),
         )
-        return counted, stays
+        return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
         """Columns of a table of lifetimes by lag, from the numbers of pairs inside at each frame.

@@ -263,25 +263,30 @@ def _no_trajectory(folder: Path) -> InputError:
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     """What opens a file, of its path, its topology and the frames asked for."""
+    from mdnum.trajectories import binary
+
+    suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
+    word = (format or suffix[1:]).lower()
+    if word == "xtc":
+        # without what the readers of all other formats import, which takes as long as reading many frames
+        return binary.XtcTrajectory
     import MDAnalysis
 
-    from mdnum.trajectories import binary, mdanalysis_source, text
+    from mdnum.trajectories import mdanalysis_source, text
 
     own = dict.fromkeys(("lammpsdump", "lammpstrj", "lammps-dump-text"), text.LammpsDump)
-    own |= {"gro": text.GroTrajectory, "xtc": binary.XtcTrajectory}
+    own |= {"gro": text.GroTrajectory}
     library = partial(mdanalysis_source.MDAnalysisTrajectory, format=format)
     known: set[str] = set(MDAnalysis._READERS)
-    suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
-    if format is not None and format.lower() in own:
-        return own[format.lower()]
-    word = (format or suffix[1:]).lower()
+    if format is not None and word in own:
+        return own[word]
     if word in _NETCDF and (head := binary.head_of(file)) is not None and head.cut:
         return binary.NetcdfTrajectory
     if format is not None and word.upper() in known:
         return library
     by_ase = suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None)
     if format is None and not by_ase:
-        if suffix in (".gro", ".xtc"):
+        if suffix == ".gro":
             return own[word]
         head, comment = _first_lines(file)
         if word.upper() not in known and head.startswith("item:"):

@@ -7,6 +7,7 @@ import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 WINDOW = 5
 # displacement between frames over what velocities say, above which they cannot belong to the positions
 _TOO_FAR = 1.1
-# rows of the ledger held at once
-_PART_ROWS = 1_500_000
+# rows of the ledger that are worked on at once, and such parts that are held, at 22 bytes a row
+_PART_ROWS, _PARTS_HELD = 1_500_000, 10
 # an odd number, so that the parts of a crystal's regular labels are alike
 _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
@@ -250,28 +251,34 @@ def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
     """(part, parts, history of some of the pairs) until every pair of a rule had its turn.
 
-    The ledger is in the order of frames and may be larger than memory; a part has all flips of its pairs.
+    The ledger is in the order of frames and may be larger than memory; a part has all flips of its pairs. It
+    is read once for as many parts as are held together.
     """
     from mdnum.trajectories.history import History
 
     streams = {name: TableStream(folder.path, name, folder.world) for name in ("members", "flips")}
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
-    def columns(name: str, part: int, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        found: dict[str, list[np.ndarray]] = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
-        for batch in streams[name].batches(["rule", *kinds]):
-            rows = {name: as_numpy(batch[name]) for name in ("rule", *kinds)}
-            mine = rows["rule"] == rule
-            if parts > 1:
-                mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part
-            for name in kinds:
-                found[name].append(rows[name][mine])
-        return {name: np.concatenate(some) for name, some in found.items()}
+    def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:
+        """Of one part after the other."""
+        found: list[list[dict[str, np.ndarray]]] = [[] for _ in wanted]
+        names, stream = ["rule", *kinds], streams[name]
+        for batch in chain([stream.read(names, rows=0)], stream.batches(names)):
+            rows = {name: as_numpy(batch[name]) for name in names}
+            of = (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts
+            of[rows["rule"] != rule] = -1
+            for part, held in zip(wanted, found, strict=True):
+                mine = np.flatnonzero(of == part)
+                held.append({kind: rows[kind][mine] for kind in kinds})
+        for held in found:
+            yield {kind: np.concatenate([rows[kind] for rows in held]) for kind in kinds}
 
-    pair = {"i": np.int64, "j": np.int64, "rank": np.int64}
-    for part in range(parts):
-        flips = columns("flips", part, {"frame": np.int64, "entered": bool, **pair, "ambiguous": bool})
-        yield part, parts, History.of(flips, columns("members", part, pair), frames)
+    pair = ["i", "j", "rank"]
+    for begin in range(0, parts, _PARTS_HELD):
+        wanted = range(begin, min(begin + _PARTS_HELD, parts))
+        flips = columns("flips", wanted, ["frame", "entered", *pair, "ambiguous"])
+        for part, rows, first in zip(wanted, flips, columns("members", wanted, pair), strict=True):
+            yield part, parts, History.of(rows, first, frames)
 
 
 def _rule_told(
@@ -297,9 +304,8 @@ def _rule_told(
         folder.append(table, {"rule": np.full(length, number), **columns})
 
     for part, parts, history in histories(folder, number, found.frames):
-        counted, stays = Statistics.of(history, labels, one.rule.directed, window)
+        total, stays = Statistics.of(history, labels, one.rule.directed, window, total)
         append("contacts", vars(stays))
-        total = counted if total is None else total + counted
         log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
     assert total is not None, "there is at least one part"
     rows = {name: values[frames["rule"] == number] for name, values in frames.items()}

