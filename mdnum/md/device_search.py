@@ -1,4 +1,4 @@
-"""The neighbor search of `md.neighbors` in XLA: lists are built where the positions are, and stay there.
+"""The neighbor search of `md.host_search` in XLA: lists are built where the positions are, and stay there.
 
 An atom meets what is in the bins around its own, in the order in which the search on the host meets it: of
 the same bins both make the same table. Two numbers of a search come to the host: how many atoms the fullest
@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from mdnum.md.cell import Cell
-from mdnum.md.neighbors import SAFETY, free_extent, grid
+from mdnum.md.host_search import SAFETY, free_extent, grid
 
 # candidates of the atoms that are taken at a time, which take some fifty bytes each
 _AT_A_TIME = 2**21
@@ -36,7 +36,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """As `ListBuilder.build`; table and order are on the device."""
+        """As `neighbors.ListBuilder.build`; table and order are on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):

@@ -286,7 +286,7 @@ def _smallest_distance(spec: schema.SystemSpec) -> float:
 
 def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
     from mdnum.md.cell import Cell, wrap_positions
-    from mdnum.md.neighbors import neighbor_table
+    from mdnum.md.host_search import neighbor_table
 
     if len(atoms) < 2:
         return

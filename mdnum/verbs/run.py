@@ -124,7 +124,7 @@ def _compile_beside() -> None:
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):
-        if kept and not os.listdir(kept):
+        if kept and not os.listdir(kept) and (os.cpu_count() or 1) > 1:
             subprocess.Popen(
                 python("-c", COMPILE), env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )

@@ -10,9 +10,10 @@ import oracles
 import pytest
 
 from mdnum.errors import CapacityError, InputError
-from mdnum.md import device_search, neighbors
+from mdnum.md import device_search, host_search
 from mdnum.md.cell import Cell, wrap_positions
-from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
+from mdnum.md.host_search import neighbor_table
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius
 from mdnum.references.conformance import ListLimits, NeighborListConformance
 
 
@@ -101,10 +102,10 @@ def test_a_search_on_a_device_makes_the_same_table(name, monkeypatch):
 def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
     rng, cell = np.random.default_rng(3), Cell.create([20.0, 18.0, 22.0], pbc)
     positions = rng.uniform(0, 1, (900, 3)) * [20.0, 18.0, 22.0]
-    monkeypatch.setattr(neighbors, "_SHARED", 100)
+    monkeypatch.setattr(host_search, "_SHARED", 100)
     made = []
     for cores in (1, 2, 3, 7):
-        monkeypatch.setattr(neighbors, "_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(host_search, "_cores", lambda cores=cores: cores)
         index, order, most = neighbor_table(positions, cell, 4.0, 64)
         # not the memory that the next search is given
         made.append((index.copy(), order, most))
