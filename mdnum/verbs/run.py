@@ -140,8 +140,12 @@ def _beside_the_loop(
         return None
     from mdnum.references.energy_check import SAMPLED, check_energy
 
+    def shown() -> Iterator[np.ndarray]:
+        while (positions := frames.get()) is not None:
+            yield positions
+
     def named() -> Iterator[tuple[str, Atoms]]:
-        given = iter(frames.get, None)
+        given = shown()
         if simulation.atoms > SAMPLED:
             # what a large system takes of memory would come on top of the loop's
             given = iter(list(islice(given, 2)))
