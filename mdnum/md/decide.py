@@ -333,8 +333,8 @@ class Changes(NamedTuple):
         v: Float[Array, "3 atoms"],
         row: Int[Array, ""],
         most: int,
-    ) -> Changes:
-        """These, and what has changed since the decisions before.
+    ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
+        """These, and what has changed since the decisions before; and the decisions, in the memory of those.
 
         Args:
             most: how many may come at a time on a device other than a CPU, where each step takes the same
@@ -358,17 +358,21 @@ class Changes(NamedTuple):
         start = (self.count[0], jnp.zeros((), jnp.int64))
         # more than there may be is more than there is room for
         seen = jnp.where(found > most, found + len(self.pairs), found)
-        return Changes(
+        made = Changes(
             lax.dynamic_update_slice(self.pairs, pairs, start),
             lax.dynamic_update_slice(self.ends, ends.astype(self.ends.dtype), start),
             jnp.stack([self.count[0] + seen, self.count[1] + both, inside]),
         )
+        return made, bits
 
-    def _noted_by_host(self, before, bits, tables: Tables, x, v, row) -> Changes:
-        shapes = [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in self]
-        call = jax.ffi.ffi_call(_noting(), shapes, input_output_aliases={0: 0, 1: 1, 2: 2})
+    def _noted_by_host(self, before, bits, tables: Tables, x, v, row):
+        # written over, or XLA would copy the decisions of every step twice
+        kept = (*self, before)
+        shapes = [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in kept]
+        call = jax.ffi.ffi_call(_noting(), shapes, input_output_aliases={k: k for k in range(4)})
         index = tables.index.astype(jnp.int32)
-        return Changes(*call(*self, before, bits, index, x, v, row.astype(jnp.int64)))
+        *made, held = call(*kept, bits, index, x, v, row.astype(jnp.int64))
+        return Changes(*made), held
 
 
 @partial(jax.jit, static_argnames="room")
@@ -392,7 +396,7 @@ def _note(frame):
     pairs_at, room, _ = buffer(results, 0)
     ends_at, _, _ = buffer(results, 1)
     count_at, _, _ = buffer(results, 2)
-    before_at, words, atoms = buffer(operands, 3)
+    before_at, words, atoms = buffer(results, 3)
     bits_at, _, _ = buffer(operands, 4)
     index_at, _, _ = buffer(operands, 5)
     x_at, _, _ = buffer(operands, 6)
@@ -420,6 +424,8 @@ _TOGETHER = 128
 def note(before, bits, index, x, v, row, pairs, ends, count):
     """Add what changed in a row to the parts of `Changes`; what there is no room for is counted.
 
+    The decisions before become those now.
+
     Stretch after stretch of words, each in passes of their own: found, looked up and kept one by one, every
     change costs a branch that is guessed wrong and waits for its neighbor to be read.
     """
@@ -439,11 +445,13 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
         for k in range(start, end):
             inside += np.int64(bits_set(now[k]))
             places[n], changes[n] = 8 * k, now[k] ^ ahead[k]
+            ahead[k] = now[k]
             n += np.int64(changes[n] != 0)
         if start + _TOGETHER > whole:
             for k in range(8 * whole, size):
                 inside += np.int64(bits_set(np.uint64(bytes_now[k])))
                 places[n], changes[n] = k, np.uint64(bytes_now[k] ^ bytes_before[k])
+                bytes_before[k] = bytes_now[k]
                 n += np.int64(changes[n] != 0)
         # their bits: atom, place in the list and decision
         m = 0

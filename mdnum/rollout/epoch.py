@@ -314,9 +314,9 @@ def run_epoch(
             if program.rows:
                 values |= {"x": x, "v": v, "images": images, "bits": d.bits}
             else:
-                changes = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
+                changes, earlier = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
                 values["inside"] = changes.count[2]
-                record, earlier = record._replace(changes=changes), d.bits
+                record = record._replace(changes=changes)
         record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
         v = program.integrator.kick(v, half_step, acceleration, mass_row)

@@ -57,11 +57,9 @@ def _fingerprint_of_keys(keys):
 @numba.njit(cache=True, nogil=True)
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
     """`Changes` of consecutive rows of one list."""
+    held = before.copy()
     for r in range(len(rows)):
-        if r == 0:
-            note(before, rows[r], index, x[r], v[r], r, pairs, ends, count)
-        else:
-            note(rows[r - 1], rows[r], index, x[r], v[r], r, pairs, ends, count)
+        note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
 
 
 @numba.njit(cache=True, nogil=True)

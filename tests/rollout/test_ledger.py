@@ -376,9 +376,11 @@ def test_changes_are_noted_to_the_last_byte(monkeypatch, on, words, atoms):
     def noted(before, bits, index, x, v):
         tables = decide.Tables(index, None, jnp.arange(atoms))
         empty = decide.Changes.empty(len(pairs) + 3, x.dtype)
-        return empty.noted(before, bits, tables, x, v, jnp.int64(7), len(pairs))
+        made, held = empty.noted(before, bits, tables, x, v, jnp.int64(7), len(pairs))
+        return *made, held, before
 
-    made = [np.asarray(part) for part in jax.jit(noted)(before, bits, index, x, v)]
+    *made, held, untouched = [np.asarray(part) for part in jax.jit(noted)(before, bits, index, x, v)]
+    assert np.array_equal(held, bits) and np.array_equal(untouched, before)
     assert made[2].tolist() == [len(pairs), len(first), np.bitwise_count(bits).sum()]
     here, there = (np.lexsort(found.T) for found in (made[0][: len(pairs)], pairs))
     assert np.array_equal(made[0][here], pairs[there]) and np.array_equal(made[1][here], ends[there])
