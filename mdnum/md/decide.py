@@ -469,9 +469,10 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
         count[1] += m
         for k in range(m):
             second = flat[slots[k]]
-            # written always and kept where it is seen from its first end, which half of them are
-            at = min(found, len(pairs) - 1)
-            pairs[at, 0], pairs[at, 1], pairs[at, 2], pairs[at, 3] = row, firsts[k], second, values[k]
+            # written wherever there is room and kept where it is seen from its first end, as half of them are
+            if found < len(pairs):
+                pairs[found, 0], pairs[found, 1] = row, firsts[k]
+                pairs[found, 2], pairs[found, 3] = second, values[k]
             found += np.int64(second > firsts[k])
     for at in range(min(begun, len(pairs)), min(found, len(pairs))):
         first, second = pairs[at, 1], pairs[at, 2]

@@ -412,12 +412,16 @@ def neighbor_table(
     parts = max(1, min(_cores(), atoms // _SHARED))
     ends = np.searchsorted(start[:: bins[2]], np.linspace(0, atoms, parts + 1)[1:-1])
     edges = [0, *ends.tolist(), int(bins[0] * bins[1])]
-    most = [0] * parts
+    most, failed = [0] * parts, []
 
     def fill(part: int) -> None:
         columns = edges[part], edges[part + 1]
         box, r2_list = (bins, reach, periodic, matrix), (r_list * SAFETY) ** 2
-        most[part] = _fill(x, layered, box, inverse, start, r2_list, table, columns)
+        try:
+            most[part] = _fill(x, layered, box, inverse, start, r2_list, table, columns)
+        except BaseException as error:
+            # a thread's would end with the thread, and leave a part of the table as it was
+            failed.append(error)
 
     helpers = [threading.Thread(target=fill, args=(part,)) for part in range(1, parts)]
     for helper in helpers:
@@ -425,6 +429,8 @@ def neighbor_table(
     fill(0)
     for helper in helpers:
         helper.join()
+    if failed:
+        raise failed[0]
     return table, order, max(most)
 
 

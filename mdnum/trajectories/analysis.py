@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from multiprocessing import parent_process
 from tempfile import NamedTemporaryFile
 from typing import Any
 
@@ -82,13 +84,23 @@ class _ProcessPart:
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
     def __getstate__(self) -> dict[str, Any]:
-        """To another process, which would wait for flips to come through a pipe: those go through a file."""
+        """From a process to its parent, which would wait for flips to come through a pipe: through a file."""
+        if parent_process() is None or "distributed" in sys.modules:
+            # to nobody knows where, and how often it is read
+            return vars(self)
         with NamedTemporaryFile(prefix="mdnum-flips-", delete=False) as file:
-            for name in vars(FlipTable.none()):
-                file.writelines(getattr(one, name).data for one in self.flips)
+            try:
+                for name in vars(FlipTable.none()):
+                    file.writelines(getattr(one, name).data for one in self.flips)
+            except BaseException:
+                os.unlink(file.name)
+                raise
         return {**vars(self), "flips": (file.name, sum(map(len, self.flips)))}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        if isinstance(state["flips"], list):
+            vars(self).update(state)
+            return
         name, count = state["flips"]
         columns, at = [], 0
         for none in vars(FlipTable.none()).values():

@@ -123,8 +123,9 @@ def _compile_beside() -> None:
     compiles for one processor.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(OSError):
-        if kept and not os.listdir(kept) and (os.cpu_count() or 1) > 1:
+        if kept and not os.listdir(kept) and cores > 1:
             subprocess.Popen(
                 python("-c", COMPILE), env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )
@@ -148,7 +149,9 @@ def _beside_the_loop(
         given = shown()
         if simulation.atoms > SAMPLED:
             # what a large system takes of memory would come on top of the loop's
-            given = iter(list(islice(given, 2)))
+            both = list(islice(given, 2))
+            # of a run that was stopped nobody asks
+            given = iter(both if len(both) == 2 else ())
         for name, positions in zip(("initial", "last"), given, strict=False):
             atoms = simulation.system.atoms.copy()
             atoms.set_positions(positions)

@@ -116,6 +116,21 @@ def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
     )
 
 
+def test_a_thread_that_fails_is_heard_of(monkeypatch):
+    fill = host_search._fill
+
+    def failing(*given):
+        if given[-1][0]:
+            raise MemoryError("no room")
+        return fill(*given)
+
+    monkeypatch.setattr(host_search, "_SHARED", 100)
+    monkeypatch.setattr(host_search, "_cores", lambda: 2)
+    monkeypatch.setattr(host_search, "_fill", failing)
+    with pytest.raises(MemoryError, match="no room"):
+        neighbor_table(np.random.default_rng(1).uniform(0, 20, (400, 3)), Cell.create([20.0] * 3), 3.0, 64)
+
+
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
 def test_a_pair_at_the_radius_is_not_lost_between_bins(bins):
     """Bins of exactly half a radius put some pairs at the radius three bins apart by rounding."""

@@ -375,7 +375,8 @@ def test_changes_are_noted_to_the_last_byte(monkeypatch, on, words, atoms):
 
     def noted(before, bits, index, x, v):
         tables = decide.Tables(index, None, jnp.arange(atoms))
-        empty = decide.Changes.empty(len(pairs) + 3, x.dtype)
+        # for all of them and no more
+        empty = decide.Changes.empty(len(pairs), x.dtype)
         made, held = empty.noted(before, bits, tables, x, v, jnp.int64(7), len(pairs))
         return *made, held, before
 
@@ -384,6 +385,23 @@ def test_changes_are_noted_to_the_last_byte(monkeypatch, on, words, atoms):
     assert made[2].tolist() == [len(pairs), len(first), np.bitwise_count(bits).sum()]
     here, there = (np.lexsort(found.T) for found in (made[0][: len(pairs)], pairs))
     assert np.array_equal(made[0][here], pairs[there]) and np.array_equal(made[1][here], ends[there])
+
+
+def test_more_flips_than_were_expected_are_all_in_the_ledger(fluid):
+    hot = shaken(fluid, 3, 60.0)
+    simulation = build(hot)
+    most = 0
+    for lean, kept in zip(
+        Engine(simulation, 40, rows=False).segments(), Engine(simulation, 40).segments(), strict=True
+    ):
+        one, other = (PairRecorder(simulation).flips(segment) for segment in (lean, kept))
+        assert np.array_equal(one.subject, other.subject) and np.array_equal(one.step, other.step)
+        assert len(
+            {(step, *pair) for step, pair in zip(one.step, map(tuple, one.subject), strict=True)}
+        ) == len(one)
+        most = max(most, len(one) / lean.rows)
+    # more than there is room for at first
+    assert most > max(64, simulation.atoms // 4)
 
 
 def test_rows_are_made_again_where_somebody_asks(fluid):
