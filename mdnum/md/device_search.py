@@ -2,7 +2,7 @@
 
 An atom meets what is in the bins around its own, in the order in which the search on the host meets it: of
 the same bins both make the same table. Two numbers of a search come to the host: how many atoms the fullest
-bin holds, and the most neighbors.
+bin holds, and the most neighbors; where an axis is free also the ends of what the atoms span.
 """
 
 from __future__ import annotations
