@@ -7,7 +7,6 @@ half the smallest perpendicular width.
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 from typing import Any
@@ -22,6 +21,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from mdnum.md.cell import Cell
+from mdnum.provenance import cores
 
 # atoms whose slots are written together: 16 of four bytes are a cache line
 _TOGETHER = 16
@@ -409,7 +409,7 @@ def neighbor_table(
     matrix, periodic = np.asarray(cell.matrix, np.float64), np.array(cell.pbc)
     layered = _layered(x, start, bins)
     # shared among threads by atoms; columns of bins are whole
-    parts = max(1, min(_cores(), atoms // _SHARED))
+    parts = max(1, min(cores(), atoms // _SHARED))
     ends = np.searchsorted(start[:: bins[2]], np.linspace(0, atoms, parts + 1)[1:-1])
     edges = [0, *ends.tolist(), int(bins[0] * bins[1])]
     most, failed = [0] * parts, []
@@ -432,11 +432,6 @@ def neighbor_table(
     if failed:
         raise failed[0]
     return table, order, max(most)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _used: list[np.ndarray] = []

@@ -16,6 +16,7 @@ import numpy as np
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
+from mdnum.provenance import cores
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
@@ -123,9 +124,8 @@ def _compile_beside() -> None:
     compiles for one processor.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(OSError):
-        if kept and not os.listdir(kept) and cores > 1:
+        if kept and not os.listdir(kept) and cores() > 1:
             subprocess.Popen(
                 python("-c", COMPILE), env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )

@@ -105,7 +105,7 @@ def test_threads_that_share_a_search_make_the_table_of_one(pbc, monkeypatch):
     monkeypatch.setattr(host_search, "_SHARED", 100)
     made = []
     for cores in (1, 2, 3, 7):
-        monkeypatch.setattr(host_search, "_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(host_search, "cores", lambda cores=cores: cores)
         index, order, most = neighbor_table(positions, cell, 4.0, 64)
         # not the memory that the next search is given
         made.append((index.copy(), order, most))
@@ -125,7 +125,7 @@ def test_a_thread_that_fails_is_heard_of(monkeypatch):
         return fill(*given)
 
     monkeypatch.setattr(host_search, "_SHARED", 100)
-    monkeypatch.setattr(host_search, "_cores", lambda: 2)
+    monkeypatch.setattr(host_search, "cores", lambda: 2)
     monkeypatch.setattr(host_search, "_fill", failing)
     with pytest.raises(MemoryError, match="no room"):
         neighbor_table(np.random.default_rng(1).uniform(0, 20, (400, 3)), Cell.create([20.0] * 3), 3.0, 64)
