@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float, Int
 from mdnum.ball.step import BallDecisions, BallState, EventLocated, ImplicitMidpoint, Penalty, Projection
 from mdnum.ball.stopping import Reason
 from mdnum.ball.world import World
+from mdnum.bits import changes_in_time
 from mdnum.errors import InputError
-from mdnum.numerics.events import Ledger, changes_in_time
+from mdnum.numerics.events import Ledger
 from mdnum.numerics.rounding import gamma
 
 #: Balls times steps that leave the device at once.

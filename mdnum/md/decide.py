@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from mdnum.bits import bits_set, lowest_bit
 from mdnum.errors import InputError
 from mdnum.md import foreign
 from mdnum.md.cell import Cell
@@ -24,7 +25,6 @@ from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, regist
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
-from mdnum.numerics.events import bits_set, lowest_bit
 from mdnum.numerics.exact import squared_norm
 from mdnum.numerics.rounding import unit_roundoff
 
@@ -316,13 +316,18 @@ class Changes(NamedTuple):
         """The same room without any."""
         return self._replace(count=jnp.zeros_like(self.count))
 
-    def first(self, count: int) -> tuple[Int[np.ndarray, "count 4"], Float[np.ndarray, "count 12"]]:
-        """So many pairs and their ends, on the host; of a device's memory little more than these comes."""
-        room, parts = 1 << count.bit_length(), self[:2]
-        if isinstance(self.pairs, jax.Array) and room < len(self.pairs) and not foreign.known():
-            parts = _cut(parts, room)
-        pairs, ends = (np.asarray(part)[:count] for part in parts)
-        return pairs, ends
+    @property
+    def found(self) -> int:
+        """How many have been seen, noted or not."""
+        return int(np.asarray(self.count)[0])
+
+    def cut(self) -> Changes:
+        """Those that there are and a few more: of a device's memory little else comes to the host."""
+        room = 1 << self.found.bit_length()
+        if foreign.known() or room >= len(self.pairs):
+            return self
+        pairs, ends = _cut((self.pairs, self.ends), room)
+        return self._replace(pairs=pairs, ends=ends)
 
     def noted(
         self,

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.decide import Tables, zeros
+from mdnum.md.decide import Changes, Tables, zeros
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -52,6 +52,7 @@ class Segment:
         first: step of the first row.
         rows: number of rows.
         record: one row per step (on the device; valid until the next segment but one is asked for).
+        changes: of the record, without most of the room behind them.
         before: decisions of this list at the step before `first`, shape (words, atoms).
         table: the list.
         epoch: number of the list's life.
@@ -73,6 +74,7 @@ class Segment:
     first: int
     rows: int
     record: EpochRecord
+    changes: Changes | None
     before: UInt8[Array | np.ndarray, "words atoms"] | None
     table: PairTable
     epoch: int
@@ -96,7 +98,7 @@ class Segment:
 
     def rows_of(self, name: str) -> np.ndarray:
         """The filled rows of a column of the record; where it has none, the steps are made once more."""
-        lacks = self.record.changes is not None and name in ("x", "v", "images", "bits")
+        lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     @property
@@ -334,13 +336,13 @@ class Engine:
         """What the loop left behind, and the decisions at its last row; waits for it."""
         outcome, record = begun
         rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
-        changes = record.changes
-        while changes is not None and finite and np.asarray(changes.count)[0] > len(changes.pairs):
+        while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
             # a step had more changes than there was room for
             self._room_for_changes(4 * self.program.most)
             outcome, record = self._advance(listed, start, held, turn)
             rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
-            changes = record.changes
+        # before the next stretch is started, or a device would make that first
+        changes = None if changes is None else changes.cut()
         first, table = int(start.state.step), listed[0]
         before = held if outcome.before is None or held is not None else outcome.before
         if self.rows:
@@ -352,6 +354,7 @@ class Engine:
             first,
             rows,
             record,
+            changes,
             before,
             table,
             start.epoch,

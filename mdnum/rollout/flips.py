@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from mdnum.bits import digit_order
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
 from mdnum.md.decide import Changes, note
@@ -62,21 +63,6 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
 
 
-@numba.njit(cache=True, nogil=True)
-def _placed(column, size, order):
-    """An order sorted by a column of numbers below a size; rows that are equal keep theirs."""
-    start = np.zeros(size + 1, np.int64)
-    for value in column:
-        start[value + 1] += 1
-    for k in range(size):
-        start[k + 1] += start[k]
-    out = np.empty_like(order)
-    for q in order:
-        out[start[column[q]]] = q
-        start[column[q]] += 1
-    return out
-
-
 # atoms in one place have no radial speed: not a number, as in numpy
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice, narrow, first, factor):
@@ -95,21 +81,12 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     """
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
-    rows, order, place = np.empty_like(i), np.empty_like(i), np.empty_like(i)
+    atoms, room, place = len(labels), np.empty((4, flips), np.int64), np.empty_like(i)
     for q in range(flips):
         one, other = labels[pairs[q, 1]], labels[pairs[q, 2]]
-        i[q], j[q], rows[q], order[q] = min(one, other), max(one, other), pairs[q, 0], q
-    order = _placed(rows, len(bounds), _placed(i, len(labels), order))
-    # an atom has few flips in a step
-    for f in range(1, flips):
-        q, at = order[f], f
-        while at > 0:
-            p = order[at - 1]
-            if i[p] != i[q] or j[p] < j[q] or rows[p] != rows[q]:
-                break
-            order[at] = p
-            at -= 1
-        order[at] = q
+        i[q], j[q] = min(one, other), max(one, other)
+        room[0, q] = (pairs[q, 0] * atoms + i[q]) * atoms + j[q]
+    order = digit_order(room, flips, len(bounds) * atoms * atoms)
     for f in range(flips):
         place[order[f]] = f
     step, subject = np.empty(flips, np.int64), np.empty((flips, 2), np.int64)
@@ -118,7 +95,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     # as they were noted: they come from further away than their places, which are near one another
     for q in range(flips):
         f = place[q]
-        row, now, k = rows[q], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
+        row, now, k = pairs[q, 0], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
         x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
         dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz
@@ -222,7 +199,7 @@ class PairRecorder:
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs inside at every step of a segment."""
-        if segment.record.changes is None:
+        if segment.changes is None:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
@@ -273,7 +250,7 @@ class PairRecorder:
             MdnumError: a flip was recorded from one end only, or a margin contradicts its decision: the
                 compiled program and the host would disagree about arithmetic.
         """
-        table, changes = segment.table, segment.record.changes
+        table, changes = segment.table, segment.changes
         replaced = self._replace(segment)
         if changes is None or replaced is not None:
             bits, x, v = (segment.rows_of(name) for name in ("bits", "x", "v"))
@@ -282,8 +259,8 @@ class PairRecorder:
         found, both, _ = np.asarray(changes.count).tolist()
         if 2 * found != both:
             raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
-        pairs, ends = changes.first(min(found, len(changes.pairs)))
-        kept = np.searchsorted(pairs[:, 0], segment.rows)
+        pairs, ends = np.asarray(changes.pairs), np.asarray(changes.ends)
+        kept = np.searchsorted(pairs[:found, 0], segment.rows)
         pairs, ends = pairs[:kept], ends[:kept]
         if replaced is not None:
             keys, now = replaced

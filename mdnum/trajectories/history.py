@@ -20,8 +20,9 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mdnum.bits import digit_order
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.ledger import Columns, FlipTable, Members, in_order
+from mdnum.trajectories.ledger import Columns, FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is far faster
 _ROOM = 2**62
@@ -116,7 +117,7 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         packed = (columns[0] * sizes[1] + columns[1]) * sizes[2] + columns[2]
         room = np.empty((4, len(packed)), np.int64)
         room[0] = packed
-        order = in_order(room, len(packed), sizes[0] * sizes[1] * sizes[2])
+        order = digit_order(room, len(packed), sizes[0] * sizes[1] * sizes[2])
         changed = np.diff(packed[order]) != 0
     else:
         order = np.lexsort(columns[::-1])

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mdnum.bits import digit_order
 from mdnum.trajectories.search import Changed
 
 
@@ -140,36 +141,7 @@ def _ordered(changed, labels, atoms, ranks, directed, room):
         if not directed:
             one, other = min(one, other), max(one, other)
         keys[k] = (one * atoms + other) * ranks + changed.rank[k]
-    return in_order(room, count, atoms * atoms * ranks)
-
-
-@numba.njit(cache=True, nogil=True)
-def in_order(room, count, most):
-    """A stable order of so many keys, whole numbers from 0 to below the most: digit by digit, the last first.
-
-    They are in the first row of the room, which is used up: int64, (4, count or more).
-    """
-    keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
-    bits = 1
-    for k in range(count):
-        numbers[k] = k
-    while most >> bits:
-        bits += 1
-    digits = (bits + 10) // 11
-    width = (bits + digits - 1) // digits
-    cursor, mask = np.empty((1 << width) + 1, np.int64), (1 << width) - 1
-    for digit in range(digits):
-        cursor[:] = 0
-        for k in range(count):
-            cursor[((keys[k] >> digit * width) & mask) + 1] += 1
-        for value in range(mask):
-            cursor[value + 1] += cursor[value]
-        for k in range(count):
-            value = (keys[k] >> digit * width) & mask
-            other_keys[cursor[value]], other_numbers[cursor[value]] = keys[k], numbers[k]
-            cursor[value] += 1
-        keys, numbers, other_keys, other_numbers = other_keys, other_numbers, keys, numbers
-    return numbers[:count]
+    return digit_order(room, count, atoms * atoms * ranks)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from mdnum.bits import lowest_bit
 from mdnum.trajectories.lattice import Participants, Placed, wrap
 from mdnum.trajectories.search import Changed, exact_square
 
@@ -470,16 +471,6 @@ _LANES = ir.VectorType(_FLOAT, CLUSTER)
 _intrinsic: Any = intrinsic
 
 
-@_intrinsic
-def _lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Number of the lowest of 64 bits that is set; there is one. That of `mdnum.numerics` comes with jax."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.uint64(types.uint64), generate
-
-
 class _Vectors:
     """Writes instructions on vectors of sixteen."""
 
@@ -597,7 +588,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         # of a cluster with itself each pair is met once
         alone, held = i == j and code == np.uintp(_NONE), np.uintp(0)
         while left != np.uintp(0):
-            row = _lowest_bit(left)
+            row = lowest_bit(left)
             left &= left - np.uintp(1)
             bits = _lanes(scratch_at + np.uintp(4) * row, j_at, low, high)
             if alone:
@@ -621,7 +612,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
             if changed != np.uintp(0):
                 inside[tile, row] = now
                 while limits.record and changed != np.uintp(0):
-                    lane = _lowest_bit(changed)
+                    lane = lowest_bit(changed)
                     changed &= changed - np.uintp(1)
                     place = np.uintp(count)
                     flips.i[place] = order[np.uintp(CLUSTER) * i + row]
@@ -641,7 +632,7 @@ def _settled(inside, doubtful, i, slot, code, numbers, limits):
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):
-        lane = _lowest_bit(doubtful)
+        lane = lowest_bit(doubtful)
         doubtful &= doubtful - np.uintp(1)
         real = exact_square(numbers.positions, numbers.home, i, order[slot + lane], n0, n1, n2, vectors)
         margin = abs(limits.radius - np.sqrt(real))
