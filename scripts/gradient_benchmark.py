@@ -230,7 +230,7 @@ def verdicts(result: dict[str, Any]) -> list[tuple[str, float, str, bool]]:
     """What was measured against what it should be: (claim, measured, asked, holds)."""
     rows = []
     for row in (Row(**one) for one in result["rows"]):
-        if row.name in (SYMMETRIC, REVERSIBLE):
+        if row.name in _BESIDE:
             assert row.cpu_ratio is not None
             claim = f"{row.name} over {_BESIDE[row.name]}, N = {row.atoms:,}, CPU time"
             rows.append((claim, row.cpu_ratio, f"<= {MOST_RATIO:g}", row.cpu_ratio <= MOST_RATIO))

@@ -4,7 +4,8 @@ The Lennard-Jones liquid of LAMMPS's bench/in.lj (density 0.8442, r_cut 2.5, ski
 from 4,000 to 1,000,000 atoms. Every size is a process of its own on one core: a warm-up, then steps whose
 CPU time counts, with their flips decoded to ledger rows; the peak of its memory; and one neighbor search.
 Then the smallest size once more in as many processes at a time as there are cores, and every size once more
-in one process that has two cores.
+in one process that has two cores. Then whole commands from a shell: a shipped system with nothing compiled
+and again, and systems of more than 100,000 atoms from their files (`--no-commands` leaves them out).
 
 How to read it. What is flat is linear in the number of atoms: the slope over all sizes is the exponent of the
 growth, 1 for linear. Times depend on the machine and on what else it does, slopes hardly. `together` is the
@@ -17,9 +18,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,8 @@ import numpy as np
 from _liquid import liquid
 from _output import figure, parser, save, say, start, table
 from _processes import machine, peak_mb
+
+from mdnum.safe_path import environment, python
 
 #: Sizes, about, and CPU seconds that the steps of one should take, about.
 SIZES, SECONDS = (4_000, 32_000, 108_000, 256_000, 1_000_000), 8.0
@@ -67,6 +73,67 @@ def measure(atoms: int, seconds: float) -> dict[str, float]:
         "us_per_flip": 1e6 * taken / max(flips, 1), "search_us_per_atom": 1e6 * search / count,
         "peak_mb": peak_mb(), "ms_per_step": 1e3 * elapsed / rows,
     }  # fmt: skip
+
+
+def commands(sizes: list[int]) -> list[dict[str, Any]]:
+    """`mdnum run` from a shell: seconds, those of its loop, and peak memory."""
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        home, out = Path(scratch), Path(scratch) / "out"
+        own = environment(XDG_CACHE_HOME=str(home / "programs"), NUMBA_CACHE_DIR=str(home / "numba"))
+        for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+            own.pop(name, None)
+
+        def run(system: str, steps: int, what: str) -> None:
+            shutil.rmtree(out, ignore_errors=True)
+            words = python("-m", "mdnum", "run", system, "--steps", str(steps), "--out", str(out))
+            say(what)
+            begun = time.perf_counter()
+            child = subprocess.Popen(words, env=own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            _, status, used = os.wait4(child.pid, 0)
+            seconds = time.perf_counter() - begun
+            # 1 is for findings
+            if os.waitstatus_to_exitcode(status) > 1:
+                raise RuntimeError(f"{' '.join(words)} failed")
+            summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+            loop = steps / summary["steps_per_second"]
+            atoms, peak = summary["atoms"], used.ru_maxrss / 1024
+            rows.append(
+                {"what": what, "atoms": atoms, "steps": steps, "seconds": seconds, "loop": loop, "mb": peak}
+            )
+
+        for when in ("first", "again"):
+            run("argon/liquid-864", 5_000, f"argon/liquid-864, {when}")
+        for atoms in sorted(size for size in sizes if size > 100_000):
+            file, steps = str(liquid(atoms).write(home / str(atoms))), 200 if atoms < 500_000 else 12
+            # programs are compiled by the first
+            run(file, steps, f"{atoms:,} atoms, first")
+            run(file, steps, f"{atoms:,} atoms, again")
+    return rows
+
+
+def verdicts(result: dict[str, Any]) -> Iterator[tuple[str, float, str, bool]]:
+    """What was measured beside what is asked for: (claim, measured, asked, holds)."""
+
+    def most(what: str, measured: float, asked: float) -> tuple[str, float, str, bool]:
+        return what, measured, f"<= {asked:g}", measured <= asked
+
+    if "flat" in result:
+        yield most("cost of an atom's step, largest over smallest", result["flat"], 1.3)
+    for row in result["sizes"]:
+        name = f"{row['atoms']:,.0f} atoms"
+        if "two_cores" in row:
+            yield f"two cores over one, {name}", row["two_cores"], ">= 1.7", row["two_cores"] >= 1.7
+        if row["atoms"] > 500_000:
+            yield most(f"one search, {name}, CPU s", 1e-6 * row["search_us_per_atom"] * row["atoms"], 0.6)
+    for row in result.get("commands", []):
+        if row["atoms"] < 100_000:
+            yield most(f"`mdnum run` {row['what']}, s", row["seconds"], 7 if "first" in row["what"] else 5)
+        elif "again" in row["what"] and row["steps"] > 12:
+            yield most(f"`mdnum run` of {row['what']}, over its loop", row["seconds"] / row["loop"], 1.5)
+        elif "again" in row["what"]:
+            yield most(f"`mdnum run` of {row['what']}, s a step", row["seconds"] / row["steps"], 2.5)
+            yield most(f"`mdnum run` of {row['what']}, peak MB", row["mb"], 4096)
 
 
 def children(sizes: list[int], seconds: float, cores: list[list[int]]) -> list[dict[str, float]]:
@@ -111,6 +178,7 @@ def _options() -> argparse.Namespace:
     made = parser(__file__, __doc__)
     made.add_argument("--sizes", nargs="+", type=int, metavar="N", default=list(SIZES), help="atoms, about")
     made.add_argument("--seconds", type=float, default=SECONDS, help="CPU time of a size's steps, about")
+    made.add_argument("--no-commands", action="store_true", help="only the loop")
     made.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
     return made.parse_args()
 
@@ -139,6 +207,8 @@ def main() -> None:
     if len(rows) > 1:
         result["slopes"] = {name: slope(rows, name) for name in _COLUMNS[2:] if name != "us_per_flip"}
         result["flat"] = rows[-1]["us_per_atom_step"] / rows[0]["us_per_atom_step"]
+    if not chosen.no_commands:
+        result["commands"] = commands(chosen.sizes)
     result["machine"] = machine()
     if chosen.json:
         print(json.dumps(result, indent=2))
@@ -148,19 +218,16 @@ def main() -> None:
             [f"{row['atoms']:,.0f}", *(float(row.get(name, np.nan)) for name in (*_COLUMNS[1:], "two_cores"))]
             for row in rows
         ]
-        columns = (
-            "N",
-            "steps",
-            "µs/atom/step",
-            "µs/flip",
-            "search µs/atom",
-            "peak MB",
-            "two cores (wanted >= 1.7)",
-        )
+        columns = ("N", "steps", "µs/atom/step", "µs/flip", "search µs/atom", "peak MB", "two cores")
         table("growth", columns, cells)
         print(f"\n{len(cores)} at a time: a step takes {together:.2f} of one alone")
-        if "flat" in result:
-            print(f"cost of an atom's step, largest over smallest: {result['flat']:.2f} (wanted <= 1.3)")
+        if whole := result.get("commands"):
+            cells = [[row["what"], row["steps"], row["seconds"], row["loop"], row["mb"]] for row in whole]
+            table("\n`mdnum run` from a shell", ("what", "steps", "s", "loop s", "peak MB"), cells)
+        table("\nasked", ("what", "measured", "asked", "holds"), (
+            (what, f"{measured:.3g}", asked, "yes" if holds else "no")
+            for what, measured, asked, holds in verdicts(result)
+        ))  # fmt: skip
     if len(rows) > 1:
         draw(rows, chosen.output)
 
