@@ -6,39 +6,11 @@ jax_md takes six, and `mdnum --help` needs neither.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
 
 __version__ = "0.1.0"
-
-# where each public name lives; a value without ":" is the module itself
-_HOMES = {
-    "CapacityError": "mdnum.errors:CapacityError",
-    "FolderError": "mdnum.errors:FolderError",
-    "InputError": "mdnum.errors:InputError",
-    "MdnumCalculator": "mdnum.references:MdnumCalculator",
-    "MdnumError": "mdnum.errors:MdnumError",
-    "NumericalError": "mdnum.errors:NumericalError",
-    "audit_calculator": "mdnum.verbs.audit:audit",
-    "bounce": "mdnum.verbs.ball:bounce",
-    "build": "mdnum.systems:build",
-    "conform": "mdnum.verbs.conform:conform",
-    "demonstrate": "mdnum.verbs.demos:demonstrate",
-    "diagnose": "mdnum.doctor:diagnose",
-    "flips": "mdnum.verbs.flips:flips",
-    "fork": "mdnum.verbs.fork:fork",
-    "fork_benign": "mdnum.verbs.fork:fork_benign",
-    "fork_certify": "mdnum.verbs.fork_certify:fork_certify",
-    "fork_folders": "mdnum.verbs.fork:fork_folders",
-    "fork_forecast": "mdnum.verbs.fork_map:fork_forecast",
-    "fork_map": "mdnum.verbs.fork_map:fork_map",
-    "fork_processes": "mdnum.verbs.fork_certify:fork_processes",
-    "fork_screen": "mdnum.verbs.fork:fork_screen",
-    "grad": "mdnum.verbs.grad:grad",
-    "load": "mdnum.systems:load",
-    "run": "mdnum.verbs.run:run",
-    "systems": "mdnum.systems",
-}
 
 if TYPE_CHECKING:
     from mdnum import systems as systems
@@ -51,7 +23,7 @@ if TYPE_CHECKING:
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
-    from mdnum.verbs.audit import audit as audit_calculator
+    from mdnum.verbs import audit as _audit
     from mdnum.verbs.ball import bounce as bounce
     from mdnum.verbs.conform import conform as conform
     from mdnum.verbs.demos import demonstrate as demonstrate
@@ -67,46 +39,25 @@ if TYPE_CHECKING:
     from mdnum.verbs.grad import grad as grad
     from mdnum.verbs.run import run as run
 
-__all__ = [
-    "CapacityError",
-    "FolderError",
-    "InputError",
-    "MdnumCalculator",
-    "MdnumError",
-    "NumericalError",
-    "__version__",
-    "audit_calculator",
-    "bounce",
-    "build",
-    "conform",
-    "demonstrate",
-    "diagnose",
-    "flips",
-    "fork",
-    "fork_benign",
-    "fork_certify",
-    "fork_folders",
-    "fork_forecast",
-    "fork_map",
-    "fork_processes",
-    "fork_screen",
-    "grad",
-    "load",
-    "run",
-    "systems",
-]
+    audit_calculator = _audit.audit
 
-
-def __getattr__(name: str) -> Any:
-    home = _HOMES.get(name)
-    if home is None:
-        raise AttributeError(f"module 'mdnum' has no attribute {name!r}")
-    module_name, _, attribute = home.partition(":")
-    module = importlib.import_module(module_name)
-    value = getattr(module, attribute) if attribute else module
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = on_first_use(
+    __name__,
+    {
+        "doctor": "diagnose",
+        "errors": "CapacityError FolderError InputError MdnumError NumericalError",
+        "references": "MdnumCalculator",
+        "systems": "build load systems",
+        "verbs.audit": "audit_calculator=audit",
+        "verbs.ball": "bounce",
+        "verbs.conform": "conform",
+        "verbs.demos": "demonstrate",
+        "verbs.flips": "flips",
+        "verbs.fork": "fork fork_benign fork_folders fork_screen",
+        "verbs.fork_certify": "fork_certify fork_processes",
+        "verbs.fork_map": "fork_forecast fork_map",
+        "verbs.grad": "grad",
+        "verbs.run": "run",
+    },
+)
+__all__ += ["__version__"]

@@ -57,7 +57,6 @@ class Program(Protocol):
         """Run this program (A) and another (B) side by side.
 
         Args:
-            last: last step.
             forward: whether to run B under A's decisions too, "B|A".
             back: whether to run A under B's decisions too, "A|B".
             guard: length; a run ends when an imposed decision is further than this from its threshold: it
@@ -108,64 +107,50 @@ class Program(Protocol):
 
         Args:
             steps: of their runs.
-            key: of the number.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Twin:
-    """Two programs that differ in one numerical choice.
+    """Two programs that differ in one numerical choice."""
 
-    Attributes:
-        a, b: the programs.
-        difference: what differs, one line.
-        changes: keys of the system file whose values differ, with both values.
-    """
-
+    # a, b: the programs
     a: Any
     b: Any
-    difference: str
+    difference: str  # what differs, one line
+    # keys of the system file whose values differ, with both values
     changes: Mapping[str, list[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PairRows:
-    """Some steps of two runs side by side.
+    """Some steps of two runs side by side."""
 
-    Attributes:
-        first: step of the first row.
-        separation: largest distance between the runs, length, of "B" and "B|A" from A, of "A|B" from B, and
-            the other way around, "A|B from A" and "B|A from B"; shape (rows,), NaN where a run has ended.
-        bits: whether any bit of the state of A and B differs, shape (rows,).
-        energy: by run, shape (rows,).
-        cross: decisions in which A and B differ, shape (rows,).
-        flips: cross-run flips of these steps, in order; each has a `step`.
-        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,); floats where
-            rows after the end of a run are NaN.
-        furthest: by counterfactual: distance of the furthest of them from its threshold, length.
-        nearest: of A and B, distance of the decision nearest to its threshold from it, length, shape (rows,).
-        bound: of A and B, how far rounding can move what is compared, length, shape (rows,).
-        ambiguous: of A and B, decisions that rounding could have changed, shape (rows,).
-        doubts: which ones they are: a tuple of columns, the first of them the step.
-        failed: by run, "blow-up" or "runaway" where it ended that way, else "".
-        runs: whole runs by name, where a world keeps them.
-    """
-
-    first: int
+    first: int  # step of the first row
+    # largest distance between the runs, length, of "B" and "B|A" from A, of "A|B" from B, and the other way
+    # around, "A|B from A" and "B|A from B"; shape (rows,), NaN where a run has ended
     separation: dict[str, Float[np.ndarray, "rows"]]
-    bits: Bool[np.ndarray, "rows"]
-    energy: dict[str, Float[np.ndarray, "rows"]]
-    cross: Int[np.ndarray, "rows"]
-    flips: Sequence[Any]
+    bits: Bool[np.ndarray, "rows"]  # whether any bit of the state of A and B differs, shape (rows,)
+    energy: dict[str, Float[np.ndarray, "rows"]]  # by run, shape (rows,)
+    cross: Int[np.ndarray, "rows"]  # decisions in which A and B differ, shape (rows,)
+    flips: Sequence[Any]  # cross-run flips of these steps, in order; each has a `step`
+    # by counterfactual: decisions it would have made otherwise, shape (rows,); floats where rows after the
+    # end of a run are NaN
     overridden: dict[str, Real[np.ndarray, "rows"]] = field(default_factory=dict)
+    # by counterfactual: distance of the furthest of them from its threshold, length
     furthest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    # of A and B, distance of the decision nearest to its threshold from it, length, shape (rows,)
     nearest: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    # of A and B, how far rounding can move what is compared, length, shape (rows,)
     bound: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    # of A and B, decisions that rounding could have changed, shape (rows,)
     ambiguous: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
+    # which ones they are: a tuple of columns, the first of them the step
     doubts: dict[str, Any] = field(default_factory=dict)
+    # by run, "blow-up" or "runaway" where it ended that way, else ""
     failed: dict[str, str] = field(default_factory=dict)
-    runs: dict[str, Any] = field(default_factory=dict)
+    runs: dict[str, Any] = field(default_factory=dict)  # whole runs by name, where a world keeps them
 
     @property
     def rows(self) -> int:
@@ -196,32 +181,24 @@ class PairRows:
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision at a fork.
+    """The decision at a fork."""
 
-    Attributes:
-        channel: "pair", "contact" or "stop".
-        step: of the fork.
-        subject: labels of the atoms of a pair, or of the ball; empty where one decision is the whole batch's.
-        run: the run that made the decision, "A" or "B": in which the pair flipped, the ball touches, the
-            solver stops first; "start" where the runs differ from the start on.
-        entered: whether the pair entered its cutoff in that run; True for a contact and a stop.
-        a, b: what each run decided: 0 or 1, or a number of iterations.
-        margins, bounds: by run, in the quantity's space; NaN where a run made no such decision.
-        separation: of the runs at the step before, length.
-        also: further decisions that differ at this step.
-    """
-
-    channel: str
-    step: int
+    channel: str  # "pair", "contact" or "stop"
+    step: int  # of the fork
+    # labels of the atoms of a pair, or of the ball; empty where one decision is the whole batch's
     subject: tuple[int, ...]
+    # the run that made the decision, "A" or "B": in which the pair flipped, the ball touches, the solver
+    # stops first; "start" where the runs differ from the start on
     run: str
-    entered: bool
+    entered: bool  # whether the pair entered its cutoff in that run; True for a contact and a stop
+    # a, b: what each run decided: 0 or 1, or a number of iterations
     a: int
     b: int
+    # margins, bounds: by run, in the quantity's space; NaN where a run made no such decision
     margins: Mapping[str, float]
     bounds: Mapping[str, float]
-    separation: float
-    also: int
+    separation: float  # of the runs at the step before, length
+    also: int  # further decisions that differ at this step
 
     @property
     def margin(self) -> float:
@@ -246,48 +223,31 @@ class Decision:
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a system that can be varied.
+    """One number of a system that can be varied."""
 
-    Attributes:
-        key: as system files have it where they do.
-        value: what the system says, in the units of its file; None where a batch has several.
-        unit: of it; empty for a pure number and where it is not known.
-        at: the program at another value, which is not compiled again.
-        positive: whether only values above 0 make sense.
-        zero: whether 0 does too.
-        dtype: of the floats that the number can have.
-    """
-
-    key: str
-    value: float | None
-    unit: str
-    at: Callable[[float], Any]
-    positive: bool
-    zero: bool = False
-    dtype: Any = np.float64
+    key: str  # as system files have it where they do
+    value: float | None  # what the system says, in the units of its file; None where a batch has several
+    unit: str  # of it; empty for a pure number and where it is not known
+    at: Callable[[float], Any]  # the program at another value, which is not compiled again
+    positive: bool  # whether only values above 0 make sense
+    zero: bool = False  # whether 0 does too
+    dtype: Any = np.float64  # of the floats that the number can have
 
 
 @dataclass(frozen=True)
 class DecisionHistory:
-    """What a run decided, step by step, and where it ended.
+    """What a run decided, step by step, and where it ended."""
 
-    Attributes:
-        marks: of each step, a number that any other decisions of that step have different (up to collisions
-            of 64 bits); shorter where the run failed, shape (rows,).
-        digest: all decisions in one word of 32 hexadecimal digits.
-        x: at the last step, unwrapped, length, shape (atoms, 3) or (balls,).
-        loss, energy: at the last step; NaN where the run failed.
-        failed: "blow-up" or "runaway" where it ended that way, else "".
-        first: step of the first row.
-    """
-
+    # of each step, a number that any other decisions of that step have different (up to collisions of 64
+    # bits); shorter where the run failed, shape (rows,)
     marks: UInt64[np.ndarray, "rows"]
-    digest: str
-    x: Float[np.ndarray, "..."]
+    digest: str  # all decisions in one word of 32 hexadecimal digits
+    x: Float[np.ndarray, "..."]  # at the last step, unwrapped, length, shape (atoms, 3) or (balls,)
+    # loss, energy: at the last step; NaN where the run failed
     loss: float
     energy: float
-    failed: str
-    first: int = 0
+    failed: str  # "blow-up" or "runaway" where it ended that way, else ""
+    first: int = 0  # step of the first row
 
     def first_difference(self, other: DecisionHistory) -> int | None:
         """The first step at which two runs decide differently; None where they decide alike."""
@@ -300,13 +260,10 @@ class DecisionHistory:
 
 @dataclass(frozen=True)
 class Differing:
-    """The decisions in which two programs with neighboring numbers differ at one step, the nearest first.
+    """The decisions in which two programs with neighboring numbers differ at one step, the nearest first."""
 
-    Attributes:
-        decision: the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of
-            the two programs.
-        gradients: of the loss along the number on both sides, decisions held; empty where none is taken.
-    """
-
+    # the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of the two
+    # programs
     decision: Decision
+    # of the loss along the number on both sides, decisions held; empty where none is taken
     gradients: tuple[float, ...] = ()

@@ -55,9 +55,6 @@ _NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants", "fork"
 def collect(system: _System) -> dict[str, Any]:
     """Everything outside the system file that a run depends on, and hashes of what is inside.
 
-    Args:
-        system: the system as loaded.
-
     Returns:
         A mapping of plain values, ready for JSON.
     """

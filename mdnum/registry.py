@@ -53,20 +53,14 @@ def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ..
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Values by name, in the order in which they were added, then those of other packages.
+    """Values by name, in the order in which they were added, then those of other packages."""
 
-    Attributes:
-        noun: what one of them is called, for messages.
-        group: entry points by which other packages add theirs.
-        kind: class that a value is an instance or a subclass of; functions are taken at their word.
-        separator: between a name and its argument.
-        check: called with a value of another package when it is loaded; raises where it is not what it says.
-    """
-
-    noun: str
-    group: str
+    noun: str  # what one of them is called, for messages
+    group: str  # entry points by which other packages add theirs
+    # class that a value is an instance or a subclass of; functions are taken at their word
     kind: type | None = None
-    separator: str = "="
+    separator: str = "="  # between a name and its argument
+    # called with a value of another package when it is loaded; raises where it is not what it says
     check: Callable[[Any], None] | None = None
     _own: dict[str, Any] = field(default_factory=dict, repr=False)
     _descriptions: dict[str, str] = field(default_factory=dict, repr=False)

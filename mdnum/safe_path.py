@@ -23,11 +23,7 @@ def python(*words: str) -> list[str]:
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """The environment of a child, in which it finds mdnum where this process found it.
-
-    Args:
-        changes: variables of the child.
-    """
+    """The environment of a child, in which it finds mdnum where this process found it."""
     home = Path(__file__).resolve().parents[1]
     if home.name in ("site-packages", "dist-packages"):
         return {**os.environ, **changes}

@@ -325,7 +325,6 @@ class CalculatorSubject:
         otherwise than a new one does, what it has seen since may be why.
 
         Args:
-            atoms: as they were asked about.
             energy: that was answered, eV; at least one of both.
             forces: that were answered, eV/Å.
 

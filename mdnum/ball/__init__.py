@@ -8,8 +8,9 @@ without it.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
     from mdnum.ball.exact import ExactImpact, ExactPenalty
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     )
     from mdnum.ball.world import World
 
-_NAMES = {
+__getattr__, __dir__, __all__ = on_first_use(__name__, {
     "exact": "ExactImpact ExactPenalty",
     "problem": "FinalHeight MeanHeight BallProblem ResidualPenetration arrive loss_of",
     "rollout": "BallDifference BallRun first_difference simulate",
@@ -46,15 +47,4 @@ _NAMES = {
     "Projection SemiImplicitEuler",
     "stopping": "FixedCount GlobalSum HysteresisStop Maximum PerInstance Reason Relative",
     "world": "World",
-}
-_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOMES)
+})  # fmt: skip

@@ -36,14 +36,10 @@ _MOST = 100_000
 
 @dataclass(frozen=True)
 class Known:
-    """A quantity known in closed form, with its derivative with respect to every parameter.
+    """A quantity known in closed form, with its derivative with respect to every parameter."""
 
-    Attributes:
-        value: shape of what was asked for (times or impact numbers).
-        gradient: derivative by name of the parameter, each of that shape.
-    """
-
-    value: Float[np.ndarray, "..."]
+    value: Float[np.ndarray, "..."]  # shape of what was asked for (times or impact numbers)
+    # derivative by name of the parameter, each of that shape
     gradient: Mapping[str, Float[np.ndarray, "..."]]
 
 
@@ -124,12 +120,6 @@ class ExactImpact(_Motion):
 
     Impacts are numbered from 1. At the time of an impact the state is the one after it.
 
-    Attributes:
-        y0: height at the start, m, at least 0.
-        v0: velocity at the start, m/s, upwards.
-        gravity: m/s², positive, acts downwards.
-        restitution: speed after an impact over the speed before it, 0 to 1.
-
     Raises:
         InputError: a parameter out of range, or a ball that starts at rest on the floor.
 
@@ -138,10 +128,10 @@ class ExactImpact(_Motion):
     height and velocity within that of the motion at a time some ulps earlier or later.
     """
 
-    y0: float
-    v0: float = 0.0
-    gravity: float = 9.81
-    restitution: float = 0.8
+    y0: float  # height at the start, m, at least 0
+    v0: float = 0.0  # velocity at the start, m/s, upwards
+    gravity: float = 9.81  # m/s², positive, acts downwards
+    restitution: float = 0.8  # speed after an impact over the speed before it, 0 to 1
 
     NAMES = ("y0", "v0", "gravity", "restitution")
 
@@ -229,24 +219,17 @@ class ExactPenalty(_Motion):
     lowest point and the first crest after it. A ball whose crest stays below the floor has come to rest in
     it, g / k deep.
 
-    Attributes:
-        y0: height at the start, m, at least 0.
-        v0: velocity at the start, m/s, upwards.
-        gravity: m/s², positive, acts downwards.
-        k: stiffness per mass, 1/s².
-        damping: per mass, 1/s; not the critical 2 sqrt(k) exactly.
-
     Raises:
         InputError: a parameter out of range, or a ball that starts at rest on the floor.
 
     Error: some ten ulps per contact, in values and in derivatives.
     """
 
-    y0: float
-    v0: float = 0.0
-    gravity: float = 9.81
-    k: float = 1e4
-    damping: float = 0.0
+    y0: float  # height at the start, m, at least 0
+    v0: float = 0.0  # velocity at the start, m/s, upwards
+    gravity: float = 9.81  # m/s², positive, acts downwards
+    k: float = 1e4  # stiffness per mass, 1/s²
+    damping: float = 0.0  # per mass, 1/s; not the critical 2 sqrt(k) exactly
 
     NAMES = ("y0", "v0", "gravity", "k", "damping")
 

@@ -63,13 +63,9 @@ class MeanHeight(eqx.Module):
 
 
 class ResidualPenetration(eqx.Module):
-    """What the contact model leaves of the penetration, summed over steps, averaged over balls.
+    """What the contact model leaves of the penetration, summed over steps, averaged over balls."""
 
-    Attributes:
-        power: 2 for squares, m²; 1 for the penetration itself, m.
-    """
-
-    power: int = eqx.field(static=True, default=2)
+    power: int = eqx.field(static=True, default=2)  # 2 for squares, m²; 1 for the penetration itself, m
 
     def step(self, state, record, dtype):
         """The mean of |p|^power over the batch."""
@@ -83,21 +79,13 @@ class ResidualPenetration(eqx.Module):
 
 @dataclass(frozen=True)
 class BallProblem:
-    """A world, a start, a number of steps and a loss.
+    """A world, a start, a number of steps and a loss."""
 
-    Attributes:
-        world: the program.
-        y0: heights at the start, m, a number or shape (balls,).
-        v0: velocities at the start, m/s, a number or shape (balls,).
-        steps: steps to make.
-        loss: of the rollout.
-    """
-
-    world: World
-    y0: Any
-    v0: Any = 0.0
-    steps: int = 100
-    loss: BallLoss = field(default_factory=FinalHeight)
+    world: World  # the program
+    y0: Any  # heights at the start, m, a number or shape (balls,)
+    v0: Any = 0.0  # velocities at the start, m/s, a number or shape (balls,)
+    steps: int = 100  # steps to make
+    loss: BallLoss = field(default_factory=FinalHeight)  # of the rollout
 
     def with_values(self, values: Mapping[str, Any]) -> BallProblem:
         """The same problem with other values of named parameters, start values included."""

@@ -28,34 +28,22 @@ _UNITS = {"y0": "m", "v0": "m/s", "h": "s", "tol": "m", "gravity": "m/s²", "k":
 
 @dataclass(frozen=True)
 class ImposedDecision:
-    """One decision that is imposed on a run, which makes all others by itself.
-
-    Attributes:
-        channel: "contact" or "stop".
-        step: from 1.
-        ball: whose; -1 for the count that all balls share.
-        value: whether it touches (0 or 1), or how many iterations it makes.
-    """
+    """One decision that is imposed on a run, which makes all others by itself."""
 
     channel: Literal["contact", "stop"]
-    step: int
-    ball: int
-    value: int
+    step: int  # from 1
+    ball: int  # whose; -1 for the count that all balls share
+    value: int  # whether it touches (0 or 1), or how many iterations it makes
 
 
 @dataclass(frozen=True)
 class BallProgram:
-    """World, start and steps of a ball, and how they are compared with another's.
+    """World, start and steps of a ball, and how they are compared with another's."""
 
-    Attributes:
-        problem: the program.
-        order: its balls are those of the other program in this order; None where they are the same.
-        pins: decisions that are imposed on it.
-    """
-
-    problem: BallProblem
+    problem: BallProblem  # the program
+    # its balls are those of the other program in this order; None where they are the same
     order: tuple[int, ...] | None = None
-    pins: tuple[ImposedDecision, ...] = ()
+    pins: tuple[ImposedDecision, ...] = ()  # decisions that are imposed on it
     _runs: dict[int, BallRun] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
@@ -114,7 +102,6 @@ class BallProgram:
         """A rollout, its balls in the order of the other program.
 
         Args:
-            steps: to make.
             decisions: imposed on the balls in that order; its own, and its pins, when None.
         """
         if decisions is None and steps in self._runs:

@@ -125,9 +125,7 @@ def simulate(
     """Advance a batch of balls and record every decision.
 
     Args:
-        world: the program.
         start: from `world.start`.
-        steps: steps to make.
         history: keep the residual of every stop decision too.
         keep: keep every state; otherwise the first and the last, and the flips.
         imposed: decisions of every step to act on instead of the world's own, leading axis steps.
@@ -246,7 +244,6 @@ def height_bound(
     Four roundings on the way from the state before, none of which cancels more than the sum of its parts.
 
     Args:
-        world: the program.
         y, v: height (m) and velocity (m/s) of the state before.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
@@ -260,7 +257,6 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
     All terms of a residual have one sign, so the error of their sum is at most gamma times the sum.
 
     Args:
-        world: the program.
         residual: what a stop decision compares.
         terms: balls that it is a residual of; 1 where each has its own.
     """
@@ -271,25 +267,19 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
 
 
 class CrossDecision(NamedTuple):
-    """A decision that two runs made differently.
+    """A decision that two runs made differently."""
 
-    Attributes:
-        step: from 1.
-        channel: "contact" or "stop".
-        ball: whose; -1 for a count that all balls share.
-        a, b: what each run decided: whether the ball touches, or how many iterations.
-        margin_a, margin_b: minus the height, or tolerance minus residual at the decision at which one run
-            stopped and the other did not; NaN where a run made no such decision.
-        bound_a, bound_b: on the rounding error of what was compared.
-    """
-
-    step: int
-    channel: str
-    ball: int
+    step: int  # from 1
+    channel: str  # "contact" or "stop"
+    ball: int  # whose; -1 for a count that all balls share
+    # a, b: what each run decided: whether the ball touches, or how many iterations
     a: int
     b: int
+    # margin_a, margin_b: minus the height, or tolerance minus residual at the decision at which one run
+    # stopped and the other did not; NaN where a run made no such decision
     margin_a: float
     margin_b: float
+    # bound_a, bound_b: on the rounding error of what was compared
     bound_a: float
     bound_b: float
 
@@ -301,28 +291,19 @@ class CrossDecision(NamedTuple):
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Where two rollouts of the same length diverge.
+    """Where two rollouts of the same length diverge."""
 
-    Attributes:
-        seed: first step whose state bits differ (0: the start itself); None where none do.
-        fork: first step whose decisions differ; None where none do.
-        channel: "contact" or "stop", whichever differs at the fork; "" without one.
-        ball: the first ball whose decision differs there; -1 where the decision is the batch's.
-        margins: the deciding margin in the first and in the second run (see `CrossDecision`).
-        iterations_differ: number of steps whose iteration counts differ; 0 where the runs count other things
-            (impacts, iterations of one solver or another, nothing).
-        contacts_differ: number of contact decisions that differ.
-        separation: largest |difference| of heights at each step, m, shape (steps + 1,); empty where states
-            were not kept.
-    """
-
-    seed: int | None
-    fork: int | None
-    channel: str
-    ball: int
+    seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
+    fork: int | None  # first step whose decisions differ; None where none do
+    channel: str  # "contact" or "stop", whichever differs at the fork; "" without one
+    ball: int  # the first ball whose decision differs there; -1 where the decision is the batch's
+    # the deciding margin in the first and in the second run (see `CrossDecision`)
     margins: tuple[float, float]
+    # number of steps whose iteration counts differ; 0 where the runs count other things (impacts, iterations
+    # of one solver or another, nothing)
     iterations_differ: int
-    contacts_differ: int
+    contacts_differ: int  # number of contact decisions that differ
+    # largest |difference| of heights at each step, m, shape (steps + 1,); empty where states were not kept
     separation: Float[np.ndarray, "times"]
 
 

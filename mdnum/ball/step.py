@@ -24,52 +24,37 @@ Touching = Bool[Array, "balls"]
 
 
 class BallState(NamedTuple):
-    """A batch of balls between two steps.
+    """A batch of balls between two steps."""
 
-    Attributes:
-        step: number of steps made.
-        y: heights above the floor, m, shape (balls,).
-        v: velocities, upward positive, m/s, shape (balls,).
-        a: accelerations that velocity Verlet carries from one step to the next, m/s², shape (balls,).
-        touching: the contact decision of the step before, shape (balls,); what hysteresis looks back to.
-    """
-
-    step: Int[Array, ""]
-    y: Float[Array, "balls"]
-    v: Float[Array, "balls"]
+    step: Int[Array, ""]  # number of steps made
+    y: Float[Array, "balls"]  # heights above the floor, m, shape (balls,)
+    v: Float[Array, "balls"]  # velocities, upward positive, m/s, shape (balls,)
+    # accelerations that velocity Verlet carries from one step to the next, m/s², shape (balls,)
     a: Float[Array, "balls"]
+    # the contact decision of the step before, shape (balls,); what hysteresis looks back to
     touching: Bool[Array, "balls"]
 
 
 class BallDecisions(NamedTuple):
-    """Everything that a step decides; or what is imposed on a step, in part or in whole.
+    """Everything that a step decides; or what is imposed on a step, in part or in whole."""
 
-    Attributes:
-        contact: whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1,
-            and a negative number where the step is to decide by itself.
-        iterations: iterations of the step's solver, shape () where one rule stops it for all balls,
-            (balls,) where each ball has its own; impacts located in the step for an event-located one. A
-            negative number, imposed, leaves it to the step.
-    """
-
+    # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
+    # number where the step is to decide by itself
     contact: Bool[Array, "balls"] | Int[Array, "balls"]
+    # iterations of the step's solver, shape () where one rule stops it for all balls, (balls,) where each
+    # ball has its own; impacts located in the step for an event-located one. A negative number, imposed,
+    # leaves it to the step
     iterations: Int[Array, "..."]
 
 
 class BallRecord(NamedTuple):
-    """What a step leaves.
+    """What a step leaves."""
 
-    Attributes:
-        height: what the contact decision compared with zero, m, shape (balls,).
-        contact: the decision, shape (balls,).
-        left: penetration that the contact model left, m, shape (balls,); carries derivatives.
-        solve: of the step's solver.
-    """
-
-    height: Float[Array, "balls"]
-    contact: Bool[Array, "balls"]
+    height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
+    contact: Bool[Array, "balls"]  # the decision, shape (balls,)
+    # penetration that the contact model left, m, shape (balls,); carries derivatives
     left: Float[Array, "balls"]
-    solve: Solve
+    solve: Solve  # of the step's solver
 
     @property
     def decisions(self) -> BallDecisions:
@@ -78,13 +63,9 @@ class BallRecord(NamedTuple):
 
 
 class Rounding(eqx.Module):
-    """Rounds a product (or anything) before it is used: the fence, with the zero it needs.
+    """Rounds a product (or anything) before it is used: the fence, with the zero it needs."""
 
-    Attributes:
-        zero: an integer zero that the compiler must not know (see mdnum.numerics.exact).
-    """
-
-    zero: Int[Array, ""]
+    zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
     def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """x, rounded here."""
@@ -92,30 +73,23 @@ class Rounding(eqx.Module):
 
 
 class Motion(NamedTuple):
-    """What a contact model is given for one step.
+    """What a contact model is given for one step."""
 
-    Attributes:
-        y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
-            arithmetic.
-        free: acceleration without contact (control minus gravity), shape (balls,).
-        touching: the contact decision of the step before.
-        judge: the contact decision at a height: the world's own, or what was imposed.
-        imposed: iterations that are imposed, or None.
-        integrator, policy, rounding: of the world.
-        history: whether solvers keep the residual of every decision.
-    """
-
+    # y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
+    # arithmetic
     y: Balls
     v: Balls
     carried: Balls
-    free: Balls
-    touching: Touching
+    free: Balls  # acceleration without contact (control minus gravity), shape (balls,)
+    touching: Touching  # the contact decision of the step before
+    # the contact decision at a height: the world's own, or what was imposed
     judge: Callable[[Balls], Touching]
-    imposed: Int[Array, "..."] | None
+    imposed: Int[Array, "..."] | None  # iterations that are imposed, or None
+    # integrator, policy, rounding: of the world
     integrator: Scheme
     policy: RolePrecision
     rounding: Rounding
-    history: bool
+    history: bool  # whether solvers keep the residual of every decision
 
 
 class Moved(NamedTuple):
@@ -135,13 +109,9 @@ Pull = Callable[[Balls, Balls, Touching], Balls]
 
 
 class Scheme(Protocol):
-    """The contract of a scheme.
+    """The contract of a scheme."""
 
-    Attributes:
-        h: time step, s.
-    """
-
-    h: Any
+    h: Any  # time step, s
 
     def fly(self, y: Balls, v: Balls, a: Balls, r: Rounding) -> tuple[Balls, Balls]:
         """One step under a constant acceleration."""
@@ -210,13 +180,10 @@ class ImplicitMidpoint(eqx.Module):
     """The acceleration of the middle of the step, found by Newton's method. Order 2, stable at any step.
 
     The derivative is the implicit one: of the equation that the solve ends at, not of its iterations.
-
-    Attributes:
-        h: time step, s.
-        stop: when the solve ends; its residual is h times the error in the acceleration, m/s.
     """
 
-    h: Any
+    h: Any  # time step, s
+    # when the solve ends; its residual is h times the error in the acceleration, m/s
     stop: StopRule = Maximum(1e-12, 50)
 
     def fly(self, y, v, a, r):
@@ -274,15 +241,10 @@ class ImplicitMidpoint(eqx.Module):
 
 
 class EventLocated(eqx.Module):
-    """Flight along the exact parabola, with every impact located inside the step. For impacts only.
+    """Flight along the exact parabola, with every impact located inside the step. For impacts only."""
 
-    Attributes:
-        h: time step, s; the trajectory does not depend on it, only where it is looked at.
-        max_impacts: the cap on impacts inside one step.
-    """
-
-    h: Any
-    max_impacts: int = eqx.field(static=True, default=200)
+    h: Any  # time step, s; the trajectory does not depend on it, only where it is looked at
+    max_impacts: int = eqx.field(static=True, default=200)  # the cap on impacts inside one step
 
     def fly(self, y, v, a, r):
         drift = r(self.h * r(v + r(r(0.5 * self.h) * a)))
@@ -321,19 +283,14 @@ class Penalty(eqx.Module):
     A step on which a contact is imposed pushes with -k y whatever the sign of y: the branch continues
     smoothly beyond its threshold, as a pair force beyond its cutoff does when it is imposed.
 
-    Attributes:
-        k: stiffness per mass, 1/s².
-        damping: per mass, 1/s; the force may pull while the ball leaves.
-        eps: width of the softplus, m, where `smooth`.
-        smooth: p = eps softplus(-y/eps) for every height; the decision is recorded and not acted on, except
-            by the damping.
-
     Source: the soft contact of the discrete element method (Cundall and Strack 1979).
     """
 
-    k: Any
-    damping: Any = 0.0
-    eps: Any = 0.0
+    k: Any  # stiffness per mass, 1/s²
+    damping: Any = 0.0  # per mass, 1/s; the force may pull while the ball leaves
+    eps: Any = 0.0  # width of the softplus, m, where `smooth`
+    # p = eps softplus(-y/eps) for every height; the decision is recorded and not acted on, except by the
+    # damping
     smooth: bool = eqx.field(static=True, default=False)
 
     def depth(self, y, contact):
@@ -364,20 +321,14 @@ class Projection(_Forceless):
     Each iteration leaves 1 - alpha k of the penetration, so tol is reached after
     ceil(log(tol / p0) / log(1 - alpha k)) iterations; alpha k in (1, 2) overshoots, at 2 it never ends.
     The floor is at 0 whatever k is: where the iterations end depends on k only through what they leave.
-
-    Attributes:
-        k: gain, dimensionless; what is learned in place of a stiffness.
-        alpha: relaxation, dimensionless.
-        restitution: speed after over speed before; the velocity is reset at the end of the step.
-        stop: when the iteration stops.
-        derivative: None for the derivative of the iterations that ran; else an object whose
-            `attach(y, gain, contact)` gives the result another one.
     """
 
-    k: Any
-    alpha: Any
-    stop: StopRule
-    restitution: Any = 0.8
+    k: Any  # gain, dimensionless; what is learned in place of a stiffness
+    alpha: Any  # relaxation, dimensionless
+    stop: StopRule  # when the iteration stops
+    restitution: Any = 0.8  # speed after over speed before; the velocity is reset at the end of the step
+    # None for the derivative of the iterations that ran; else an object whose `attach(y, gain, contact)`
+    # gives the result another one
     derivative: Any = None
 
     def move(self, motion: Motion) -> Moved:
@@ -422,14 +373,11 @@ class Impact(_Forceless):
     With an event-located step the impact happens at its exact time, and the rest of the step flies on from
     there; with any other scheme the ball is put on the floor and reset at the end of the step in which it
     passed the floor, an error of order h in its state and of order 1 in its derivative.
-
-    Attributes:
-        restitution: speed after over speed before.
-        rest_speed: a rebound at or below this speed, m/s, ends the bouncing (a ball that loses a share of
-            its speed bounces infinitely often in a finite time).
     """
 
-    restitution: Any = 0.8
+    restitution: Any = 0.8  # speed after over speed before
+    # a rebound at or below this speed, m/s, ends the bouncing (a ball that loses a share of its speed bounces
+    # infinitely often in a finite time)
     rest_speed: Any = 1e-6
 
     def move(self, motion: Motion) -> Moved:

@@ -44,34 +44,24 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """The record of one iterative solve; shape () where one rule stops all balls, else (balls,).
+    """The record of one iterative solve; shape () where one rule stops all balls, else (balls,)."""
 
-    Attributes:
-        iterations: how often it went on.
-        reason: a `Reason`.
-        residual: the residual at the last decision.
-        margin: threshold minus residual there: positive where the residual was low enough to stop.
-        before: the margin of the decision before, which was to go on; -inf where there was none.
-        history: residual at every decision, NaN where none was made, shape (max_iter + 1,), or (0,) unless
-            it was asked for; the largest over the balls where each ball has its own.
-    """
-
-    iterations: Int[Array, "..."]
-    reason: Int[Array, "..."]
-    residual: Float[Array, "..."]
+    iterations: Int[Array, "..."]  # how often it went on
+    reason: Int[Array, "..."]  # a `Reason`
+    residual: Float[Array, "..."]  # the residual at the last decision
+    # threshold minus residual there: positive where the residual was low enough to stop
     margin: Float[Array, "..."]
+    # the margin of the decision before, which was to go on; -inf where there was none
     before: Float[Array, "..."]
+    # residual at every decision, NaN where none was made, shape (max_iter + 1,), or (0,) unless it was asked
+    # for; the largest over the balls where each ball has its own
     history: Float[Array, "decisions"]
 
 
 class StopRule(Protocol):
-    """The contract of a stopping rule.
+    """The contract of a stopping rule."""
 
-    Attributes:
-        max_iter: the cap: the solver gives up after so many iterations.
-    """
-
-    max_iter: int
+    max_iter: int  # the cap: the solver gives up after so many iterations
 
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
@@ -90,15 +80,10 @@ def stops(threshold: Float[Array, "..."], residual: Float[Array, "..."]) -> Bool
 
 
 class _ToleranceRule(eqx.Module):
-    """A rule with one tolerance.
+    """A rule with one tolerance."""
 
-    Attributes:
-        tol: the solver stops when the residual is below; the unit of the residual.
-        max_iter: the cap.
-    """
-
-    tol: Any
-    max_iter: int = eqx.field(static=True, default=100)
+    tol: Any  # the solver stops when the residual is below; the unit of the residual
+    max_iter: int = eqx.field(static=True, default=100)  # the cap
 
     def threshold(self, first, iteration):
         return jnp.broadcast_to(jnp.asarray(self.tol).astype(first.dtype), first.shape)
@@ -139,15 +124,10 @@ class Relative(GlobalSum):
 
 
 class HysteresisStop(eqx.Module):
-    """A rule with a gap: the solver starts only above one threshold, and then runs to below another.
+    """A rule with a gap: the solver starts only above one threshold, and then runs to below another."""
 
-    Attributes:
-        rule: says what the residual is, and where a solver that has started stops.
-        enter: a residual below this starts no solve; at least the rule's tolerance.
-    """
-
-    rule: _ToleranceRule
-    enter: Any
+    rule: _ToleranceRule  # says what the residual is, and where a solver that has started stops
+    enter: Any  # a residual below this starts no solve; at least the rule's tolerance
 
     @property
     def max_iter(self) -> int:
@@ -164,13 +144,9 @@ class HysteresisStop(eqx.Module):
 
 
 class FixedCount(eqx.Module):
-    """A fixed number of iterations, whatever the residual: no decision, and none that could flip.
+    """A fixed number of iterations, whatever the residual: no decision, and none that could flip."""
 
-    Attributes:
-        count: iterations; also the cap.
-    """
-
-    count: int = eqx.field(static=True, default=10)
+    count: int = eqx.field(static=True, default=10)  # iterations; also the cap
 
     @property
     def max_iter(self) -> int:

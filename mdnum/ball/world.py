@@ -192,7 +192,6 @@ class World(eqx.Module):
         """Decide and act.
 
         Args:
-            state: at this step.
             imposed: decisions to act on instead of its own, or instead of some of them (see `BallDecisions`).
             history: whether a solver keeps the residual of every decision.
 

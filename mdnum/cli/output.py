@@ -196,14 +196,6 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
         )
 
 
-def print_notes(*folders: str | Path) -> None:
-    """A line on stderr for each file of a folder that is not as it was written."""
-    from mdnum.store import RunFolder
-
-    for folder in dict.fromkeys(map(Path, folders)):
-        print_lines(RunFolder.open(folder).noted())
-
-
 def print_lines(lines: Iterable[str]) -> None:
     """Lines on stderr that say who speaks."""
     for line in lines:

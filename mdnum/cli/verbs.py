@@ -361,10 +361,11 @@ def report(
     folder: Path = typer.Argument(metavar="DIR", help="A run folder."), as_json: bool = output.JSON_OPTION
 ) -> int:
     """Write the report of a run folder again."""
+    from mdnum.store import RunFolder
     from mdnum.verbs import frame
 
     written = frame.finish(folder).folder / "report.html"
-    output.print_notes(folder)
+    output.print_lines(RunFolder.open(folder).noted())
     return output.print_document({"folder": folder, "report": written}, f"wrote {written}", as_json)
 
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import comb
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.special import betaincinv
 
 from mdnum.errors import InputError
 from mdnum.forks.ensemble import (
@@ -72,18 +72,13 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class Space:
-    """The principal components of an ensemble.
+    """The principal components of an ensemble."""
 
-    Attributes:
-        mean, spread: of each feature over the ensemble; infinite spread leaves a feature out.
-        axes: components as rows, in standardized features.
-        sigma: standard deviation of the ensemble along each component.
-    """
-
+    # mean, spread: of each feature over the ensemble; infinite spread leaves a feature out
     mean: Float[np.ndarray, "features"]
     spread: Float[np.ndarray, "features"]
-    axes: Float[np.ndarray, "components features"]
-    sigma: Float[np.ndarray, "components"]
+    axes: Float[np.ndarray, "components features"]  # components as rows, in standardized features
+    sigma: Float[np.ndarray, "components"]  # standard deviation of the ensemble along each component
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
@@ -145,21 +140,9 @@ def two_of_three(rate: float) -> float:
 def bounds(count: int, of: int, level: float = 0.95) -> tuple[float, float]:
     """The exact (Clopper-Pearson) interval of a rate of which `count` of `of` were seen."""
     tail = (1 - level) / 2
-    low = 0.0 if count == 0 else _solve(lambda p: 1 - _at_most(count - 1, of, p), tail)
-    high = 1.0 if count == of else _solve(lambda p: -_at_most(count, of, p), -tail)
-    return low, high
-
-
-def _at_most(count: int, of: int, p: float) -> float:
-    return sum(comb(of, k) * p**k * (1 - p) ** (of - k) for k in range(count + 1))
-
-
-def _solve(rising, value: float) -> float:
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if rising(middle) < value else (low, middle)
-    return (low + high) / 2
+    low = betaincinv(count, of - count + 1, tail) if count else 0.0
+    high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
+    return float(low), float(high)
 
 
 # --- calibration ----------------------------------------------------------------------------------------
@@ -167,20 +150,14 @@ def _solve(rising, value: float) -> float:
 
 @dataclass(frozen=True)
 class Planted:
-    """What the rule said of a planted change.
+    """What the rule said of a planted change."""
 
-    Attributes:
-        change: what it is.
-        must_fail: whether it is another model; else only other rounding.
-        failures, tries: verdicts "fail" of all, each from three runs of their own.
-        scores: what each verdict compared with 1: the second largest component, in limits.
-    """
-
-    change: str
-    must_fail: bool
+    change: str  # what it is
+    must_fail: bool  # whether it is another model; else only other rounding
+    # failures, tries: verdicts "fail" of all, each from three runs of their own
     failures: int
     tries: int
-    scores: tuple[float, ...]
+    scores: tuple[float, ...]  # what each verdict compared with 1: the second largest component, in limits
 
     @property
     def ok(self) -> bool:
@@ -192,19 +169,12 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """One step at which runs could be compared.
+    """One step at which runs could be compared."""
 
-    Attributes:
-        step: of the comparison.
-        space: components of the ensemble.
-        limit: standard deviations beyond which a component stands out.
-        table: what the rule said of each planted change.
-    """
-
-    step: int
-    space: Space
-    limit: float
-    table: tuple[Planted, ...]
+    step: int  # of the comparison
+    space: Space  # components of the ensemble
+    limit: float  # standard deviations beyond which a component stands out
+    table: tuple[Planted, ...]  # what the rule said of each planted change
 
     @property
     def power(self) -> float:
@@ -219,21 +189,14 @@ class Window:
 
 @dataclass(frozen=True)
 class Calibration:
-    """An ensemble that runs can be compared with.
+    """An ensemble that runs can be compared with."""
 
-    Attributes:
-        nodes: of the pair histogram that features are measured on.
-        window: the one that was chosen.
-        held_out: runs of the same program that the ensemble does not hold. alone: those that stood out.
-        triples: tries of three of them each. false_positives: those that failed.
-    """
-
-    nodes: Float[np.ndarray, "nodes"]
-    window: Window
-    held_out: int
-    alone: int
-    triples: int
-    false_positives: int
+    nodes: Float[np.ndarray, "nodes"]  # of the pair histogram that features are measured on
+    window: Window  # the one that was chosen
+    held_out: int  # runs of the same program that the ensemble does not hold
+    alone: int  # those that stood out
+    triples: int  # tries of three of them each
+    false_positives: int  # those that failed
 
     @property
     def rate(self) -> float:
@@ -358,33 +321,26 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @dataclass(frozen=True)
 class Benign:
-    """Whether B's runs belong to A's ensemble.
+    """Whether B's runs belong to A's ensemble."""
 
-    Attributes:
-        passed: whether they do.
-        window: step of the comparison.
-        components, limit: principal components that were compared, and standard deviations beyond which one
-            stands out.
-        scores: components of B's runs, in standard deviations of A's ensemble, shape (runs, components);
-            not a number for a run that blew up.
-        failing: features that give B away, by name, with the median over B's runs of their distance from A's
-            mean, in standard deviations of A's ensemble; the ones that matter most come first.
-        calibration: what the rule said of each planted change.
-        false_positive_rate, false_positive_bounds: verdicts "fail" on A itself, expected from runs that were
-            held out, and the exact 95 % interval; not a number where none were.
-        false_positives: verdicts "fail" that were counted, and of how many.
-    """
-
-    passed: bool
-    window: int
+    passed: bool  # whether they do
+    window: int  # step of the comparison
+    # components, limit: principal components that were compared, and standard deviations beyond which one
+    # stands out
     components: int
     limit: float
+    # components of B's runs, in standard deviations of A's ensemble, shape (runs, components); not a number
+    # for a run that blew up
     scores: Float[np.ndarray, "runs components"]
+    # features that give B away, by name, with the median over B's runs of their distance from A's mean, in
+    # standard deviations of A's ensemble; the ones that matter most come first
     failing: dict[str, float]
-    calibration: tuple[Planted, ...]
+    calibration: tuple[Planted, ...]  # what the rule said of each planted change
+    # false_positive_rate, false_positive_bounds: verdicts "fail" on A itself, expected from runs that were
+    # held out, and the exact 95 % interval; not a number where none were
     false_positive_rate: float
     false_positive_bounds: tuple[float, float]
-    false_positives: tuple[int, int]
+    false_positives: tuple[int, int]  # verdicts "fail" that were counted, and of how many
 
 
 def benign(

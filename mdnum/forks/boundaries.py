@@ -30,49 +30,33 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """A run on one side of a boundary.
+    """A run on one side of a boundary."""
 
-    Attributes:
-        at: the number, as the float next to the boundary.
-        digest: of its decisions.
-        loss, energy: at its last step; a ball's energy is not kept.
-        gradient: of the loss along the number, decisions held; NaN of molecular dynamics.
-        margin: of the decision that changes, in the quantity's space.
-        decided: that decision: 0 or 1, or a number of iterations.
-    """
-
-    at: float
-    digest: str
+    at: float  # the number, as the float next to the boundary
+    digest: str  # of its decisions
+    # loss, energy: at its last step; a ball's energy is not kept
     loss: float
     energy: float
-    gradient: float
-    margin: float
-    decided: int
+    gradient: float  # of the loss along the number, decisions held; NaN of molecular dynamics
+    margin: float  # of the decision that changes, in the quantity's space
+    decided: int  # that decision: 0 or 1, or a number of iterations
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats with different histories, and the decision that makes the difference.
+    """Two adjacent floats with different histories, and the decision that makes the difference."""
 
-    Attributes:
-        below, above: the two sides; above.at is the float after below.at.
-        channel: of the first decision that differs: "pair", "contact" or "stop".
-        step: of it.
-        subject: labels of its pair, or of its ball; empty where one decision is the whole batch's.
-        bound: on the rounding error of its margin.
-        also: further decisions that differ first at this step.
-        separation: largest distance between the two final states, length.
-        confirmed: whether a fresh process found the same history on either side; None where none was asked.
-    """
-
+    # below, above: the two sides; above.at is the float after below.at
     below: Side
     above: Side
-    channel: str
-    step: int
+    channel: str  # of the first decision that differs: "pair", "contact" or "stop"
+    step: int  # of it
+    # labels of its pair, or of its ball; empty where one decision is the whole batch's
     subject: tuple[int, ...]
-    bound: float
-    also: int
-    separation: float
+    bound: float  # on the rounding error of its margin
+    also: int  # further decisions that differ first at this step
+    separation: float  # largest distance between the two final states, length
+    # whether a fresh process found the same history on either side; None where none was asked
     confirmed: bool | None = None
 
     @property
@@ -83,55 +67,45 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of the number on which every run made had one history.
+    """A stretch of the number on which every run made had one history."""
 
-    Attributes:
-        low, high: its ends; both were run.
-        history: a number for each distinct history of a map, in order of appearance.
-        digest: of it.
-        loss_low, loss_high: at the ends.
-        runs: how many were made here.
-        gap: the longest stretch between two of them: two boundaries closer than this may hide there. One ulp
-            where every float was run.
-    """
-
+    # low, high: its ends; both were run
     low: float
     high: float
-    history: int
-    digest: str
+    history: int  # a number for each distinct history of a map, in order of appearance
+    digest: str  # of it
+    # loss_low, loss_high: at the ends
     loss_low: float
     loss_high: float
-    runs: int
+    runs: int  # how many were made here
+    # the longest stretch between two of them: two boundaries closer than this may hide there. One ulp where
+    # every float was run
     gap: float
 
 
 @dataclass(frozen=True)
 class BoundaryMap:
-    """A run as a piecewise function of a number.
+    """A run as a piecewise function of a number."""
 
-    Attributes:
-        number, steps: that was varied, and the last step of every run.
-        low, high: the interval that was searched.
-        intervals, boundaries: with one history each and between them, in order.
-        unresolved: stretches whose ends have different histories but were not searched to the last bit, and
-            adjacent floats where a run fails on one side before anything is decided otherwise.
-        complete: whether every float of the interval was run, so that nothing can hide.
-        resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
-            cancel each other may be missed.
-        evaluations, failed: runs made to find them, and those that ended in a blow-up or a runaway.
-        at, loss, energy: of every run made, in order; at its last step.
-    """
-
+    # number, steps: that was varied, and the last step of every run
     number: Number
     steps: int
+    # low, high: the interval that was searched
     low: float
     high: float
+    # intervals, boundaries: with one history each and between them, in order
     intervals: tuple[Interval, ...]
     boundaries: tuple[Boundary, ...]
+    # stretches whose ends have different histories but were not searched to the last bit, and adjacent floats
+    # where a run fails on one side before anything is decided otherwise
     unresolved: tuple[tuple[float, float], ...]
-    complete: bool
+    complete: bool  # whether every float of the interval was run, so that nothing can hide
+    # the longest stretch between two runs of one history; a pair of boundaries within it that cancel each
+    # other may be missed
     resolution: float
+    # evaluations, failed: runs made to find them, and those that ended in a blow-up or a runaway
     evaluations: int
+    # at, loss, energy: of every run made, in order; at its last step
     at: np.ndarray
     loss: np.ndarray
     energy: np.ndarray
@@ -148,8 +122,6 @@ class NumberLine:
 
     Args:
         program: with the system's own value.
-        number: that is varied.
-        steps: last step of each run.
         loss: of the final state, as the world's `history` takes it.
     """
 
@@ -243,15 +215,8 @@ def boundaries(
     a fresh process.
 
     Args:
-        system: of either world.
-        key: the number, such as "potential.sigma" or "position.17.x"; of a ball "k", "tol", "y0".
-        low, high: the interval, in the units of the system's file; both belong to it.
-        steps: last step; default the system's own.
+        steps: last step; default the system's own. What is not named here is as for `mdnum.fork_map`.
         cells: of the grid. With at least as many as there are floats, all are run.
-        most: stop after this many boundaries; default 24, of a ball 64. What is left is unresolved.
-        loss: of the final state of molecular dynamics, called with the simulation, unwrapped positions and
-            velocities; default the mean squared displacement. That of a ball is its file's.
-        confirm: whether to run both sides of every boundary in a fresh process.
         progress: called with what is done of what there is to do, and figures: the phase, what is counted.
 
     Raises:

@@ -43,40 +43,29 @@ _ROOT_BITS = 400
 
 @dataclass(frozen=True)
 class Horizon:
-    """Decisions of one run against their own rounding.
+    """Decisions of one run against their own rounding."""
 
-    Attributes:
-        step: the last one before the first ambiguous decision; the last one followed where there is none,
-            -1 where the start is ambiguous.
-        decisions: ambiguous ones, a step's pair counted at each step.
-        steps: at which there are any.
-        complete: whether the list is certain to hold every pair; where not, the horizon is of listed pairs.
-    """
-
+    # the last one before the first ambiguous decision; the last one followed where there is none, -1 where
+    # the start is ambiguous
     step: int
-    decisions: int
-    steps: int
+    decisions: int  # ambiguous ones, a step's pair counted at each step
+    steps: int  # at which there are any
+    # whether the list is certain to hold every pair; where not, the horizon is of listed pairs
     complete: bool
 
 
 @dataclass(frozen=True)
 class Certified:
-    """The three dates of a pair of runs.
+    """The three dates of a pair of runs."""
 
-    Attributes:
-        horizon: by run, "A" and "B"; nothing for many-body potentials, which decide inside their energy
-            function, without a rounding bound.
-        protected: the last step up to which every pair was further from its cutoff than twice the separation
-            of the runs and what their cutoffs differ by; -1 where it is not so at the first step. None for
-            many-body potentials.
-        shadow: the wider of the two programs, "A" or "B"; None where neither is.
-        shadow_step: the last step up to which they decided alike; None without a shadow.
-    """
-
+    # by run, "A" and "B"; nothing for many-body potentials, which decide inside their energy function,
+    # without a rounding bound
     horizon: Mapping[str, Horizon]
+    # the last step up to which every pair was further from its cutoff than twice the separation of the runs
+    # and what their cutoffs differ by; -1 where it is not so at the first step. None for many-body potentials
     protected: int | None
-    shadow: str | None
-    shadow_step: int | None
+    shadow: str | None  # the wider of the two programs, "A" or "B"; None where neither is
+    shadow_step: int | None  # the last step up to which they decided alike; None without a shadow
 
 
 def certified(fork: Fork) -> Certified:
@@ -151,43 +140,30 @@ def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class AmbiguousDecision:
-    """A decision closer to its threshold than its rounding bound.
+    """A decision closer to its threshold than its rounding bound."""
 
-    Attributes:
-        step, i, j: which decision; i < j.
-        inside: as the program decided.
-        margin: threshold - quantity as it computed it, in the quantity's space.
-        bound: on the rounding error of that margin.
-        exact: the margin of the same state without any rounding.
-        wrong: whether the exact margin asks for the other decision.
-    """
-
+    # step, i, j: which decision; i < j
     step: int
     i: int
     j: int
-    inside: bool
-    margin: float
-    bound: float
-    exact: float
-    wrong: bool
+    inside: bool  # as the program decided
+    margin: float  # threshold - quantity as it computed it, in the quantity's space
+    bound: float  # on the rounding error of that margin
+    exact: float  # the margin of the same state without any rounding
+    wrong: bool  # whether the exact margin asks for the other decision
 
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """What is certain about the decisions of one run, from its own states.
+    """What is certain about the decisions of one run, from its own states."""
 
-    Attributes:
-        horizon: first step with an ambiguous decision; every decision before it would have come out the same
-            in exact arithmetic from the same states. None where there is none.
-        wrong: first step with a decision that exact arithmetic decides otherwise; None where there is none.
-        total: ambiguous decisions.
-        decisions: the first of them.
-    """
-
+    # first step with an ambiguous decision; every decision before it would have come out the same in exact
+    # arithmetic from the same states. None where there is none
     horizon: int | None
+    # first step with a decision that exact arithmetic decides otherwise; None where there is none
     wrong: int | None
-    total: int
-    decisions: tuple[AmbiguousDecision, ...]
+    total: int  # ambiguous decisions
+    decisions: tuple[AmbiguousDecision, ...]  # the first of them
 
 
 def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
@@ -195,7 +171,6 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
 
     Args:
         simulation: a pair potential.
-        steps: last step.
 
     Raises:
         InputError: a rebuild rule that may miss pairs.

@@ -160,7 +160,6 @@ def ensemble(
     """Features of every run at every window; not a number from where a run blew up.
 
     Args:
-        simulation: the program.
         begin: a start for each run.
         windows: steps, ascending.
         nodes: of the comparison, see `nodes_of`.
@@ -199,19 +198,12 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
 
 @dataclass(frozen=True)
 class Change:
-    """A program that is changed on purpose.
+    """A program that is changed on purpose."""
 
-    Attributes:
-        name: of the change, for readers.
-        must_fail: whether it is another model; else only other rounding.
-        simulation: the changed program.
-        once: whether one verdict on it is enough, because its runs take long.
-    """
-
-    name: str
-    must_fail: bool
-    simulation: Simulation
-    once: bool = False
+    name: str  # of the change, for readers
+    must_fail: bool  # whether it is another model; else only other rounding
+    simulation: Simulation  # the changed program
+    once: bool = False  # whether one verdict on it is enough, because its runs take long
 
 
 def planted(a: Simulation) -> tuple[Change, ...]:

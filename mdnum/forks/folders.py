@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import ROLES, flat, program_of
+from mdnum.forks.worlds import ROLES, program_of
 from mdnum.program import Twin
 from mdnum.store import RunFolder
 from mdnum.systems.load import load
+from mdnum.systems.toml import flat
 
 Difference = tuple[str, Any, Any]
 
@@ -43,55 +44,40 @@ _SAME = 1e-6
 
 @dataclass(frozen=True)
 class StoredFlip:
-    """A stored flip that one of two runs has and the other has not.
+    """A stored flip that one of two runs has and the other has not."""
 
-    Attributes:
-        run, step: which run has it, "A" or "B", and when.
-        subject: labels of the atoms of a pair, or of the ball.
-        entered: whether the pair enters its cutoff, or the contact begins.
-        margin, bound: as stored: of the decision, and on its rounding error.
-        distance: of the pair, length; NaN of a ball.
-        ambiguous: whether rounding alone could have decided otherwise.
-    """
-
+    # run, step: which run has it, "A" or "B", and when
     run: str
     step: int
-    subject: tuple[int, ...]
-    entered: bool
+    subject: tuple[int, ...]  # labels of the atoms of a pair, or of the ball
+    entered: bool  # whether the pair enters its cutoff, or the contact begins
+    # margin, bound: as stored: of the decision, and on its rounding error
     margin: float
     bound: float
-    distance: float
-    ambiguous: bool
+    distance: float  # of the pair, length; NaN of a ball
+    ambiguous: bool  # whether rounding alone could have decided otherwise
 
 
 @dataclass(frozen=True)
 class FolderFork:
-    """What two run folders hold about where their runs diverge.
+    """What two run folders hold about where their runs diverge."""
 
-    Attributes:
-        world, a, b: "md" or "ball", and the folders.
-        differences: what was different about the runs, as (key, in A, in B): system first, then the starts,
-            then what bits depend on.
-        causes: what a fork may be put down to: keys of the system file, "start", "arithmetic".
-        steps: that both have.
-        first_bit, fork: first steps at which a stored number and decision differ; None where none does.
-        channel: of the decision at the fork; "" without one.
-        iterations: of both solvers of a ball at the fork, where they differ.
-        decisions: the flips that differ at the fork, the nearest to its threshold first.
-        same_structure: whether both began from the same atoms, bit for bit.
-    """
-
+    # world, a, b: "md" or "ball", and the folders
     world: str
     a: Path
     b: Path
+    # what was different about the runs, as (key, in A, in B): system first, then the starts, then what bits
+    # depend on
     differences: tuple[Difference, ...]
-    causes: tuple[str, ...]
-    steps: int
+    causes: tuple[str, ...]  # what a fork may be put down to: keys of the system file, "start", "arithmetic"
+    steps: int  # that both have
+    # first_bit, fork: first steps at which a stored number and decision differ; None where none does
     first_bit: int | None
     fork: int | None
-    channel: str
-    same_structure: bool
-    iterations: tuple[int, int] | None = None
+    channel: str  # of the decision at the fork; "" without one
+    same_structure: bool  # whether both began from the same atoms, bit for bit
+    iterations: tuple[int, int] | None = None  # of both solvers of a ball at the fork, where they differ
+    # the flips that differ at the fork, the nearest to its threshold first
     decisions: tuple[StoredFlip, ...] = ()
 
 

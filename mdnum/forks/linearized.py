@@ -54,27 +54,22 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent along some steps of one list.
+    """The tangent along some steps of one list."""
 
-    Attributes:
-        segment: the steps.
-        size: log of the length of the tangent (positions, and velocities times 30 time steps) at each step,
-            relative to its length at the start, shape (rows,).
-        furthest: largest displacement of an atom per amplitude, at each step, as its log, shape (rows,).
-        reach: amplitude at which the nearest decisions of each step flip, by sign of the amplitude: first
-            axis 0 for positive, 1 for negative amplitudes; shape (2, rows, KEPT). Infinite where there is
-            none.
-        pairs: i, j of those decisions (i < j; -1 where there is none), shape (2, rows, KEPT, 2).
-        margins: of those decisions, in the quantity's space, same shape as `reach`.
-        moved: largest displacement since the list was built, at each step, length, shape (rows,).
-    """
-
-    segment: Segment
+    segment: Segment  # the steps
+    # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
+    # to its length at the start, shape (rows,)
     size: Float[np.ndarray, "rows"]
+    # largest displacement of an atom per amplitude, at each step, as its log, shape (rows,)
     furthest: Float[np.ndarray, "rows"]
+    # amplitude at which the nearest decisions of each step flip, by sign of the amplitude: first axis 0 for
+    # positive, 1 for negative amplitudes; shape (2, rows, KEPT). Infinite where there is none
     reach: Float[np.ndarray, "signs rows kept"]
+    # i, j of those decisions (i < j; -1 where there is none), shape (2, rows, KEPT, 2)
     pairs: Int[np.ndarray, "signs rows kept ends"]
+    # of those decisions, in the quantity's space, same shape as `reach`
     margins: Float[np.ndarray, "signs rows kept"]
+    # largest displacement since the list was built, at each step, length, shape (rows,)
     moved: Float[np.ndarray, "rows"]
 
 
@@ -88,8 +83,7 @@ def tangents(
     """Carry a perturbation of the start along a run.
 
     Args:
-        simulation: the system as objects, with a pair potential.
-        steps: last step.
+        simulation: with a pair potential.
         dx: perturbation of the positions per amplitude, length. dv: of the velocities.
         reach: whether to ask for the amplitudes at which decisions flip.
 
@@ -136,7 +130,7 @@ def tangents(
         )
         if segment.closes in FAILURES:
             return
-        tangent = tuple(_unsorted(np.asarray(part, np.float64), order) for part in end)
+        tangent = tuple(np.asarray(part, np.float64)[:, np.argsort(order)] for part in end)
         # carried at length 1, so that no length overflows, however long the run
         now = _length(tangent, clock)
         tangent = tuple(part / now for part in tangent)
@@ -150,12 +144,6 @@ def _joined(parts: list[StepTangents], name: str, axis: int = 0) -> np.ndarray:
 def _length(tangent, clock: float) -> float:
     x, v = tangent
     return float(np.sqrt(np.sum(x * x) + clock * clock * np.sum(v * v)))
-
-
-def _unsorted(part: np.ndarray, order: np.ndarray) -> np.ndarray:
-    out = np.empty_like(part)
-    out[:, order] = part
-    return out
 
 
 def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
@@ -232,26 +220,21 @@ def _carry(
 
 @dataclass(frozen=True)
 class Lyapunov:
-    """Growth of a tangent along a run.
+    """Growth of a tangent along a run."""
 
-    Attributes:
-        steps, timestep: of the run; the time step in the units of the system's file.
-        rate: the exponent, per step. error: its standard error, from blocks of the run.
-        size: log of the length of the tangent at each step, relative to its start, shape (steps + 1,).
-        furthest: displacement of the furthest atom at each step per displacement of the furthest atom at the
-            start, as its log, shape (steps + 1,).
-        transient: steps left out at the start.
-        chaotic: whether the rate is above what linear growth (a perturbation of speeds, or of a frequency)
-            would give in so many steps, and above four times its error.
-    """
-
+    # steps, timestep: of the run; the time step in the units of the system's file
     steps: int
     timestep: float
-    rate: float
-    error: float
+    rate: float  # the exponent, per step
+    error: float  # its standard error, from blocks of the run
+    # log of the length of the tangent at each step, relative to its start, shape (steps + 1,)
     size: Float[np.ndarray, "rows"]
+    # displacement of the furthest atom at each step per displacement of the furthest atom at the start, as
+    # its log, shape (steps + 1,)
     furthest: Float[np.ndarray, "rows"]
-    transient: int
+    transient: int  # steps left out at the start
+    # whether the rate is above what linear growth (a perturbation of speeds, or of a frequency) would give in
+    # so many steps, and above four times its error
     chaotic: bool
 
     @property
@@ -294,8 +277,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
     """The largest Lyapunov exponent along a run.
 
     Args:
-        simulation: the system as objects, with a pair potential.
-        steps: last step; default the system's own.
+        simulation: with a pair potential.
         seed: of the perturbation that is followed: random displacements.
 
     Raises:
@@ -338,33 +320,25 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
 
 @dataclass(frozen=True)
 class PredictedFlip:
-    """A decision that a perturbation is expected to flip.
+    """A decision that a perturbation is expected to flip."""
 
-    Attributes:
-        step, i, j: of the decision, i < j.
-        amplitude, ulps: at which it flips, with its sign, and in ulps of the largest start coordinate.
-        margin: of the unperturbed run, in the quantity's space.
-    """
-
+    # step, i, j: of the decision, i < j
     step: int
     i: int
     j: int
+    # amplitude, ulps: at which it flips, with its sign, and in ulps of the largest start coordinate
     amplitude: float
-    margin: float
+    margin: float  # of the unperturbed run, in the quantity's space
     ulps: float
 
 
 class ForecastRange(NamedTuple):
-    """How far a forecast is good for one amplitude.
+    """How far a forecast is good for one amplitude."""
 
-    Attributes:
-        step: the last one; -1 for none.
-        ends: why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision
-            of the next step flips is within the error; "size", the displacement is too large from then on;
-            "list", a pair that was not examined could come inside.
-    """
-
-    step: int
+    step: int  # the last one; -1 for none
+    # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
+    # next step flips is within the error; "size", the displacement is too large from then on; "list", a pair
+    # that was not examined could come inside
     ends: str
 
 
@@ -372,32 +346,29 @@ class ForecastRange(NamedTuple):
 class Forecast:
     """What perturbations of the start along one direction will flip, to first order.
 
-    Attributes:
-        simulation, steps: the run.
-        dx, dv: the direction: change of positions (length) and velocities per amplitude, shape (atoms, 3).
-        reach: amplitude at which the nearest decisions of each step flip, for positive and negative
-            amplitudes, shape (2, steps + 1, KEPT).
-        pairs: of those decisions, shape (2, steps + 1, KEPT, 2); margins: theirs, as `reach`.
-        furthest: displacement of the furthest atom per amplitude at each step, shape (steps + 1,).
-        ulp: spacing of the floats at the largest start coordinate, length.
-        listed: pairs that were examined, those of the list, at each step, shape (steps + 1,).
-        room: how much nearer to the cutoff than in the run a pair would have to be that was not examined,
-            length, shape (steps + 1,).
-
     Error: second order in the displacement, and some ulps; a decision that may flip or not within it is not
         predicted. `good_until` says how far a forecast goes.
     """
 
+    # simulation, steps: the run
     simulation: Simulation
     steps: int
+    # dx, dv: the direction: change of positions (length) and velocities per amplitude, shape (atoms, 3)
     dx: Float[np.ndarray, "atoms 3"]
     dv: Float[np.ndarray, "atoms 3"]
+    # amplitude at which the nearest decisions of each step flip, for positive and negative amplitudes, shape
+    # (2, steps + 1, KEPT)
     reach: Float[np.ndarray, "signs rows kept"]
+    # pairs: of those decisions, shape (2, steps + 1, KEPT, 2); margins: theirs, as `reach`
     pairs: Int[np.ndarray, "signs rows kept ends"]
     margins: Float[np.ndarray, "signs rows kept"]
+    # displacement of the furthest atom per amplitude at each step, shape (steps + 1,)
     furthest: Float[np.ndarray, "rows"]
-    ulp: float
+    ulp: float  # spacing of the floats at the largest start coordinate, length
+    # pairs that were examined, those of the list, at each step, shape (steps + 1,)
     listed: Int[np.ndarray, "rows"]
+    # how much nearer to the cutoff than in the run a pair would have to be that was not examined, length,
+    # shape (steps + 1,)
     room: Float[np.ndarray, "rows"]
 
     @property
@@ -496,8 +467,7 @@ def forecast(
     """Foretell flips along a direction in the start.
 
     Args:
-        simulation: the system as objects, with a pair potential.
-        steps: last step; default the system's own.
+        simulation: with a pair potential.
         dx, dv: the direction; default random displacements, the furthest by 1, so that an amplitude is the
             largest displacement.
         seed: of a random direction.

@@ -317,27 +317,18 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Screened:
-    """What one choice did within the horizon.
+    """What one choice did within the horizon."""
 
-    Attributes:
-        choice: its name.
-        difference: one line; why it does not apply where it does not.
-        first_bit, fork, split: dates, steps; None where they did not come.
-        must_hold: whether it cannot change a bit by design.
-        reason_unavailable: why it was not run; None where it was.
-        steps: last step that was compared; 0 where it was not run.
-        failed: "blow-up" or "runaway" by run, where one ended that way.
-    """
-
-    choice: str
-    difference: str
+    choice: str  # its name
+    difference: str  # one line; why it does not apply where it does not
+    # first_bit, fork, split: dates, steps; None where they did not come
     first_bit: int | None
     fork: int | None
     split: int | None
-    must_hold: bool
-    reason_unavailable: str | None = None
-    steps: int = 0
-    failed: str = ""
+    must_hold: bool  # whether it cannot change a bit by design
+    reason_unavailable: str | None = None  # why it was not run; None where it was
+    steps: int = 0  # last step that was compared; 0 where it was not run
+    failed: str = ""  # "blow-up" or "runaway" by run, where one ended that way
 
     @property
     def held(self) -> bool | None:

@@ -50,20 +50,14 @@ _NO_FMA = ("--xla_cpu_max_isa=AVX",)
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to run the same steps.
+    """A way to run the same steps."""
 
-    Attributes:
-        name: what to call it.
-        program: "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal
-            copies), "grad" (the primal inside value_and_grad) or "eager" (operation by operation).
-        flags: of XLA.
-        reduction: order of the force sums; None for the system's own.
-    """
-
-    name: str
+    name: str  # what to call it
+    # "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal copies),
+    # "grad" (the primal inside value_and_grad) or "eager" (operation by operation)
     program: ProgramName = "scan"
-    flags: tuple[str, ...] = ()
-    reduction: str | None = None
+    flags: tuple[str, ...] = ()  # of XLA
+    reduction: str | None = None  # order of the force sums; None for the system's own
 
 
 REFERENCE = Variant("scan")
@@ -85,25 +79,16 @@ VARIANTS: tuple[Variant, ...] = (
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a variant.
+    """What became of a variant."""
 
-    Attributes:
-        variant: which.
-        hashes: of the positions at steps 1, 2, ..., hexadecimal; empty where it failed.
-        failed: the last line that a failed process said.
-        seconds: of its process.
-        cluster: number of the variants that agree with it, from 0; -1 where it failed.
-        first_bit: first step whose positions are not those of the reference; None where all are.
-        separations: largest distance from the reference's atoms at steps 1, 2, ..., as far as both ran,
-            length.
-    """
-
-    variant: Variant
-    hashes: tuple[str, ...]
-    failed: str = ""
-    seconds: float = 0.0
-    cluster: int = -1
+    variant: Variant  # which
+    hashes: tuple[str, ...]  # of the positions at steps 1, 2, ..., hexadecimal; empty where it failed
+    failed: str = ""  # the last line that a failed process said
+    seconds: float = 0.0  # of its process
+    cluster: int = -1  # number of the variants that agree with it, from 0; -1 where it failed
+    # first step whose positions are not those of the reference; None where all are
     first_bit: int | None = None
+    # largest distance from the reference's atoms at steps 1, 2, ..., as far as both ran, length
     separations: Float[np.ndarray, "steps"] = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -119,18 +104,12 @@ class Ran:
 
 @dataclass(frozen=True)
 class Variants:
-    """Variants of one system, by what they compute.
+    """Variants of one system, by what they compute."""
 
-    Attributes:
-        rows: one a variant, in the order asked for.
-        reference: name of the one that the others are compared with: the first that ran.
-        steps: that it ran.
-        causes: what tells the clusters apart: codes and their values (see `causes_of`).
-    """
-
-    rows: tuple[Ran, ...]
-    reference: str
-    steps: int
+    rows: tuple[Ran, ...]  # one a variant, in the order asked for
+    reference: str  # name of the one that the others are compared with: the first that ran
+    steps: int  # that it ran
+    # what tells the clusters apart: codes and their values (see `causes_of`)
     causes: tuple[dict[str, Any], ...]
 
     @property

@@ -30,13 +30,9 @@ _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ord
 
 @dataclass(frozen=True)
 class ReorderedSimulation(Simulation):
-    """A simulation whose lists hold their pairs in another order.
+    """A simulation whose lists hold their pairs in another order."""
 
-    Attributes:
-        order: a format, or the seed of a shuffle.
-    """
-
-    order: str | int = 0
+    order: str | int = 0  # a format, or the seed of a shuffle
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
@@ -66,16 +62,12 @@ def _fields(kind: type, value: object) -> dict:
 
 @dataclass
 class FormattedList(VerletList):
-    """A list whose slots are in the order in which a format adds.
+    """A list whose slots are in the order in which a format adds."""
 
-    Attributes:
-        format: "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the
-            slots, earlier ones in the second, both by label).
-        half: slots of one half; grows with what it must hold.
-    """
-
+    # "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the slots, earlier
+    # ones in the second, both by label)
     format: str = "sparse"
-    half: int = 0
+    half: int = 0  # slots of one half; grows with what it must hold
 
     def build(self, positions, cell) -> PairTable:
         """As the search found them, in another order."""
@@ -113,15 +105,10 @@ def _first(
 
 @dataclass(frozen=True)
 class ShuffledBuilder:
-    """A neighbor search whose rows are shuffled, each atom's in its own way.
+    """A neighbor search whose rows are shuffled, each atom's in its own way."""
 
-    Attributes:
-        inner: who searches.
-        seed: of the shuffle; every list of a run is shuffled with it again.
-    """
-
-    inner: ListBuilder
-    seed: int
+    inner: ListBuilder  # who searches
+    seed: int  # of the shuffle; every list of a run is shuffled with it again
 
     @property
     def name(self) -> str:

@@ -36,21 +36,15 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """Atoms around the deciding pair, at the fork.
+    """Atoms around the deciding pair, at the fork."""
 
-    Attributes:
-        atoms: labels of A; the pair first, the others by their distance from its middle, shape (near,).
-        positions: in A, from the middle of the pair, length, shape (near, 3).
-        moved: B's positions minus A's, length, shape (near, 3).
-        margins: of the deciding pair in A and in B, as each program computes it, in the quantity's space.
-        bounds: on the rounding errors of these.
-    """
-
+    # labels of A; the pair first, the others by their distance from its middle, shape (near,)
     atoms: Int[np.ndarray, "near"]
-    positions: Float[np.ndarray, "near 3"]
-    moved: Float[np.ndarray, "near 3"]
+    positions: Float[np.ndarray, "near 3"]  # in A, from the middle of the pair, length, shape (near, 3)
+    moved: Float[np.ndarray, "near 3"]  # B's positions minus A's, length, shape (near, 3)
+    # of the deciding pair in A and in B, as each program computes it, in the quantity's space
     margins: tuple[float, float]
-    bounds: tuple[float, float]
+    bounds: tuple[float, float]  # on the rounding errors of these
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
@@ -92,22 +86,15 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """B with some decisions overridden by A's.
+    """B with some decisions overridden by A's."""
 
-    Attributes:
-        pairs: whose decisions were.
-        first, last: steps of the window in which they were.
-        separation: from A at each step, length; NaN where a run has ended.
-        split: first step beyond the tolerance; None where there is none.
-        free: split without the pins.
-    """
-
-    pairs: tuple[tuple[int, int], ...]
+    pairs: tuple[tuple[int, int], ...]  # whose decisions were
+    # first, last: steps of the window in which they were
     first: int
     last: int
-    separation: Float[np.ndarray, "steps"]
-    split: int | None
-    free: int | None
+    separation: Float[np.ndarray, "steps"]  # from A at each step, length; NaN where a run has ended
+    split: int | None  # first step beyond the tolerance; None where there is none
+    free: int | None  # split without the pins
 
 
 def pinned(
@@ -222,23 +209,17 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of pairs that restores agreement.
+    """A smallest set of pairs that restores agreement."""
 
-    Attributes:
-        pairs: pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A;
-            None where no set does.
-        code: "alone": pinning the pair at the fork alone is enough; "none": no set is; "proven": none of the
-            pairs can be left out; "unproven": the runs allowed did not suffice to show that.
-        candidates: pairs that the runs decided differently before the split.
-        tests: runs that were made.
-        horizon: up to which step B had to stay with A.
-    """
-
+    # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
+    # no set does
     pairs: tuple[tuple[int, int], ...] | None
+    # "alone": pinning the pair at the fork alone is enough; "none": no set is; "proven": none of the pairs
+    # can be left out; "unproven": the runs allowed did not suffice to show that
     code: str
-    candidates: int
-    tests: int
-    horizon: int
+    candidates: int  # pairs that the runs decided differently before the split
+    tests: int  # runs that were made
+    horizon: int  # up to which step B had to stay with A
 
     @property
     def proven(self) -> bool:

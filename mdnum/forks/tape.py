@@ -18,18 +18,12 @@ from mdnum.rollout.program import MdProgram
 
 @dataclass(frozen=True)
 class DecisionTape:
-    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
+    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later."""
 
-    Attributes:
-        atoms: number of atoms.
-        steps: the last step that was decided.
-        first: keys i * atoms + j (i < j) of the pairs inside at step 0, sorted.
-        step, key, entered: the flips, sorted by step and key.
-    """
-
-    atoms: int
-    steps: int
-    first: Int[np.ndarray, "pairs"]
+    atoms: int  # number of atoms
+    steps: int  # the last step that was decided
+    first: Int[np.ndarray, "pairs"]  # keys i * atoms + j (i < j) of the pairs inside at step 0, sorted
+    # step, key, entered: the flips, sorted by step and key
     step: Int[np.ndarray, "flips"]
     key: Int[np.ndarray, "flips"]
     entered: Bool[np.ndarray, "flips"]

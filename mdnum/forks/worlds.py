@@ -16,6 +16,7 @@ from mdnum.ball.limits import DTYPES, rounded
 from mdnum.errors import InputError
 from mdnum.program import Program, Twin
 from mdnum.systems import BallSystem, System
+from mdnum.systems.toml import flat
 
 #: What has a dtype of its own, by world.
 ROLES = {
@@ -114,11 +115,3 @@ def as_used(system: Any, key: str) -> tuple[float, Any]:
         # a spread is laid out, and a control drawn up, in double precision
         dtype = "float64" if key.startswith(("start.", "flight.control.")) else precision.arithmetic
     return rounded(value, dtype), DTYPES[dtype]
-
-
-def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, by dotted keys."""
-    rows: dict[str, Any] = {}
-    for key, value in table.items():
-        rows |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return rows

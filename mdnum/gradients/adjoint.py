@@ -40,19 +40,12 @@ ALL = frozenset((MODEL, SCALE, FORCE))
 
 
 class ForceCotangents(NamedTuple):
-    """What comes back through one evaluation of forces.
+    """What comes back through one evaluation of forces."""
 
-    Attributes:
-        x: on the positions.
-        model: on the parameters, a pytree of arrays like theirs; zeros where it was not asked for.
-        scale: on a common factor of all distances (the box and everything in it), at 1.
-        force: the forces themselves, energy/length.
-    """
-
-    x: Float[Array, "3 atoms"]
-    model: Any
-    scale: Float[Array, ""]
-    force: Float[Array, "3 atoms"]
+    x: Float[Array, "3 atoms"]  # on the positions
+    model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
+    scale: Float[Array, ""]  # on a common factor of all distances (the box and everything in it), at 1
+    force: Float[Array, "3 atoms"]  # the forces themselves, energy/length
 
 
 def pull_back(
@@ -211,23 +204,18 @@ class AdjointCarry(NamedTuple):
     In the trace of a stretch, row k belongs to the state (x, half-kicked v) that step first + k begins with,
     before the crossings that lead there, in the order of the stretch's list; rows beyond the used ones are
     void, and the origin is left out.
-
-    Attributes:
-        x: cotangent of the positions at the step that comes next in time.
-        v: of the half-kicked velocities that lead there.
-        model, integrator, scale: of parameters and of a common factor of all distances, so far.
-        origin: of the frame of step 0 where the loss compares with it, user's order.
-        r_cut: of the cutoffs by the times of flips, so far.
-        frame: of potential energy and virial in the frame that the loss looks at next in time.
     """
 
-    x: Float[Array, "3 atoms"]
-    v: Float[Array, "3 atoms"]
+    x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
+    v: Float[Array, "3 atoms"]  # of the half-kicked velocities that lead there
+    # model, integrator, scale: of parameters and of a common factor of all distances, so far
     model: Any
     integrator: Any
     scale: Float[Array, ""]
+    # of the frame of step 0 where the loss compares with it, user's order
     origin: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]
-    r_cut: Float[Array, "types"]
+    r_cut: Float[Array, "types"]  # of the cutoffs by the times of flips, so far
+    # of potential energy and virial in the frame that the loss looks at next in time
     frame: tuple[Float[Array, ""], Float[Array, ""]]
 
 
@@ -301,15 +289,10 @@ class StretchReversal:
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
         """What `transposed` is called with for a stretch, from where the pass stands."""
         simulation, order = self.tape.simulation, stretch.table.order
-        self.met = None
-        if self.guard is not None:
-            assert stretch.ledger is not None, "made without flips"
-            self.met = crossings(
-                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, self.guard
-            )
+        self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
         looking = (tape.loss, tape.origin, tape.around, self.onto_total, tape.pace)
-        crossed = None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms)
+        crossed = None if self.met is None else self.met.rows(len(stretch.x))
         return (
             self.force, simulation.integrator, simulation.masses[order], tables, stretch.columns,
             stretch.bits, stretch.rows, tape.seen(stretch), looking, crossed, self.carry, self.wanted,
@@ -384,7 +367,7 @@ def transposed(
         return jax.tree.map(jnp.zeros_like, seen)
 
     def step(carry: AdjointCarry, given):
-        row, told, see, met = given
+        row, told, see, span = given
         number, x, v = row[0], row[1], row[2]
         half = (0.5 * integrator.timestep).astype(dtype)
         second = jnp.where(number == 0, jnp.zeros((), dtype), half)
@@ -428,7 +411,8 @@ def transposed(
         )
         trace = after._replace(origin=())
         weights = jnp.zeros(0)
-        if met is not None:
+        if crossed is not None:
+            met = crossed.row(span, x.shape[1])
             # the forces are there wherever the derivative by scale is wanted
             arriving = v - half * made.force / mass_row
             share = pace.share(number, integrator.timestep)
@@ -445,5 +429,6 @@ def transposed(
             )
         return after, (weights, trace)
 
-    carry, by_row = over_rows(step, carry, (rows, bits, seen, crossed), used, backward=True)
+    spans = None if crossed is None else crossed.spans
+    carry, by_row = over_rows(step, carry, (rows, bits, seen, spans), used, backward=True)
     return carry._replace(x=unsorted(carry.x, order), v=unsorted(carry.v, order)), by_row

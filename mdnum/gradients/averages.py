@@ -38,26 +38,19 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames that a loss looks at, each by itself.
+    """The frames that a loss looks at, each by itself."""
 
-    Attributes:
-        step: of each. x: wrapped positions, user's order, length.
-        term: what each adds to the loss, which is linearized in its sums.
-        by_potential, by_virial: derivatives of the loss by the potential energy and the virial of each.
-        energy: potential energy from which the forces of each derive. kinetic: kinetic energy of each.
-        explicit: derivatives of the loss at fixed positions (in units of the box) and decisions, by name.
-        force_energy: derivatives of `energy` likewise.
-    """
-
-    step: Int[np.ndarray, "frames"]
-    x: Float[np.ndarray, "frames 3 atoms"]
-    term: Float[np.ndarray, "frames"]
+    step: Int[np.ndarray, "frames"]  # of each
+    x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
+    term: Float[np.ndarray, "frames"]  # what each adds to the loss, which is linearized in its sums
+    # by_potential, by_virial: derivatives of the loss by the potential energy and the virial of each
     by_potential: Float[np.ndarray, "frames"]
     by_virial: Float[np.ndarray, "frames"]
-    energy: Float[np.ndarray, "frames"]
-    kinetic: Float[np.ndarray, "frames"]
+    energy: Float[np.ndarray, "frames"]  # potential energy from which the forces of each derive
+    kinetic: Float[np.ndarray, "frames"]  # kinetic energy of each
+    # derivatives of the loss at fixed positions (in units of the box) and decisions, by name
     explicit: dict[str, Float[np.ndarray, "frames *types"]]
-    force_energy: dict[str, Float[np.ndarray, "frames *types"]]
+    force_energy: dict[str, Float[np.ndarray, "frames *types"]]  # derivatives of `energy` likewise
 
     def __len__(self) -> int:
         return len(self.step)
@@ -184,18 +177,14 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """How many pairs there are per length at the cutoff, weighted frame by frame.
+    """How many pairs there are per length at the cutoff, weighted frame by frame."""
 
-    Attributes:
-        frames: each frame's share of the estimate that was chosen, shape (frames, types).
-        width: the largest of the three kernels that it is extrapolated from, length.
-        error: standard error and what is left of the bias, for the sum over frames, shape (types,).
-        table: (width, estimate, standard error) of each kernel, summed over frames and types.
-    """
-
+    # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
-    width: float
+    width: float  # the largest of the three kernels that it is extrapolated from, length
+    # standard error and what is left of the bias, for the sum over frames, shape (types,)
     error: Float[np.ndarray, "types"]
+    # (width, estimate, standard error) of each kernel, summed over frames and types
     table: tuple[tuple[float, float, float], ...]
 
 
@@ -266,15 +255,11 @@ def density(
 
 @dataclass(frozen=True)
 class BoundaryTerm(Method):
-    """The derivative of an average over given states: of what is inside, and of which pairs are.
+    """The derivative of an average over given states: of what is inside, and of which pairs are."""
 
-    Attributes:
-        reach: half the width of the widest kernel as a share of the cutoff; less where the box is narrow.
-        budget: bytes of the recorded run that are kept in memory.
-    """
-
+    # half the width of the widest kernel as a share of the cutoff; less where the box is narrow
     reach: float = 0.1
-    budget: int = KEPT
+    budget: int = KEPT  # bytes of the recorded run that are kept in memory
 
     name = "boundary"
     kind = "average"
@@ -344,16 +329,13 @@ class Reweighting(Method):
     The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
     the derivative of the energy, over kT.
 
-    Attributes:
-        at_states: the explicit part. budget: bytes of the recorded run that are kept in memory.
-
     Error: statistical; a standard error from blocks is in the details. With a few correlated frames it is
         large, and one over the steps of the run at best.
     Source: S. Thaler, J. Zavadlav, Nature Communications 12, 6884 (2021).
     """
 
-    at_states: BoundaryTerm = field(default_factory=BoundaryTerm)
-    budget: int = KEPT
+    at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part
+    budget: int = KEPT  # bytes of the recorded run that are kept in memory
 
     name = "reweighting"
     kind = "average"

@@ -67,15 +67,10 @@ for _name, _class in {
 
 @dataclass(frozen=True)
 class BallGradients:
-    """Derivatives of one problem by several methods.
+    """Derivatives of one problem by several methods."""
 
-    Attributes:
-        gradients: of the methods that apply, in the order asked for.
-        refused: why another does not, by its name.
-    """
-
-    gradients: tuple[Gradient, ...]
-    refused: Mapping[str, str]
+    gradients: tuple[Gradient, ...]  # of the methods that apply, in the order asked for
+    refused: Mapping[str, str]  # why another does not, by its name
 
     def __iter__(self) -> Iterator[Gradient]:
         return iter(self.gradients)
@@ -255,12 +250,9 @@ def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run:
 
 @dataclass(frozen=True)
 class ThroughIterations(BallMethod):
-    """The derivative of the operations that ran, iteration by iteration.
+    """The derivative of the operations that ran, iteration by iteration."""
 
-    Attributes:
-        loss_scale: the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two.
-    """
-
+    # the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two
     loss_scale: float = 1.0
 
     name = "unrolled"
@@ -327,15 +319,12 @@ class RandomizedSmoothing(BallMethod):
 
     It sees through jumps (of iteration counts, of contacts), and is that of a smoother loss; the same seed
     gives the same bits. Each sample is used with its mirror image, which removes the value from the variance.
-
-    Attributes:
-        width: standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0).
-        samples: pairs of mirrored samples. seed: of the noise.
     """
 
+    # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)
     width: float = 1e-2
-    samples: int = 256
-    seed: int = 0
+    samples: int = 256  # pairs of mirrored samples
+    seed: int = 0  # of the noise
 
     name = "randomized"
     kind = "average"

@@ -48,13 +48,11 @@ class FixedPointRule(eqx.Module):
     lies on the kink of max(0, -y), where dG/dy has two values: the one from below is used, because the ball
     comes from there (a choice of branch, as the active set of a complementarity problem). By the implicit
     function theorem (1 - dG/dy) dy = dG/dgain dgain, ball by ball: gain dy = -y dgain.
-
-    Attributes:
-        regularization: added to 1 - dG/dy; moves the answer by about regularization / gain, relative.
-        at_iterate: evaluate at the height where the iteration stopped instead, which is no fixed point.
     """
 
+    # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
     regularization: float = eqx.field(static=True, default=0.0)
+    # evaluate at the height where the iteration stopped instead, which is no fixed point
     at_iterate: bool = eqx.field(static=True, default=False)
 
     def attach(
@@ -86,13 +84,10 @@ class Implicit(BallMethod):
 
     The loss is that of the iterations that ran; its derivative is that of where they were heading: the floor,
     whatever the gain. What the unrolled one gives by k is an artefact of the tolerance.
-
-    Attributes:
-        regularization: added to 1 - dG/dy, for a gain too small to divide by.
-        at_iterate: take the stopped iterate for the fixed point (an error of the order of the tolerance).
     """
 
-    regularization: float = 0.0
+    regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
+    # take the stopped iterate for the fixed point (an error of the order of the tolerance)
     at_iterate: bool = False
 
     name = "implicit"
@@ -148,18 +143,13 @@ class SoftImpact(eqx.Module):
     The spring has stiffness k while the ball falls and restitution² k while it rises, with smooth passages
     between the two and at the floor, so that the ball leaves with restitution times its speed.
 
-    Attributes:
-        restitution: speed after over speed before, in the limit of small widths.
-        k: stiffness per mass on the way in, 1/s².
-        eps: width in height over which the spring sets in, m. slow: in velocity, of the passage, m/s.
-
     Source: the latching spring of Walton and Braun (1986), smoothed.
     """
 
-    restitution: Any
-    k: Any
-    eps: Any
-    slow: Any
+    restitution: Any  # speed after over speed before, in the limit of small widths
+    k: Any  # stiffness per mass on the way in, 1/s²
+    eps: Any  # width in height over which the spring sets in, m
+    slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
         """Gravity, control and the spring; the decision is not used."""
@@ -179,14 +169,11 @@ class SoftImpact(eqx.Module):
 
 @dataclass(frozen=True)
 class SoftFloor(BallMethod):
-    """The derivative of a program with a soft floor: softplus contact, softened restitution.
+    """The derivative of a program with a soft floor: softplus contact, softened restitution."""
 
-    Attributes:
-        eps: width, m. Small: near the given program, with derivatives that peak at its contacts. Large: a
-            tame derivative, of something else. None for one that suits the problem: a tenth of the depth to
-            which a penalty gives way, and for an impact the narrowest floor that the step resolves.
-    """
-
+    # width, m. Small: near the given program, with derivatives that peak at its contacts. Large: a tame
+    # derivative, of something else. None for one that suits the problem: a tenth of the depth to which a
+    # penalty gives way, and for an impact the narrowest floor that the step resolves
     eps: float | None = None
 
     name = "smoothed"

@@ -13,70 +13,80 @@ dr of the distance moves the crossing by -dr/s and the momentum along the pair b
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.numerics import Ledger
-from mdnum.numerics.saltation import saltation_flagged
 from mdnum.systems.build import Simulation
+
+if TYPE_CHECKING:
+    from mdnum.gradients.tape import TapeStretch
 
 #: Crossings of one step that there is room for at least, as a power of two.
 _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """The crossings of some rows on the device, padded to one length.
+    """Crossings in a compiled program, padded: those of a row, or of all rows one after the other."""
 
-    Attributes:
-        i, j: sorted atoms; beyond the last one where there is no crossing. normal, images: as in `Crossings`.
-        push: signed force jump over radial speed, energy/length per (length/time).
-        kind: pair type; -1 - kind where it is left out.
-        potential, virial: their jumps over the radial speed, energy per (length/time).
-    """
+    # i, j: sorted atoms; beyond the last one where there is no crossing
+    i: Int[Array, "most"]
+    j: Int[Array, "most"]
+    # normal, images: as in `Crossings`
+    normal: Float[Array, "3 most"]
+    push: Float[Array, "most"]  # signed force jump over radial speed, energy/length per (length/time)
+    kind: Int[Array, "most"]  # pair type; -1 - kind where it is left out
+    images: Int[Array, "3 most"]
+    # potential, virial: their jumps over the radial speed, energy per (length/time)
+    potential: Float[Array, "most"]
+    virial: Float[Array, "most"]
 
-    i: Int[Array, "*rows most"]
-    j: Int[Array, "*rows most"]
-    normal: Float[Array, "*rows 3 most"]
-    push: Float[Array, "*rows most"]
-    kind: Int[Array, "*rows most"]
-    images: Int[Array, "*rows 3 most"]
-    potential: Float[Array, "*rows most"]
-    virial: Float[Array, "*rows most"]
+
+class MetRows(NamedTuple):
+    """The crossings of a stretch, as a compiled program is given them."""
+
+    met: Met  # of all rows
+    spans: Int[np.ndarray, "room 2"]  # where each row begins, and how many crossings it has
+    slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
+
+    def row(self, span: Int[Array, "2"], atoms: int) -> Met:
+        """Those of the row of a span."""
+        most = len(self.slots)
+        own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
+        # behind them are those of the next row
+        here = self.slots < span[1]
+        i, j = (jnp.where(here, end, atoms) for end in (own.i, own.j))
+        return own._replace(i=i, j=j, kind=jnp.where(here, own.kind, -1))
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """The flips of one stretch, as events with a time.
+    """The flips of one stretch, as events with a time."""
 
-    Attributes:
-        ledger: the flips. kind: pair type.
-        row: row of each in its stretch. i, j: its atoms in the order of the stretch's list.
-        normal: unit vector from i to j at the crossing.
-        speed: radial speed there, length per internal time: negative where the pair enters.
-        force: radial force that the flip adds, energy/length.
-        energy, virial: what the flip adds to the potential energy and to the virial, energy.
-        images: lattice vectors from the nearest image of atom j to its wrapped position.
-        grazing: slower than the guard: left out.
-        weight: derivative of the loss by the cutoff of this one crossing; NaN until the reverse pass has
-            been there. For one left out, what it would have been.
-    """
-
-    ledger: Ledger
-    row: Int[np.ndarray, "crossings"]
+    ledger: Ledger  # the flips
+    row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
+    # i, j: its atoms in the order of the stretch's list
     i: Int[np.ndarray, "crossings"]
     j: Int[np.ndarray, "crossings"]
-    normal: Float[np.ndarray, "crossings 3"]
+    normal: Float[np.ndarray, "crossings 3"]  # unit vector from i to j at the crossing
+    # radial speed there, length per internal time: negative where the pair enters
     speed: Float[np.ndarray, "crossings"]
-    force: Float[np.ndarray, "crossings"]
+    force: Float[np.ndarray, "crossings"]  # radial force that the flip adds, energy/length
+    # energy, virial: what the flip adds to the potential energy and to the virial, energy
     energy: Float[np.ndarray, "crossings"]
     virial: Float[np.ndarray, "crossings"]
-    kind: Int[np.ndarray, "crossings"]
+    kind: Int[np.ndarray, "crossings"]  # pair type
+    # lattice vectors from the nearest image of atom j to its wrapped position
     images: Int[np.ndarray, "crossings 3"]
-    grazing: Bool[np.ndarray, "crossings"]
+    grazing: Bool[np.ndarray, "crossings"]  # slower than the guard: left out
+    # derivative of the loss by the cutoff of this one crossing; NaN until the reverse pass has been there.
+    # For one left out, what it would have been
     weight: Float[np.ndarray, "crossings"]
 
     def __len__(self) -> int:
@@ -85,51 +95,47 @@ class Crossings:
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
         """How the momentum along the pair follows its distance through the crossing, energy/length per
-        (length/time): the saltation matrix of (distance, momentum), whose threshold is the cutoff."""
-        still = np.zeros_like(self.speed)
-        before, after = np.stack([self.speed, still], axis=1), np.stack([self.speed, self.force], axis=1)
-        normal = np.broadcast_to([1.0, 0.0], before.shape)
-        return saltation_flagged(np.broadcast_to(np.eye(2), (len(self), 2, 2)), before, after, normal)[0][
-            :, 1, 0
-        ]
+        (length/time): of the saltation of (distance, momentum), whose threshold is the cutoff."""
+        return self.force / self.speed
 
-    def _places(self, room: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The crossings sorted by row, their rows, and where each stands among those of its row."""
-        counts = np.bincount(self.row, minlength=room)
-        order = np.argsort(self.row, kind="stable")
-        row = self.row[order]
-        return order, row, np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+    def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
+        """Where each row begins, and how many crossings it has."""
+        starts = np.searchsorted(self.row, np.arange(room + 1))
+        return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
-    def on_device(self, room: int, atoms: int) -> Met:
-        """Padded to the rows of the stretch."""
-        order, row, place = self._places(room)
-        # a power of four, so that few are compiled for
-        bits = max(_ROOM_BITS, int(place.max(initial=0)).bit_length())
-        most = 1 << (bits + bits % 2)
+    def rows(self, room: int) -> MetRows:
+        """As a compiled program is given them, of as many rows as there is room for."""
+        spans = self.spans(room)
+        most = _padded(int(spans[:, 1].max(initial=0)))
+        # a slice of so many fits everywhere
+        long = _padded(len(self) + most)
 
-        def padded(values: np.ndarray, nothing: int = 0) -> Array:
-            out = np.full((room, *values.shape[1:], most), nothing, values.dtype)
-            out[(row, slice(None), place) if values.ndim == 2 else (row, place)] = values[order]
-            return jnp.asarray(out)
+        def padded(values: np.ndarray) -> Any:
+            out = np.zeros((*values.shape[1:], long), values.dtype)
+            out[..., : len(self)] = values.T
+            return out
 
         # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
         kind = np.where(self.grazing, -1 - self.kind, self.kind)
-        return Met(
-            padded(self.i, atoms), padded(self.j, atoms), padded(self.normal), padded(self.kick),
-            padded(kind), padded(self.images), padded(self.energy / self.speed),
-            padded(self.virial / self.speed),
+        columns = (
+            self.i, self.j, self.normal, self.kick, kind, self.images,
+            self.energy / self.speed, self.virial / self.speed,
         )  # fmt: skip
+        return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Values of padded rows, in the order of the crossings."""
-        order, row, place = self._places(len(values))
-        out = np.empty((len(row), *values.shape[2:]))
-        out[order] = values[row, place]
-        return out
+        """Values of padded rows, one crossing after the other."""
+        return values[self.row, np.arange(len(self)) - self.spans(len(values))[self.row, 0]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
         """With the weights that the reverse pass found."""
         return replace(self, weight=self.gathered(weights))
+
+
+def _padded(count: int) -> int:
+    """A power of four that holds so many: few are compiled for."""
+    bits = max(_ROOM_BITS, count.bit_length())
+    return 1 << (bits + bits % 2)
 
 
 def onto_crossings(
@@ -219,31 +225,33 @@ def push_through(
     return dr.astype(jnp.float64), (half * kick, kick), sums
 
 
-def crossings(
-    simulation: Simulation,
-    ledger: Ledger,
-    first: int,
-    order: Int[np.ndarray, "atoms"],
-    x: Float[np.ndarray, "rows 3 atoms"],
-    x_before: Float[np.ndarray, "3 atoms"],
-    guard: float,
-) -> Crossings:
+def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Crossings:
     """The flips of a stretch as events: their normals and radial speeds between two steps.
 
     Args:
-        ledger: its flips. first: step of the first row. order: sorted atom k is atom order[k].
-        x: wrapped positions of the stretch. x_before: of the step before it.
+        stretch: made with its flips.
         guard: radial speed, length per internal time, below which a crossing is left out.
+
+    Raises:
+        InputError: it was made without.
     """
-    row = (ledger.step - first).astype(np.int64)
-    place = np.argsort(order)
+    ledger = stretch.ledger
+    if ledger is None:
+        raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
+    row = (ledger.step - stretch.first).astype(np.int64)
     low, high = ledger.subject[:, 0], ledger.subject[:, 1]
-    i, j = place[low], place[high]
-    cell = HostCell(simulation.cell)
-    before = np.where((row > 0)[:, None], x[np.maximum(row - 1, 0), :, i], x_before[:, i].T)
-    before_j = np.where((row > 0)[:, None], x[np.maximum(row - 1, 0), :, j], x_before[:, j].T)
-    earlier = np.stack(cell.displacement(before.astype(np.float64), before_j.astype(np.float64)), axis=1)
-    now_i, now_j = x[row, :, i].astype(np.float64), x[row, :, j].astype(np.float64)
+    i, j = stretch.table.place[low], stretch.table.place[high]
+    cell, x, ahead = HostCell(simulation.cell), stretch.x.reshape(-1), stretch.x_before.reshape(-1)
+    atoms = stretch.x.shape[2]
+
+    def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Of an atom in each of some rows; row -1 is the step before the first."""
+        axes = [of + k * atoms for k in range(3)]
+        seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
+        return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
+
+    earlier = np.stack(cell.displacement(positions(row - 1, i), positions(row - 1, j)), axis=1)
+    now_i, now_j = positions(row, i).astype(np.float64), positions(row, j).astype(np.float64)
     now = np.stack(cell.displacement(now_i, now_j), axis=1)
     inverse = np.asarray(simulation.cell.inverse, np.float64)
     images = np.rint((now_j - now_i - now) @ inverse).astype(np.int64)

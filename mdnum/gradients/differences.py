@@ -51,19 +51,12 @@ _WIDENINGS, _POINTS = 4, 7
 
 
 class Differentiated(NamedTuple):
-    """A derivative from values.
+    """A derivative from values."""
 
-    Attributes:
-        value: the derivative.
-        error: what truncation and noise leave uncertain: the disagreement of the last two extrapolations.
-        step: the largest step of the extrapolation that was chosen.
-        table: central differences by step, largest step first.
-    """
-
-    value: float
-    error: float
-    step: float
-    table: tuple[tuple[float, float], ...]
+    value: float  # the derivative
+    error: float  # what truncation and noise leave uncertain: the disagreement of the last two extrapolations
+    step: float  # the largest step of the extrapolation that was chosen
+    table: tuple[tuple[float, float], ...]  # central differences by step, largest step first
 
 
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
@@ -181,15 +174,12 @@ class FiniteDifferences(Method):
     """Values of the loss at shifted parameters, extrapolated; scalars only.
 
     Errors, steps and the noise are in the details.
-
-    Attributes:
-        relative: the largest step as a share of the parameter; None for one that the noise of the loss and
-            its third derivative ask for. In a long run the loss is straight over tiny steps only.
-        levels: steps of the extrapolation.
     """
 
+    # the largest step as a share of the parameter; None for one that the noise of the loss and its third
+    # derivative ask for. In a long run the loss is straight over tiny steps only
     relative: float | None = None
-    levels: int = 3
+    levels: int = 3  # steps of the extrapolation
 
     name = "finite-differences"
     kind = "values"
@@ -245,25 +235,16 @@ def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], N
     return count
 
 
-def in_float64(simulation: Simulation) -> Simulation:
-    """The same system with every role of a number in float64."""
-    decider = replace(simulation.decider, dtype="float64", state="float64")
-    return replace(simulation, policy=PrecisionPolicy(), decider=decider, lattice=None)
-
-
 @dataclass(frozen=True)
 class ShadowDifferences(Method):
     """Differences of the same run in a wider format than its own: what it would give without its rounding.
 
     Float64 has no wider format that a long run could be made in; its differences state themselves how far
     their noise lets them be trusted.
-
-    Attributes:
-        relative: the largest step as a share of the parameter. levels: steps of the extrapolation.
     """
 
-    relative: float = 1e-4
-    levels: int = 6
+    relative: float = 1e-4  # the largest step as a share of the parameter
+    levels: int = 6  # steps of the extrapolation
 
     name = "shadow-differences"
     kind = "values"
@@ -277,7 +258,7 @@ class ShadowDifferences(Method):
         return scalars_only(problem, names)
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
-        wide = replace(problem, simulation=in_float64(problem.simulation))
+        wide = replace(problem, simulation=problem.simulation.with_policy())
         found = FiniteDifferences(self.relative, self.levels)(wide, names, progress)
         details = {**found.details, "value of the run itself": problem.value()}
         return self.result(found.value, found.gradient, {}, details)
@@ -288,16 +269,11 @@ class ShadowDifferences(Method):
 
 @dataclass(frozen=True)
 class Replicas:
-    """Starts that differ by chance alone.
+    """Starts that differ by chance alone."""
 
-    Attributes:
-        count: how many.
-        seed: of the first one; the others count on from there.
-        settle: steps that each runs with its new velocities before its start, so that positions differ too.
-    """
-
-    count: int = 8
-    seed: int = 0
+    count: int = 8  # how many
+    seed: int = 0  # of the first one; the others count on from there
+    # steps that each runs with its new velocities before its start, so that positions differ too
     settle: int = 0
 
     def __post_init__(self):
@@ -352,16 +328,12 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over replicas.
+    """A mean over replicas."""
 
-    Attributes:
-        mean, error: the mean and its standard error, of the shape of the parameter.
-        of: each replica's, shape (replicas, ...).
-    """
-
+    # mean, error: the mean and its standard error, of the shape of the parameter
     mean: Float[np.ndarray, "..."]
     error: Float[np.ndarray, "..."]
-    of: Float[np.ndarray, "replicas ..."]
+    of: Float[np.ndarray, "replicas ..."]  # each replica's, shape (replicas, ...)
 
     @classmethod
     def from_replicas(cls, values: Sequence[Any] | np.ndarray) -> Estimate:
@@ -375,16 +347,11 @@ class Ensemble(Method):
     """The mean over replicas of another method's gradient, at several horizons.
 
     Standard errors and the horizon of noise are in the details.
-
-    Attributes:
-        method: applied to each replica.
-        replicas: their starts.
-        halvings: the horizons are the steps asked for, and this many halves of halves of them.
     """
 
-    method: Method = field(default_factory=EventAware)
-    replicas: Replicas = field(default_factory=Replicas)
-    halvings: int = 3
+    method: Method = field(default_factory=EventAware)  # applied to each replica
+    replicas: Replicas = field(default_factory=Replicas)  # their starts
+    halvings: int = 3  # the horizons are the steps asked for, and this many halves of halves of them
 
     name = "ensemble"
     kind = "average"
@@ -466,15 +433,11 @@ class SmoothedDifferences(Method):
     Of several steps, each twice the next, pairs are extrapolated to no step. The widest pair is taken that
     differs from no narrower one by more than twice the standard error of the difference: narrower steps
     have more of the noise of single events. Standard errors, steps and moved crossings are in the details.
-
-    Attributes:
-        relative: the widest step as a share of the parameter.
-        steps: number of steps, each half of the one before.
-        replicas: the starts; a replica's start does not change with the parameter.
     """
 
-    relative: float = 0.002
-    steps: int = 3
+    relative: float = 0.002  # the widest step as a share of the parameter
+    steps: int = 3  # number of steps, each half of the one before
+    # the starts; a replica's start does not change with the parameter
     replicas: Replicas = field(default_factory=Replicas)
 
     name = "smoothed-differences"

@@ -27,37 +27,24 @@ if TYPE_CHECKING:
 
 
 class LossFrame(NamedTuple):
-    """One step as a loss sees it, atoms in the user's order.
+    """One step as a loss sees it, atoms in the user's order."""
 
-    Attributes:
-        step: its number.
-        x: positions as if the box had no faces, length. v: velocities, length per internal time.
-        potential: potential energy. virial: sum over pairs of r_ij · F_ij, energy.
-    """
-
-    step: Int[Array, ""]
-    x: Float[Array, "3 atoms"]
-    v: Float[Array, "3 atoms"]
-    potential: Float[Array, ""]
-    virial: Float[Array, ""]
+    step: Int[Array, ""]  # its number
+    x: Float[Array, "3 atoms"]  # positions as if the box had no faces, length
+    v: Float[Array, "3 atoms"]  # velocities, length per internal time
+    potential: Float[Array, ""]  # potential energy
+    virial: Float[Array, ""]  # sum over pairs of r_ij · F_ij, energy
 
 
 class LossContext(NamedTuple):
-    """What does not change along a run.
+    """What does not change along a run."""
 
-    Attributes:
-        masses: of the atoms.
-        matrix: lattice vectors as rows, length. volume: of the box, length³; 0 without one.
-        kB: Boltzmann's constant in the units of the run.
-        timestep: internal time. time_factor: internal time of one unit of time of the system file.
-    """
-
-    masses: Float[Array, "atoms"]
-    matrix: Float[Array, "3 3"]
-    volume: Float[Array, ""]
-    kB: Float[Array, ""]
-    timestep: Float[Array, ""]
-    time_factor: Float[Array, ""]
+    masses: Float[Array, "atoms"]  # of the atoms
+    matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
+    volume: Float[Array, ""]  # of the box, length³; 0 without one
+    kB: Float[Array, ""]  # Boltzmann's constant in the units of the run
+    timestep: Float[Array, ""]  # internal time
+    time_factor: Float[Array, ""]  # internal time of one unit of time of the system file
 
 
 class Loss(eqx.Module):
@@ -147,13 +134,10 @@ class Custom(Loss):
 
 
 class FinalProjection(_OfLast):
-    """Projection of the last positions on fixed directions, divided by the number of atoms.
-
-    Attributes:
-        direction: shape (3, atoms), or (3,) for all atoms alike.
-    """
+    """Projection of the last positions on fixed directions, divided by the number of atoms."""
 
     name, label, unit = "final-projection", "mean of the last positions along x", "{length}"
+    # shape (3, atoms), or (3,) for all atoms alike
     direction: Float[Array, "3 *atoms"] = eqx.field(default_factory=lambda: jnp.array([1.0, 0.0, 0.0]))
 
     def observe(self, frame, origin, around):
@@ -250,15 +234,13 @@ class GreenKuboDiffusion(Loss):
     A third of the integral of v(0) · v(t), averaged over atoms, from step 0 to `until`, by the trapezoidal
     rule over every n-th step.
 
-    Attributes:
-        until: the step up to which is integrated, a multiple of `every`; correlations are noise later on.
-
     Error: of order (every × timestep)² in the correlation's slope at `until`; at 0 it has none.
     Source: as for `EinsteinDiffusion`.
     """
 
     name, unit = "diffusion-green-kubo", "{length}²/{time}"
     label = "diffusion constant from the velocity autocorrelation"
+    # the step up to which is integrated, a multiple of `every`; correlations are noise later on
     until: int = eqx.field(static=True, kw_only=True)
 
     def __check_init__(self):
@@ -294,19 +276,16 @@ class RadialDistribution(Loss):
     two continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
     memory.
 
-    Attributes:
-        r_max: right edge of the last bin, length. bins: of equal width, from 0.
-        target: the loss is the mean squared difference from this, shape (bins,), or from the same in all.
-        weights: the loss is the sum of g(r) with these weights instead, shape (bins,).
-
     Source: of the loss, J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
     of_single_frames = True
-    r_max: float = eqx.field(static=True, kw_only=True)
-    bins: int = eqx.field(static=True, kw_only=True, default=60)
+    r_max: float = eqx.field(static=True, kw_only=True)  # right edge of the last bin, length
+    bins: int = eqx.field(static=True, kw_only=True, default=60)  # of equal width, from 0
+    # the loss is the mean squared difference from this, shape (bins,), or from the same in all
     target: Float[Array, "*bins"] = eqx.field(kw_only=True, default_factory=lambda: jnp.ones((), jnp.float64))
+    # the loss is the sum of g(r) with these weights instead, shape (bins,)
     weights: Float[Array, "bins"] | None = eqx.field(kw_only=True, default=None)
 
     def __check_init__(self):

@@ -47,41 +47,28 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Cotangents:
-    """Derivatives of a loss by everything that a rollout is made of.
+    """Derivatives of a loss by everything that a rollout is made of."""
 
-    Attributes:
-        model: by the quantities of the force (`quantities`).
-        integrator: by the leaves of the integrator that are numbers.
-        x, v: by the positions and velocities of step 0, user's order.
-        scale: by a common factor of the box and all positions, at 1.
-        r_cut: by the cutoffs through the times of the flips alone; 0 without saltation.
-    """
-
-    model: Any
-    integrator: Integrator
+    model: Any  # by the quantities of the force (`quantities`)
+    integrator: Integrator  # by the leaves of the integrator that are numbers
+    # x, v: by the positions and velocities of step 0, user's order
     x: Float[np.ndarray, "3 atoms"]
     v: Float[np.ndarray, "3 atoms"]
-    scale: float
+    scale: float  # by a common factor of the box and all positions, at 1
+    # by the cutoffs through the times of the flips alone; 0 without saltation
     r_cut: Float[np.ndarray, "types"]
 
 
 class Direction(NamedTuple):
-    """Derivatives of everything that a rollout is made of by one number, or by several along a first axis.
+    """Derivatives of everything that a rollout is made of by one number, or by several along a first axis."""
 
-    Attributes:
-        x, v: of the positions and velocities of step 0, user's order.
-        model: of the quantities of the force.
-        integrator: of the numbers of the integrator; None where a leaf is no number.
-        matrix: of the lattice vectors.
-        r_cut: of the cutoffs at which pairs cross.
-    """
-
+    # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
     v: Float[Array, "*columns 3 atoms"]
-    model: Any
-    integrator: Any
-    matrix: Float[Array, "*columns 3 3"]
-    r_cut: Float[Array, "*columns types"]
+    model: Any  # of the quantities of the force
+    integrator: Any  # of the numbers of the integrator; None where a leaf is no number
+    matrix: Float[Array, "*columns 3 3"]  # of the lattice vectors
+    r_cut: Float[Array, "*columns types"]  # of the cutoffs at which pairs cross
 
 
 def quantities(force: PairForce | ManyBodyForce) -> Any:
@@ -423,14 +410,10 @@ def unit(simulation: Simulation, name: str) -> str:
 
 @dataclass(frozen=True)
 class ParameterEntry:
-    """One number among the parameters.
+    """One number among the parameters."""
 
-    Attributes:
-        name: full name of the parameter. index: which of its entries; empty for a scalar.
-    """
-
-    name: str
-    index: tuple[int, ...] = ()
+    name: str  # full name of the parameter
+    index: tuple[int, ...] = ()  # which of its entries; empty for a scalar
 
     def __str__(self) -> str:
         return f"{self.name}[{', '.join(map(str, self.index))}]" if self.index else self.name

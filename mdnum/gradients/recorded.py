@@ -50,20 +50,14 @@ Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 @dataclass(frozen=True)
 class ReversePass:
-    """A reverse pass that has been made.
+    """A reverse pass that has been made."""
 
-    Attributes:
-        tape: the run.
-        parts: derivatives by all that it is made of. gradient: by full name.
-        crossings: of every stretch with their weights, last stretch first; empty without saltation.
-        guard: radial speed below which a crossing was left out, length per internal time.
-    """
-
-    tape: RunTape
-    parts: Cotangents
-    gradient: dict[str, Float[np.ndarray, "..."]]
+    tape: RunTape  # the run
+    parts: Cotangents  # derivatives by all that it is made of
+    gradient: dict[str, Float[np.ndarray, "..."]]  # by full name
+    # of every stretch with their weights, last stretch first; empty without saltation
     crossings: list[Crossings]
-    guard: float
+    guard: float  # radial speed below which a crossing was left out, length per internal time
 
 
 def passed(
@@ -114,13 +108,10 @@ def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progres
 
 @dataclass(frozen=True)
 class Symmetric(Method):
-    """The derivative of the steps that ran, by one reverse pass without a tape of operations.
+    """The derivative of the steps that ran, by one reverse pass without a tape of operations."""
 
-    Attributes:
-        budget: bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by
-            stretch, with the same bits.
-    """
-
+    # bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by stretch,
+    # with the same bits
     budget: int = KEPT
 
     name = "symmetric"
@@ -143,16 +134,12 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """The derivative of the flow: that of the steps, and what the time of every flip adds.
+    """The derivative of the flow: that of the steps, and what the time of every flip adds."""
 
-    Attributes:
-        guard: radial speed below which a crossing grazes and is left out, as a share of the rms radial speed
-            of a pair. Left in, single crossings would dominate: their terms go with one over that speed.
-        budget: as for `Symmetric`.
-    """
-
+    # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
+    # pair. Left in, single crossings would dominate: their terms go with one over that speed
     guard: float = GUARD
-    budget: int = KEPT
+    budget: int = KEPT  # as for `Symmetric`
 
     name = "event-aware"
     kind = "flow"
@@ -177,18 +164,13 @@ class EventAware(Method):
 
 @dataclass(frozen=True)
 class Forward(Method):
-    """The derivative of the steps that ran, by tangents that are carried along with them.
+    """The derivative of the steps that ran, by tangents that are carried along with them."""
 
-    Attributes:
-        saltation: whether every flip adds what moving its time does, as the method event-aware has it.
-        guard: as for `EventAware`. budget: as for `Symmetric`.
-        most: numbers that it differentiates by, at most.
-    """
-
+    # whether every flip adds what moving its time does, as the method event-aware has it
     saltation: bool = False
-    guard: float = GUARD
-    budget: int = KEPT
-    most: int = MOST
+    guard: float = GUARD  # as for `EventAware`
+    budget: int = KEPT  # as for `Symmetric`
+    most: int = MOST  # numbers that it differentiates by, at most
 
     name = "forward"
     description = "the derivative of the steps that ran, their decisions held fixed, by tangents"
@@ -265,17 +247,11 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """The gradient of a switched twin, another program, whose flips add nothing because no force jumps.
+    """The gradient of a switched twin, another program, whose flips add nothing because no force jumps."""
 
-    Attributes:
-        cutoff: of the twin; one with an onset.
-        onset: where its switching begins, as a share of the cutoff.
-        method: how the twin is differentiated.
-    """
-
-    cutoff: str = "quintic"
-    onset: float = ONSET_FRACTION
-    method: Method = field(default_factory=Symmetric)
+    cutoff: str = "quintic"  # of the twin; one with an onset
+    onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
+    method: Method = field(default_factory=Symmetric)  # how the twin is differentiated
 
     name = "surrogate"
     kind = "other program"

@@ -18,8 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from mdnum.errors import InputError
-from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
+from mdnum.gradients.crossings import Crossings, MetRows, crossings, push_through
 from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import (
     Direction,
@@ -36,41 +35,31 @@ from mdnum.md.pairforce import Forces, ManyBodyForce, PairForce
 
 
 class TangentCarry(NamedTuple):
-    """Tangents between two steps, user's order, one for each column.
+    """Tangents between two steps, user's order, one for each column."""
 
-    Attributes:
-        x: of the positions as if the box had no faces, at the step that comes next.
-        v: of the half-kicked velocities that lead there. total: of the sums of the loss.
-        waiting: of potential energy and virial, by flips since the last frame that the loss looked at.
-    """
-
+    # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
-    v: Float[Array, "columns 3 atoms"]
-    total: Any
+    v: Float[Array, "columns 3 atoms"]  # of the half-kicked velocities that lead there
+    total: Any  # of the sums of the loss
+    # of potential energy and virial, by flips since the last frame that the loss looked at
     waiting: Float[Array, "columns 2"]
 
 
 @dataclass(frozen=True)
 class StretchTangents:
-    """Tangents along one stretch of a run.
+    """Tangents along one stretch of a run."""
 
-    Attributes:
-        stretch: the steps. columns: the numbers by which it is differentiated.
-        x, v: tangents of the positions (as if the box had no faces) and of the full-step velocities in the
-            order of the stretch's list; None where they were not asked for.
-        crossings: its flips as events; None for a tape without flips.
-        dr: tangent of the distance of each crossing's pair at the crossing. dr_cut: of its cutoff.
-        total: of the sums of the loss up to here.
-    """
-
-    stretch: TapeStretch
-    columns: tuple[ParameterEntry, ...]
+    stretch: TapeStretch  # the steps
+    columns: tuple[ParameterEntry, ...]  # the numbers by which it is differentiated
+    # x, v: tangents of the positions (as if the box had no faces) and of the full-step velocities in the
+    # order of the stretch's list; None where they were not asked for
     x: Float[np.ndarray, "rows columns 3 atoms"] | None
     v: Float[np.ndarray, "rows columns 3 atoms"] | None
-    crossings: Crossings | None
+    crossings: Crossings | None  # its flips as events; None for a tape without flips
+    # tangent of the distance of each crossing's pair at the crossing
     dr: Float[np.ndarray, "crossings columns"] | None
-    dr_cut: Float[np.ndarray, "crossings columns"] | None
-    total: Any
+    dr_cut: Float[np.ndarray, "crossings columns"] | None  # of its cutoff
+    total: Any  # of the sums of the loss up to here
 
 
 def tangents(
@@ -106,14 +95,9 @@ def tangents(
     carry = TangentCarry(along.x, along.v, total, jnp.zeros((len(columns), 2)))
     for stretch in tape.forward():
         order = stretch.table.order
-        met = None
-        if stretch.ledger is not None:
-            met = crossings(
-                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, guard
-            )
-        elif saltation:
-            raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
-        crossed = None if met is None else met.on_device(len(stretch.x), simulation.atoms)
+        wanted = saltation or stretch.ledger is not None
+        met = crossings(simulation, stretch, guard) if wanted else None
+        crossed = None if met is None else met.rows(len(stretch.x))
         carry, (by_row, dr) = _stretch(
             force, simulation.integrator, jnp.asarray(simulation.masses[order]),
             simulation.tables(stretch.table), stretch.columns, stretch.bits, stretch.rows,
@@ -160,7 +144,7 @@ def _stretch(
     used,
     seen,
     looking,
-    crossed: Met | None,
+    crossed: MetRows | None,
     carry: TangentCarry,
     along: Direction,
     jumps: Float[Array, ""],
@@ -200,14 +184,15 @@ def _stretch(
         _, seen = jax.jvp(loss.observe, (frame, origin, around), (moving, start, here))
         return jax.tree.map(jnp.add, total, seen)
 
-    def push(row, told, see, met, carry: TangentCarry, along: Direction):
+    def push(row, told, see, span, carry: TangentCarry, along: Direction):
         """One column through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0
         dr, waiting = jnp.zeros(0), carry.waiting
         shift = (along.matrix.T @ row[3].astype(matrix.dtype)).astype(dtype)
-        if met is not None:
+        if crossed is not None:
+            met = crossed.row(span, x.shape[1])
             dr, (by_x, by_v), ahead = push_through(
                 met, dx - shift, dv, masses, integrator.timestep, along.r_cut, along.matrix
             )
@@ -231,11 +216,12 @@ def _stretch(
         return TangentCarry(after_x, after_v, total, waiting), (dx, dv), dr
 
     def step(carry, given):
-        row, told, see, met = given
-        after, here, dr = jax.vmap(lambda carry, along: push(row, told, see, met, carry, along))(carry, along)
+        row, told, see, span = given
+        after, here, dr = jax.vmap(partial(push, row, told, see, span))(carry, along)
         return after, (here if states else (), dr)
 
-    return over_rows(step, carry, (rows, bits, seen, crossed), used)
+    spans = None if crossed is None else crossed.spans
+    return over_rows(step, carry, (rows, bits, seen, spans), used)
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

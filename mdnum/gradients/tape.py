@@ -37,26 +37,22 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """Some steps of one list, in the order of its atoms.
+    """Some steps of one list, in the order of its atoms."""
 
-    Attributes:
-        first, rows: its first step and the number of rows in use; those beyond are void.
-        x, v: wrapped positions and velocities. images: lattice vectors taken off so far.
-        bits: decisions. x_before: positions of the step before.
-        potential, virial: by row. table: the list. ledger: its flips; None where they were not asked for.
-    """
-
+    # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
     rows: int
+    # x, v: wrapped positions and velocities
     x: Float[np.ndarray, "room 3 atoms"]
     v: Float[np.ndarray, "room 3 atoms"]
-    images: Int[np.ndarray, "room 3 atoms"]
-    bits: np.ndarray
-    x_before: Float[np.ndarray, "3 atoms"]
+    images: Int[np.ndarray, "room 3 atoms"]  # lattice vectors taken off so far
+    bits: np.ndarray  # decisions
+    x_before: Float[np.ndarray, "3 atoms"]  # positions of the step before
+    # potential, virial: by row
     potential: Float[np.ndarray, "room"]
     virial: Float[np.ndarray, "room"]
-    table: PairTable
-    ledger: Ledger | None = None
+    table: PairTable  # the list
+    ledger: Ledger | None = None  # its flips; None where they were not asked for
 
     @property
     def nbytes(self) -> int:
@@ -102,15 +98,10 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
 
 
 class Pace(NamedTuple):
-    """How often a loss looks.
+    """How often a loss looks."""
 
-    Attributes:
-        between: steps from one frame to the next; 0 where they are not a series at equal times.
-        first: step of the first frame.
-    """
-
-    between: Int[Array, ""]
-    first: Int[Array, ""]
+    between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
+    first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
         """Frames per time around a step: by how many of them a jump just before this step comes earlier when

@@ -43,19 +43,14 @@ _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
-    """Everything that a rollout can be differentiated by.
+    """Everything that a rollout can be differentiated by."""
 
-    Attributes:
-        model: the quantities of the force. numbers: those of the integrator.
-        x, v: wrapped positions and velocities of step 0, user's order.
-        scale: a common factor of the box and of all positions, 1.
-    """
-
-    model: Any
-    numbers: Any
+    model: Any  # the quantities of the force
+    numbers: Any  # those of the integrator
+    # x, v: wrapped positions and velocities of step 0, user's order
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
-    scale: Float[Array, ""]
+    scale: Float[Array, ""]  # a common factor of the box and of all positions, 1
 
 
 class StepEnds(NamedTuple):
@@ -68,11 +63,7 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """What does not change along a run and is not differentiated; quantities are those of the inputs.
-
-    Attributes:
-        images: lattice vectors taken off the positions of step 0. The rest as in a rollout.
-    """
+    """What does not change along a run and is not differentiated; quantities are those of the inputs."""
 
     force: Any
     integrator: Any
@@ -80,34 +71,26 @@ class RunConstants(NamedTuple):
     half_skin: Float[Array, ""]
     loss: Any
     around: LossContext
+    # lattice vectors taken off the positions of step 0. The rest as in a rollout
     images: Int[Array, "3 atoms"]
 
 
 class Place(NamedTuple):
-    """Where the program can be continued, as far as that has no derivative, user's order.
+    """Where the program can be continued, as far as that has no derivative, user's order."""
 
-    Attributes:
-        step: the step whose forces come next. images: lattice vectors taken off so far.
-        home: wrapped positions at which the list was built. built: at which step.
-    """
-
-    step: Int[Array, ""]
-    images: Int[Array, "3 atoms"]
-    home: Float[Array, "3 atoms"]
-    built: Int[Array, ""]
+    step: Int[Array, ""]  # the step whose forces come next
+    images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
+    home: Float[Array, "3 atoms"]  # wrapped positions at which the list was built
+    built: Int[Array, ""]  # at which step
 
 
 class ChunkRecord(NamedTuple):
-    """What a chunk leaves beside its end.
+    """What a chunk leaves beside its end."""
 
-    Attributes:
-        place: where it ended. rows: steps done. finite: whether all numbers were.
-        x, v, bits: of each step, in the list's order, as a rollout records them.
-    """
-
-    place: Place
-    rows: Int[Array, ""]
-    finite: Bool[Array, ""]
+    place: Place  # where it ended
+    rows: Int[Array, ""]  # steps done
+    finite: Bool[Array, ""]  # whether all numbers were
+    # x, v, bits: of each step, in the list's order, as a rollout records them
     x: Float[Array, "chunk 3 atoms"]
     v: Float[Array, "chunk 3 atoms"]
     bits: UInt8[Array, "chunk words atoms"]
@@ -297,12 +280,9 @@ class ChunkedProgram:
 
 @dataclass(frozen=True)
 class Unrolled(Method):
-    """The derivative of the steps that ran, by JAX.
+    """The derivative of the steps that ran, by JAX."""
 
-    Attributes:
-        budget: bytes of states that are kept, evenly spread; those between two of them are made again.
-    """
-
+    # bytes of states that are kept, evenly spread; those between two of them are made again
     budget: int = KEPT
 
     name = "unrolled"

@@ -22,19 +22,14 @@ from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):
-    """A parallelepiped box. Usable on the host (numpy leaves) and in jit (jax leaves).
+    """A parallelepiped box. Usable on the host (numpy leaves) and in jit (jax leaves)."""
 
-    Attributes:
-        matrix: lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector.
-        inverse: columns give fractional coordinates of the periodic axes; 0 for a free axis, shape (3, 3).
-        pbc: periodicity per axis.
-        orthorhombic: lattice vectors lie along x, y and z.
-    """
-
+    # lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector
     matrix: Float[np.ndarray | jax.Array, "3 3"]
+    # columns give fractional coordinates of the periodic axes; 0 for a free axis, shape (3, 3)
     inverse: Float[np.ndarray | jax.Array, "3 3"]
-    pbc: tuple[bool, bool, bool] = eqx.field(static=True)
-    orthorhombic: bool = eqx.field(static=True)
+    pbc: tuple[bool, bool, bool] = eqx.field(static=True)  # periodicity per axis
+    orthorhombic: bool = eqx.field(static=True)  # lattice vectors lie along x, y and z
 
     @classmethod
     def create(cls, matrix, pbc: Any = True) -> Cell:
@@ -61,7 +56,7 @@ class Cell(eqx.Module):
                 remedy="Give the structure a cell or set structure.pbc = false for that axis",
             )
         full = complete(matrix, flags)
-        if abs(np.linalg.det(full)) < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
+        if abs(np.linalg.det(full)) < 1e-9 * np.prod(np.linalg.norm(full, axis=1)):
             raise InputError("the lattice vectors span no volume")
         inverse = np.linalg.inv(full)
         inverse[:, ~flags] = 0.0

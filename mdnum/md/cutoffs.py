@@ -24,18 +24,13 @@ from mdnum.registry import Registry
 
 
 class AtCutoff(NamedTuple):
-    """Constants of the bare potential at its cutoff, one per pair type (or broadcast per pair).
+    """Constants of the bare potential at its cutoff, one per pair type (or broadcast per pair)."""
 
-    Attributes:
-        r_cut, r_onset: cutoff and onset of switching, length.
-        energy: u(r_cut).
-        slope: du/dr at r_cut.
-    """
-
+    # r_cut, r_onset: cutoff and onset of switching, length
     r_cut: Float[Any, "..."]
     r_onset: Float[Any, "..."]
-    energy: Float[Any, "..."]
-    slope: Float[Any, "..."]
+    energy: Float[Any, "..."]  # u(r_cut)
+    slope: Float[Any, "..."]  # du/dr at r_cut
 
 
 class Undecided(Exception):

@@ -72,17 +72,12 @@ class Langevin(Integrator):
 
     Noise comes from a counter-based key folded with the step, so two runs can share it and a resumed run
     continues it.
-
-    Attributes:
-        friction: 1/time.
-        kT: temperature as an energy.
-        key: counter-based random key.
     """
 
     name = "langevin"
-    friction: Float[Array, ""]
-    kT: Float[Array, ""]
-    key: Array
+    friction: Float[Array, ""]  # 1/time
+    kT: Float[Array, ""]  # temperature as an energy
+    key: Array  # counter-based random key
 
     def drift(self, x, v, masses, step, order):
         half = (0.5 * self.timestep).astype(x.dtype)

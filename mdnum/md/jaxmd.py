@@ -199,7 +199,6 @@ class PairSearch:
 
     Args:
         cell: lattice vectors as rows, length.
-        pbc: which axes are periodic.
         r_list: search radius, length (cutoff plus skin).
 
     Raises:
@@ -327,19 +326,12 @@ _FIRE_SCALE = 2.0**20
 
 @dataclass(frozen=True)
 class Relaxed:
-    """Where a relaxation ended.
+    """Where a relaxation ended."""
 
-    Attributes:
-        positions: (atoms, 3), length; not folded back into the cell.
-        steps: FIRE steps taken.
-        force_max: largest force on an atom at the end, force.
-        converged: whether force_max is within the tolerance asked for.
-    """
-
-    positions: np.ndarray
-    steps: int
-    force_max: float
-    converged: bool
+    positions: np.ndarray  # (atoms, 3), length; not folded back into the cell
+    steps: int  # FIRE steps taken
+    force_max: float  # largest force on an atom at the end, force
+    converged: bool  # whether force_max is within the tolerance asked for
 
 
 def relax(

@@ -59,18 +59,12 @@ def power_of_two(x: float) -> float:
 
 @dataclass(frozen=True)
 class Lattice:
-    """The units in which a run counts.
+    """The units in which a run counts."""
 
-    Attributes:
-        spacing: of positions, length, the same along all axes.
-        force: of pair forces, energy/length.
-        energy: of pair energies, virials and kinetic energies.
-        stretch: largest relative change of an edge of the box that made it a whole number of spacings.
-    """
-
-    spacing: float
-    force: float
-    energy: float
+    spacing: float  # of positions, length, the same along all axes
+    force: float  # of pair forces, energy/length
+    energy: float  # of pair energies, virials and kinetic energies
+    # largest relative change of an edge of the box that made it a whole number of spacings
     stretch: float = 0.0
 
     @classmethod
@@ -171,12 +165,9 @@ class LatticeDecider(PairDecider):
     The squared distance is a whole number of squared spacings. Each convention becomes `r2 < limit` with a
     whole limit; the threshold that margins are measured from lies half a step below it, so no margin is zero
     and none has a rounding error.
-
-    Attributes:
-        spacing: of the lattice, length.
     """
 
-    spacing: float = 1.0
+    spacing: float = 1.0  # of the lattice, length
 
     @property
     def space(self) -> str:
@@ -232,19 +223,14 @@ _ROOM = 62 - _SHIFT
 
 
 class LatticeStep(Integrator):
-    """Kicks, drifts and sums in whole numbers: what the schemes on a lattice share.
+    """Kicks, drifts and sums in whole numbers: what the schemes on a lattice share."""
 
-    Attributes:
-        lattice: the units.
-        impulse: unit of momentum: that of force times half a time step.
-        stride: spacings that an atom of unit mass moves in a step for each unit of momentum.
-        zero: an integer zero that XLA must not know.
-    """
-
-    lattice: Lattice = eqx.field(static=True, kw_only=True)
+    lattice: Lattice = eqx.field(static=True, kw_only=True)  # the units
+    # unit of momentum: that of force times half a time step
     impulse: Float[Array, ""] = eqx.field(kw_only=True)
+    # spacings that an atom of unit mass moves in a step for each unit of momentum
     stride: Float[Array, ""] = eqx.field(kw_only=True)
-    zero: Int[Array, ""] = eqx.field(kw_only=True)
+    zero: Int[Array, ""] = eqx.field(kw_only=True)  # an integer zero that XLA must not know
 
     def momentum(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
         """Momenta in units of the impulse; a velocity of this run gives its own back exactly."""
@@ -282,17 +268,13 @@ class LatticeVerlet(LatticeStep, VelocityVerlet):
 
 
 class LatticeLangevin(LatticeStep, Langevin):
-    """BAOAB in whole numbers; what friction forgets goes into the bath.
+    """BAOAB in whole numbers; what friction forgets goes into the bath."""
 
-    Attributes:
-        kept: numerator of the factor that friction leaves of a momentum in a step, over 2^24.
-        spread: size of the noise of an atom of unit mass, in units of momentum.
-        period: steps after which the bath is put aside.
-    """
-
+    # numerator of the factor that friction leaves of a momentum in a step, over 2^24
     kept: Int[Array, ""] = eqx.field(kw_only=True)
+    # size of the noise of an atom of unit mass, in units of momentum
     spread: Float[Array, ""] = eqx.field(kw_only=True)
-    period: Int[Array, ""] = eqx.field(kw_only=True)
+    period: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
         """The momentum that noise adds after a step, from the counter alone: whole units."""
@@ -459,14 +441,10 @@ class LatticeJudge(SlotJudge):
 
 
 class LatticeForce(PairForce):
-    """Forces and decisions of a cut pair potential on a lattice.
+    """Forces and decisions of a cut pair potential on a lattice."""
 
-    Attributes:
-        lattice: the units.
-        closest: squared distance below which a pair leaves the range of exact sums.
-    """
-
-    lattice: Lattice = eqx.field(static=True, kw_only=True)
+    lattice: Lattice = eqx.field(static=True, kw_only=True)  # the units
+    # squared distance below which a pair leaves the range of exact sums
     closest: Float[Array, ""] = eqx.field(kw_only=True)
 
     @classmethod

@@ -20,18 +20,13 @@ from mdnum.md.jaxmd import Format, NeighborList, displacement, neighbor_vectors,
 
 @dataclass(frozen=True)
 class Smoothness:
-    """What happens to the energy when a pair crosses r_cut.
+    """What happens to the energy when a pair crosses r_cut."""
 
-    Attributes:
-        order: continuous derivatives of the energy at r_cut: -1 where the energy itself jumps, 0 where only
-            the force does, math.inf where every derivative vanishes.
-        energy_jump: largest jump of the energy at one crossing, energy.
-        force_jump: largest jump of a force at one crossing, energy/length.
-    """
-
+    # continuous derivatives of the energy at r_cut: -1 where the energy itself jumps, 0 where only the force
+    # does, math.inf where every derivative vanishes
     order: float
-    energy_jump: float
-    force_jump: float
+    energy_jump: float  # largest jump of the energy at one crossing, energy
+    force_jump: float  # largest jump of a force at one crossing, energy/length
 
 
 #: Nothing is promised.
@@ -113,25 +108,18 @@ class StillingerWeber(ManyBody):
 
     Smooth at its cutoff to every order: a flip changes neither energy nor force.
 
-    Attributes:
-        epsilon: energy scale, energy.
-        sigma: length scale, length.
-        a: cutoff in sigma.
-        A, B: strength of the pair term and of its repulsion (p = 4, q = 0).
-        strength: lambda, of the angular term.
-        gamma: decay of the angular term.
-
     Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7; checked against a plain
     numpy evaluation of those equations (tests/oracles_manybody.py).
     """
 
-    epsilon: float = eqx.field(static=True, default=2.1683)
-    sigma: float = eqx.field(static=True, default=2.0951)
-    a: float = eqx.field(static=True, default=1.80)
+    epsilon: float = eqx.field(static=True, default=2.1683)  # energy scale, energy
+    sigma: float = eqx.field(static=True, default=2.0951)  # length scale, length
+    a: float = eqx.field(static=True, default=1.80)  # cutoff in sigma
+    # A, B: strength of the pair term and of its repulsion (p = 4, q = 0)
     A: float = eqx.field(static=True, default=7.049556277)
     B: float = eqx.field(static=True, default=0.6022245584)
-    strength: float = eqx.field(static=True, default=21.0)
-    gamma: float = eqx.field(static=True, default=1.20)
+    strength: float = eqx.field(static=True, default=21.0)  # lambda, of the angular term
+    gamma: float = eqx.field(static=True, default=1.20)  # decay of the angular term
     name: str = eqx.field(static=True, kw_only=True, default="stillinger-weber")
     smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=Smoothness(math.inf, 0.0, 0.0))
     sources: tuple[str, ...] = eqx.field(
@@ -385,36 +373,30 @@ def _constants(noun: str, sets: dict[str, dict[str, Any]], name: str) -> dict[st
 
 @dataclass(frozen=True)
 class Setfl:
-    """An embedded-atom table as the file has it.
+    """An embedded-atom table as the file has it."""
 
-    Attributes:
-        element: chemical symbol.
-        comment: the three lines at the head of the file.
-        drho, dr: grid spacings of the density and of the distance (length).
-        r_cut: cutoff, length.
-        embedding: F on 0, drho, 2 drho, ...; energy.
-        density: rho on 0, dr, 2 dr, ...
-        r_pair: r phi(r) on 0, dr, 2 dr, ...; length times energy.
-    """
-
-    element: str
-    comment: tuple[str, ...]
+    element: str  # chemical symbol
+    comment: tuple[str, ...]  # the three lines at the head of the file
+    # drho, dr: grid spacings of the density and of the distance (length)
     drho: float
     dr: float
-    r_cut: float
-    embedding: Float[np.ndarray, "densities"]
-    density: Float[np.ndarray, "radii"]
-    r_pair: Float[np.ndarray, "radii"]
+    r_cut: float  # cutoff, length
+    embedding: Float[np.ndarray, "densities"]  # F on 0, drho, 2 drho, ...; energy
+    density: Float[np.ndarray, "radii"]  # rho on 0, dr, 2 dr, ...
+    r_pair: Float[np.ndarray, "radii"]  # r phi(r) on 0, dr, 2 dr, ...; length times energy
 
 
-def read_setfl(path: Path) -> Setfl:
+def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     """Read a table; numbers may be broken into lines in any way, and keep every digit.
 
     jax-md's own reader rounds everything to float32, which costs the forces of copper 4e-4 eV/Å.
 
+    Args:
+        symbols: of the atoms, to be compared with the table's element.
+
     Raises:
-        InputError: unreadable, not a setfl table, more than one element, numbers that are missing, left
-            over or not finite, or a table that ends before its cutoff.
+        InputError: unreadable, not a setfl table, more than one element or another one, numbers that are
+            missing, left over or not finite, or a table that ends before its cutoff.
 
     Source: the DYNAMO setfl format as LAMMPS documents it (pair_style eam/alloy).
     """
@@ -442,6 +424,12 @@ def read_setfl(path: Path) -> Setfl:
             f"a table for {len(elements)} elements ({', '.join(elements)}); one is supported",
             where=where,
             remedy="Give a table of a single element",
+        )
+    if others := sorted(set(symbols) - set(elements)):
+        raise InputError(
+            f"a table for {elements[0]}, but the structure holds {', '.join(others)}",
+            where=where,
+            remedy="Correct the structure or potential.file",
         )
     # the line of the element: atomic number, mass, lattice constant, lattice; not needed
     words = " ".join(lines[6:]).split()
@@ -473,17 +461,14 @@ class Spline(eqx.Module):
 
     The interpolant of scipy's InterpolatedUnivariateSpline(k=3), hence of ASE's EAM. Outside the table the
     first and last cubic are carried on; see `inside`.
-
-    Attributes:
-        coefficients: of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals).
-        start, step: of the grid.
-        intervals: how many.
     """
 
+    # of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals)
     coefficients: Float[Array, "4 intervals"]
+    # start, step: of the grid
     start: float = eqx.field(static=True)
     step: float = eqx.field(static=True)
-    intervals: int = eqx.field(static=True)
+    intervals: int = eqx.field(static=True)  # how many
 
     @classmethod
     def through(cls, values: Float[np.ndarray, "points"], step: float, start: float = 0.0) -> Spline:
@@ -533,9 +518,6 @@ class EmbeddedAtom(ManyBody):
     jax-md's sums are right once it gets a list without self entries; its own list has them and counts every
     atom's density at r = 0, and its splines round the table to float32 and return 0 beyond it.
 
-    Attributes:
-        pair, density, embedding: phi, density and F as splines.
-
     Error: a density off the embedding table makes the energy NaN, forces too. The spline's own error against
     the form it tabulates is the table's, not counted here.
 
@@ -543,6 +525,7 @@ class EmbeddedAtom(ManyBody):
     evaluation in extended precision (tests/oracles_manybody.py).
     """
 
+    # pair, density, embedding: phi, density and F as splines
     pair: Spline
     density: Spline
     embedding: Spline
@@ -581,25 +564,10 @@ class EmbeddedAtom(ManyBody):
 
 
 def embedded_atom(
-    path: Path | str, symbols: Sequence[str] | None = None, pbc: tuple[bool, bool, bool] = (True, True, True)
+    path: Path | str, symbols: Sequence[str] = (), pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> EmbeddedAtom:
-    """The embedded-atom potential of a setfl table.
-
-    Args:
-        path: a single-element .eam.alloy file.
-        symbols: of the atoms, to be compared with the table's element.
-
-    Raises:
-        InputError: the file is no such table, or it is for another element.
-    """
-    table = read_setfl(Path(path))
-    others = sorted(set(symbols or ()) - {table.element})
-    if others:
-        raise InputError(
-            f"a table for {table.element}, but the structure holds {', '.join(others)}",
-            where=str(path),
-            remedy="Correct the structure or potential.file",
-        )
+    """The embedded-atom potential of a setfl table, read as `read_setfl` does."""
+    table = read_setfl(Path(path), symbols)
     r = table.dr * np.arange(len(table.r_pair))
     # the file holds r phi: phi at r = 0 is unknown, so its spline starts one step later, as ASE's does
     pair = Spline.through(table.r_pair[1:] / r[1:], table.dr, start=table.dr)

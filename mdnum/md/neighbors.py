@@ -22,18 +22,12 @@ SLOTS = 8
 
 @dataclass(frozen=True)
 class RebuildRule:
-    """When a list is rebuilt, in the words of LAMMPS's neigh_modify.
+    """When a list is rebuilt, in the words of LAMMPS's neigh_modify."""
 
-    Attributes:
-        skin: r_list - r_cut, length.
-        every: a list may be rebuilt only at multiples of this many steps after its build.
-        delay: and not before this many steps.
-        check: rebuild only where an atom has moved by more than skin/2 (else blindly, whenever allowed).
-    """
-
-    skin: float
-    every: int = 1
-    delay: int = 0
+    skin: float  # r_list - r_cut, length
+    every: int = 1  # a list may be rebuilt only at multiples of this many steps after its build
+    delay: int = 0  # and not before this many steps
+    # rebuild only where an atom has moved by more than skin/2 (else blindly, whenever allowed)
     check: bool = True
 
     @property
@@ -50,22 +44,15 @@ class RebuildRule:
 
 @dataclass(frozen=True)
 class PairTable:
-    """The pairs of one list, both directions, as the force loop reads them.
+    """The pairs of one list, both directions, as the force loop reads them."""
 
-    Attributes:
-        found: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
-            shape (slots, atoms); where the search left it, on the host or on a device.
-        sorting: sorted atom k is atom sorting[k]; where the search left it.
-        r_list: list radius, length.
-        occupancy: largest number of neighbors of an atom.
-        build_seconds: time the search took.
-    """
-
+    # neighbor of each slot and atom, in sorted labels, padded with the number of atoms, shape (slots, atoms);
+    # where the search left it, on the host or on a device
     found: Int[np.ndarray | Array, "slots atoms"]
-    sorting: Int[np.ndarray | Array, "atoms"]
-    r_list: float
-    occupancy: int
-    build_seconds: float
+    sorting: Int[np.ndarray | Array, "atoms"]  # sorted atom k is atom sorting[k]; where the search left it
+    r_list: float  # list radius, length
+    occupancy: int  # largest number of neighbors of an atom
+    build_seconds: float  # time the search took
 
     @cached_property
     def index(self) -> Int[np.ndarray, "slots atoms"]:
@@ -76,6 +63,13 @@ class PairTable:
     def order(self) -> Int[np.ndarray, "atoms"]:
         """`sorting`, on the host."""
         return np.asarray(self.sorting)
+
+    @cached_property
+    def place(self) -> Int[np.ndarray, "atoms"]:
+        """Where each atom is in the sorted order: the inverse of `order`."""
+        place = np.empty_like(self.order)
+        place[self.order] = np.arange(len(place))
+        return place
 
     @property
     def slots(self) -> int:
@@ -177,23 +171,16 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """A list that grows its capacity when it must and remembers where it was built.
+    """A list that grows its capacity when it must and remembers where it was built."""
 
-    Attributes:
-        builder: the neighbor search.
-        rule: when to rebuild.
-        r_cut: largest interaction radius, length.
-        slack: room kept beyond the largest occupancy seen, so that a denser moment does not recompile.
-        guard: added to the list radius to cover the rounding of displacements in a narrow state, length.
-        slots: room per atom; 0 lets the density decide.
-    """
-
-    builder: ListBuilder
-    rule: RebuildRule
-    r_cut: float
+    builder: ListBuilder  # the neighbor search
+    rule: RebuildRule  # when to rebuild
+    r_cut: float  # largest interaction radius, length
+    # room kept beyond the largest occupancy seen, so that a denser moment does not recompile
     slack: float = 1.04
+    # added to the list radius to cover the rounding of displacements in a narrow state, length
     guard: float = 0.0
-    slots: int = field(default=0)
+    slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
         """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.

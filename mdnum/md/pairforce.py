@@ -44,42 +44,27 @@ _FEW_TYPES = 6
 
 
 class Forces(NamedTuple):
-    """What one evaluation gives.
+    """What one evaluation gives."""
 
-    Attributes:
-        force: energy/length, shape (3, atoms).
-        energy: energy of each atom, half of its pairs' (or, where a potential has no such division, the
-            total on the first atom), shape (atoms,).
-        virial: sum over pairs of r_ij · F_ij, energy.
-        decisions: None where they were not asked for.
-    """
-
-    force: Float[Array, "3 atoms"]
+    force: Float[Array, "3 atoms"]  # energy/length, shape (3, atoms)
+    # energy of each atom, half of its pairs' (or, where a potential has no such division, the total on the
+    # first atom), shape (atoms,)
     energy: Float[Array, "atoms"]
-    virial: Float[Array, ""]
-    decisions: Decisions | None
+    virial: Float[Array, ""]  # sum over pairs of r_ij · F_ij, energy
+    decisions: Decisions | None  # None where they were not asked for
 
 
 class PairForce(eqx.Module):
-    """Forces and decisions of a cut pair potential.
+    """Forces and decisions of a cut pair potential."""
 
-    Attributes:
-        model: the potential with its cutoff.
-        cell: the box.
-        zero: an integer zero that XLA must not know (see precision.exact).
-        thresholds: of the pair decision, by pair type, in the dtype and space that it compares in.
-        decider: its convention.
-        policy: dtype by role.
-        reduction: order of the sum over neighbors.
-    """
-
-    model: CutPotential
-    cell: Cell
-    zero: Int[Array, ""]
+    model: CutPotential  # the potential with its cutoff
+    cell: Cell  # the box
+    zero: Int[Array, ""]  # an integer zero that XLA must not know (see precision.exact)
+    # of the pair decision, by pair type, in the dtype and space that it compares in
     thresholds: Real[Array, "types"]
-    decider: PairDecider = eqx.field(static=True)
-    policy: PrecisionPolicy = eqx.field(static=True)
-    reduction: Reduction = eqx.field(static=True, default=Sequential())
+    decider: PairDecider = eqx.field(static=True)  # its convention
+    policy: PrecisionPolicy = eqx.field(static=True)  # dtype by role
+    reduction: Reduction = eqx.field(static=True, default=Sequential())  # order of the sum over neighbors
 
     @classmethod
     def create(cls, model: CutPotential, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
@@ -329,14 +314,10 @@ def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
 
 
 class ManyBodyForce(eqx.Module):
-    """Forces of an energy function over a jax-md neighbor list, by automatic differentiation.
+    """Forces of an energy function over a jax-md neighbor list, by automatic differentiation."""
 
-    Attributes:
-        potential: energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`.
-        cell, zero, thresholds, decider, policy: as in PairForce. The energy itself is always float64.
-    """
-
-    potential: eqx.Module
+    potential: eqx.Module  # energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`
+    # cell, zero, thresholds, decider, policy: as in PairForce. The energy itself is always float64
     cell: Cell
     zero: Int[Array, ""]
     thresholds: Float[Array, "types"]
@@ -400,16 +381,11 @@ class ManyBodyForce(eqx.Module):
 
 
 class MdState(NamedTuple):
-    """Between two force evaluations, in the order of the tables.
+    """Between two force evaluations, in the order of the tables."""
 
-    Attributes:
-        step: the step whose forces come next.
-        x: wrapped positions at that step, shape (3, atoms).
-        v: velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms).
-    """
-
-    step: Int[Array, ""]
-    x: Float[Array, "3 atoms"]
+    step: Int[Array, ""]  # the step whose forces come next
+    x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
+    # velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms)
     v: Float[Array, "3 atoms"]
 
 

@@ -69,13 +69,10 @@ class LennardJones(PairPotential):
 
 
 class Morse(PairPotential):
-    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0))).
-
-    Attributes:
-        depth: energy; alpha: 1/length; r0: length; each of shape (types,).
-    """
+    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0)))."""
 
     name = "morse"
+    # depth: energy; alpha: 1/length; r0: length; each of shape (types,)
     depth: Float[Array, "types"]
     alpha: Float[Array, "types"]
     r0: Float[Array, "types"]
@@ -87,13 +84,10 @@ class Morse(PairPotential):
 
 
 class SoftSphere(PairPotential):
-    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside.
-
-    Attributes:
-        sigma: length; epsilon: energy; alpha: exponent above 1; each of shape (types,).
-    """
+    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside."""
 
     name = "soft-sphere"
+    # sigma: length; epsilon: energy; alpha: exponent above 1; each of shape (types,)
     sigma: Float[Array, "types"]
     epsilon: Float[Array, "types"]
     alpha: Float[Array, "types"]
@@ -118,18 +112,12 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class CutPotential(eqx.Module):
-    """A pair potential with its cutoff: what the force loop evaluates.
+    """A pair potential with its cutoff: what the force loop evaluates."""
 
-    Attributes:
-        potential: bare potential, parameters per pair type.
-        cutoff: how it ends.
-        r_cut: cutoff per pair type, length, shape (types,).
-        r_onset: onset of switching per pair type (equal to r_cut where there is none), shape (types,).
-    """
-
-    potential: PairPotential
-    cutoff: Cutoff = eqx.field(static=True)
-    r_cut: Float[Array, "types"]
+    potential: PairPotential  # bare potential, parameters per pair type
+    cutoff: Cutoff = eqx.field(static=True)  # how it ends
+    r_cut: Float[Array, "types"]  # cutoff per pair type, length, shape (types,)
+    # onset of switching per pair type (equal to r_cut where there is none), shape (types,)
     r_onset: Float[Array, "types"]
 
     @property

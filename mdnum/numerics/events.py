@@ -19,17 +19,13 @@ class Threshold:
 
     The comparison is part of the physics: codes that agree on a cutoff still disagree on `<` against `<=`
     and on comparing r or r², and then on pairs that sit at the cutoff.
-
-    Attributes:
-        value: the threshold in the quantity's own space, exactly as the program compares it: a number, or an
-            array that a compiled program is given.
-        comparison: "<" or "<=": the decision is yes when `quantity comparison value`.
-        space: name of the quantity's space, for example "r", "r2" or "height".
     """
 
+    # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
+    # that a compiled program is given
     value: Any
-    comparison: str = "<"
-    space: str = "r"
+    comparison: str = "<"  # "<" or "<=": the decision is yes when `quantity comparison value`
+    space: str = "r"  # name of the quantity's space, for example "r", "r2" or "height"
 
     def __post_init__(self):
         if self.comparison not in INCLUSIVE:
@@ -55,14 +51,11 @@ class Hysteresis:
     A quantity that wavers about one threshold flips its decision each time. With a gap between the two it
     flips once; the gap is to be wider than the noise. A Verlet list does the same with its skin: it is
     built when the skin is used up, not whenever an atom moves.
-
-    Attributes:
-        enter: where a no turns yes.
-        leave: where a yes stays yes; turning no needs this threshold to be passed. The same space, and at
-            least as high as enter.
     """
 
-    enter: Threshold
+    enter: Threshold  # where a no turns yes
+    # where a yes stays yes; turning no needs this threshold to be passed. The same space, and at least as
+    # high as enter
     leave: Threshold
 
     def __post_init__(self):

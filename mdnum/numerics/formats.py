@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,24 +17,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from mdnum.errors import InputError
-from mdnum.numerics.roles import ALL
 
 
 @dataclass(frozen=True)
 class FloatFormat:
-    """A binary floating-point format with subnormals and infinities, as IEEE 754 arranges them.
+    """A binary floating-point format with subnormals and infinities, as IEEE 754 arranges them."""
 
-    Attributes:
-        name: such as "tf32".
-        bits: width in memory (TF32 lives in 32).
-        significand: binary digits of the significand, the implicit one included.
-        exponent: bits of the exponent.
-    """
-
-    name: str
-    bits: int
-    significand: int
-    exponent: int
+    name: str  # such as "tf32"
+    bits: int  # width in memory (TF32 lives in 32)
+    significand: int  # binary digits of the significand, the implicit one included
+    exponent: int  # bits of the exponent
 
     @property
     def emin(self) -> int:
@@ -174,24 +166,6 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
     return _rounded(x, name, up_or_down)
 
 
-def cast(
-    x: Float[Array, "..."],
-    dtype: str,
-    rounding: Literal["nearest", "stochastic"] = "nearest",
-    key: Array | None = None,
-) -> Float[Array, "..."]:
-    """x as an array of a dtype, rounded once, to nearest or stochastically (`RolePrecision.rounding`).
-
-    Raises:
-        InputError: stochastic without a key.
-    """
-    if rounding == "nearest":
-        return round_to(x, dtype).astype(ALL[dtype])
-    if key is None:
-        raise InputError("stochastic rounding needs a key")
-    return stochastic_round(x, dtype, key).astype(ALL[dtype])
-
-
 @jax.custom_jvp
 def quantize(
     x: Float[Array, "..."],
@@ -221,19 +195,12 @@ def _quantize_jvp(primals, tangents):
 
 
 class ScaledGradient(NamedTuple):
-    """A loss with its gradient.
+    """A loss with its gradient."""
 
-    Attributes:
-        value: the loss, in its own dtype.
-        gradient: as the differentiated argument, leaves in float64.
-        finite: whether every number of the gradient is finite.
-        scale: the factor that was used.
-    """
-
-    value: Float[Array, ""]
-    gradient: PyTree
-    finite: Bool[Array, ""]
-    scale: Float[Array, ""]
+    value: Float[Array, ""]  # the loss, in its own dtype
+    gradient: PyTree  # as the differentiated argument, leaves in float64
+    finite: Bool[Array, ""]  # whether every number of the gradient is finite
+    scale: Float[Array, ""]  # the factor that was used
 
 
 def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: Any) -> ScaledGradient:

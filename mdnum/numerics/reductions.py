@@ -139,12 +139,9 @@ class FixedPoint(Reduction):
     The same bits in every order, at the cost of one rounding per term. Error: at most n * 2^(-bits - 1)
     plus the rounding of the result. A term beyond 2^(62 - bits) / n could overflow the sum: the answer is
     then NaN, never a wrapped number.
-
-    Attributes:
-        bits: binary digits after the point, from -1000 to 1000.
     """
 
-    bits: int = 40
+    bits: int = 40  # binary digits after the point, from -1000 to 1000
 
     def __post_init__(self):
         if abs(self.bits) > 1000:

@@ -57,20 +57,15 @@ def check_role(role: str, dtype: str) -> None:
 
 @dataclass(frozen=True)
 class PrecisionPolicy:
-    """The dtype of each role of a number in a rollout of molecular dynamics.
+    """The dtype of each role of a number in a rollout of molecular dynamics."""
 
-    Attributes:
-        state: positions and velocities as they are carried from step to step; "lattice" for whole numbers.
-        force: distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements
-            are those of the decision, rounded, and all that follows has sixteen bits up to the sum.
-        decision: the quantity and the threshold that a decision compares.
-        accumulate: the sums over neighbors.
-    """
-
+    # positions and velocities as they are carried from step to step; "lattice" for whole numbers
     state: str = "float64"
+    # distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements are those
+    # of the decision, rounded, and all that follows has sixteen bits up to the sum
     force: str = "float64"
-    decision: str = "float64"
-    accumulate: str = "float64"
+    decision: str = "float64"  # the quantity and the threshold that a decision compares
+    accumulate: str = "float64"  # the sums over neighbors
 
     def __post_init__(self):
         for role in ("state", "force", "decision", "accumulate"):
@@ -92,26 +87,17 @@ class PrecisionPolicy:
 
 @dataclass(frozen=True)
 class RolePrecision:
-    """The dtype of each role of a number in a small world, where sixteen bits are allowed too.
+    """The dtype of each role of a number in a small world, where sixteen bits are allowed too."""
 
-    Attributes:
-        state: what is carried from step to step.
-        arithmetic: the operations between one state and the next.
-        decision: the quantity and the threshold that a decision compares.
-        accumulate: sums; wider than `arithmetic` it is "store low, accumulate high".
-        loss: the scalar that is differentiated.
-        rounding: how a result becomes a state: "nearest" (ties to even) or "stochastic" (up or down with
-            probabilities that make the mean exact).
-        seed: of stochastic rounding.
-    """
-
-    state: str = "float64"
-    arithmetic: str = "float64"
-    decision: str = "float64"
-    accumulate: str = "float64"
-    loss: str = "float64"
+    state: str = "float64"  # what is carried from step to step
+    arithmetic: str = "float64"  # the operations between one state and the next
+    decision: str = "float64"  # the quantity and the threshold that a decision compares
+    accumulate: str = "float64"  # sums; wider than `arithmetic` it is "store low, accumulate high"
+    loss: str = "float64"  # the scalar that is differentiated
+    # how a result becomes a state: "nearest" (ties to even) or "stochastic" (up or down with probabilities
+    # that make the mean exact)
     rounding: str = "nearest"
-    seed: int = 0
+    seed: int = 0  # of stochastic rounding
 
     def __post_init__(self):
         for role in ("state", "arithmetic", "decision", "accumulate", "loss"):

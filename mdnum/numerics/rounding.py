@@ -76,15 +76,11 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """What a displacement between any two positions in a box is made of, as far as its rounding goes.
+    """What a displacement between any two positions in a box is made of, as far as its rounding goes."""
 
-    Attributes:
-        lattice: vectors of the periodic axes in the order in which they are taken off, length.
-        coordinate: largest |coordinate| of a position, per axis, length.
-    """
-
+    # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()
-    coordinate: Vector = (0.0, 0.0, 0.0)
+    coordinate: Vector = (0.0, 0.0, 0.0)  # largest |coordinate| of a position, per axis, length
 
     @classmethod
     def of(cls, lattice: Float[np.ndarray, "vectors 3"], coordinate: Float[np.ndarray, "3"]) -> Reach:

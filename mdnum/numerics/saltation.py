@@ -67,14 +67,23 @@ def carry(
 ) -> Float[Any, "*batch state"]:
     """A tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
-    The matrix is never formed, so this also serves systems of many atoms.
+    That is the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) times dx, which is never formed, so
+    this also serves systems of many atoms. For a ball of restitution e that meets the floor with velocity v
+    it is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a distance crossed with
+    speed v, [[1, 0], [(b - a) / v, 1]].
 
     Args:
         reset: DR, Jacobian of the state after in the state before; None for the identity (a force jump).
+        flow_before, flow_after: F- and F+, time derivatives of the state just before and just after.
         reset_rate: dR, derivative of the reset at fixed state (the restitution as a parameter).
 
     Returns:
         The tangent just after the event, without the saltation term where the event grazes.
+
+    Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
+
+    Source: Kong, Payne, Zhu & Johnson, Saltation Matrices: The Essential Tool for Linearizing Hybrid
+    Dynamical Systems, Proc. IEEE 112 (2024) 585, arXiv:2306.06862.
     """
 
     def through(x):
@@ -82,36 +91,3 @@ def carry(
 
     shift = time_shift(tangent, flow_before, normal, threshold_rate)
     return through(tangent) + reset_rate - (flow_after - through(flow_before)) * shift[..., None]
-
-
-def saltation_flagged(
-    reset: Float[Any, "*batch state state"],
-    flow_before: Float[Any, "*batch state"],
-    flow_after: Float[Any, "*batch state"],
-    normal: Float[Any, "*batch state"],
-) -> tuple[Float[Any, "*batch state state"], Bool[Any, "*batch"]]:
-    """The saltation matrix of an event, Xi = DR + (F+ - DR F-) n^T / (n^T F-), and whether the event grazes.
-
-    A perturbation dx just before the event is Xi dx just after it. For a ball of restitution e that meets
-    the floor with velocity v it is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a
-    distance crossed with speed v it is [[1, 0], [(b - a) / v, 1]].
-
-    Args:
-        reset: DR, Jacobian of the state after the event in the state before it.
-        flow_before, flow_after: time derivatives of the state just before and just after.
-        normal: gradient of the event function at the event.
-
-    Returns:
-        Xi, and the flag; where it is set, the time of the event has no derivative and Xi is DR alone.
-
-    Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
-
-    Source: Kong, Payne, Zhu & Johnson, Saltation Matrices: The Essential Tool for Linearizing Hybrid
-    Dynamical Systems, Proc. IEEE 112 (2024) 585, arXiv:2306.06862.
-    """
-    xp = normal.__array_namespace__()
-    touch = grazing(flow_before, normal)
-    speed = xp.where(touch, xp.ones_like(normal[..., 0]), (normal * flow_before).sum(-1))
-    jump = flow_after - (reset * flow_before[..., None, :]).sum(-1)
-    term = jump[..., :, None] * normal[..., None, :] / speed[..., None, None]
-    return reset + xp.where(touch[..., None, None], xp.zeros_like(term), term), touch

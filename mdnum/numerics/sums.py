@@ -38,7 +38,9 @@ Add = Callable[[jax.Array, jax.Array], jax.Array]
 def _summed(reduction: Reduction, terms, zero):
     if zero is None and terms.dtype.itemsize == 2:
         zero = _data_zero(terms)
-    return reduction.sum_of(terms if zero is None else fence(terms, zero), _adder(zero))
+    if zero is None:
+        return reduction.sum_of(terms, jnp.add)
+    return reduction.sum_of(fence(terms, zero), lambda a, b: fence(a + b, zero))
 
 
 @_summed.defjvp
@@ -106,10 +108,6 @@ class Reduction:
         return max(n - 1, 0)
 
 
-def _adder(zero: jax.Array | None) -> Add:
-    return jnp.add if zero is None else lambda a, b: fence(a + b, zero)
-
-
 def in_order(terms, add, start=None):
     """((0 + t0) + t1) + ..., or from another start: a scan, which XLA does not reorder. Unrolled, since a
     step of a loop costs more than an addition."""
@@ -132,12 +130,9 @@ class Serial(Reduction):
 
 @dataclass(frozen=True)
 class Sequential(Serial):
-    """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4).
+    """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
 
-    Attributes:
-        order: "forward" (left to right, as a loop does) or "reversed".
-    """
-
+    # "forward" (left to right, as a loop does) or "reversed"
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
@@ -193,12 +188,9 @@ class Blocked(Reduction):
 
     Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree, a width of at
     least the number of terms the loop.
-
-    Attributes:
-        width: children of a node, at least 2.
     """
 
-    width: int = 32
+    width: int = 32  # children of a node, at least 2
 
     def __post_init__(self):
         if self.width < 2:
@@ -233,13 +225,9 @@ class Pairwise(Blocked):
 
 @dataclass(frozen=True)
 class Permuted(Serial):
-    """A loop over the terms in a random order: what atomic additions on a device do, made repeatable.
+    """A loop over the terms in a random order: what atomic additions on a device do, made repeatable."""
 
-    Attributes:
-        seed: of the order; the same for every sum of as many terms.
-    """
-
-    seed: int = 0
+    seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """In the order drawn for this many terms."""
@@ -294,12 +282,9 @@ class Sorted(Serial):
 
     Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
     cancel.
-
-    Attributes:
-        order: of magnitudes, "ascending" or "descending".
     """
 
-    order: Literal["ascending", "descending"] = "ascending"
+    order: Literal["ascending", "descending"] = "ascending"  # of magnitudes, "ascending" or "descending"
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Sorted along the leading axis, each column by itself."""
@@ -382,43 +367,27 @@ class Neumaier(_Compensated):
 
 @dataclass(frozen=True)
 class Addition:
-    """One addition.
+    """One addition."""
 
-    Attributes:
-        term: index of the term that was added.
-        addend: what was added to the accumulator.
-        running: the accumulator afterwards.
-        exact: the sum of the terms so far.
-        bits_lost: binary digits of the exact result of this addition below the last place that was kept;
-            0 where the addition was exact.
-        absorbed: a nonzero addend left no trace.
-    """
-
-    term: str
-    addend: float
-    running: float
-    exact: Fraction
+    term: str  # index of the term that was added
+    addend: float  # what was added to the accumulator
+    running: float  # the accumulator afterwards
+    exact: Fraction  # the sum of the terms so far
+    # binary digits of the exact result of this addition below the last place that was kept; 0 where the
+    # addition was exact
     bits_lost: int
-    absorbed: bool
+    absorbed: bool  # a nonzero addend left no trace
 
 
 @dataclass(frozen=True)
 class RunningSum:
-    """A sum with its history.
+    """A sum with its history."""
 
-    Attributes:
-        dtype: of the terms and of the accumulator.
-        reduction: the order.
-        rows: one per addition.
-        result: what the reduction gives.
-        exact: the sum of the terms.
-    """
-
-    dtype: str
-    reduction: Any
-    rows: tuple[Addition, ...]
-    result: float
-    exact: Fraction
+    dtype: str  # of the terms and of the accumulator
+    reduction: Any  # the order
+    rows: tuple[Addition, ...]  # one per addition
+    result: float  # what the reduction gives
+    exact: Fraction  # the sum of the terms
 
     @property
     def error(self) -> float:

@@ -29,15 +29,12 @@ ERROR = 0.05
 
 @dataclass(frozen=True)
 class Delay:
-    """When one pair splits, free and under the first run's decisions.
+    """When one pair splits, free and under the first run's decisions."""
 
-    Attributes:
-        free, imposed: steps of the two splits; None for one that was not seen.
-        free_until, imposed_until: last steps at which the separations are known.
-    """
-
+    # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
     imposed: int | None
+    # free_until, imposed_until: last steps at which the separations are known
     free_until: int
     imposed_until: int
 
@@ -97,19 +94,12 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """How many pairs were delayed.
+    """How many pairs were delayed."""
 
-    Attributes:
-        pairs: that were run, the pair itself among them.
-        later: that were delayed by more than asked for.
-        not_later: that were not; of the others it was not seen.
-        most: pairs at most.
-    """
-
-    pairs: int
-    later: int
-    not_later: int
-    most: int
+    pairs: int  # that were run, the pair itself among them
+    later: int  # that were delayed by more than asked for
+    not_later: int  # that were not; of the others it was not seen
+    most: int  # pairs at most
 
     @property
     def needed(self) -> tuple[int, int] | None:
@@ -170,31 +160,20 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """When two runs part; None where they do not within the horizon.
+    """When two runs part; None where they do not within the horizon."""
 
-    Attributes:
-        first_bit: first step whose state bits differ.
-        fork: first step whose decisions differ.
-        split: first step at which the separation passes the tolerance.
-    """
-
-    first_bit: int | None
-    fork: int | None
-    split: int | None
+    first_bit: int | None  # first step whose state bits differ
+    fork: int | None  # first step whose decisions differ
+    split: int | None  # first step at which the separation passes the tolerance
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponential growth of a separation, fitted to its logarithm.
+    """Exponential growth of a separation, fitted to its logarithm."""
 
-    Attributes:
-        rate: per step; NaN where too few rows could be fitted.
-        r_squared: of the fit.
-        first, last: steps between which it was fitted.
-    """
-
-    rate: float
-    r_squared: float
+    rate: float  # per step; NaN where too few rows could be fitted
+    r_squared: float  # of the fit
+    # first, last: steps between which it was fitted
     first: int
     last: int
 
@@ -286,30 +265,24 @@ def expected(
 
 @dataclass(frozen=True)
 class ForkVerdict:
-    """Whether the flips caused a split, accelerated it, or only came along.
+    """Whether the flips caused a split, accelerated it, or only came along."""
 
-    Attributes:
-        word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon,
-            or no counterfactual that was followed far enough), "cause" (without the flips no split),
-            "accelerated" (most pairs such as this split later without them, by more than one e-folding of the
-            separation), "bystander" (the split came before any flip, or most pairs do not split later by
-            that much), "undecided" (the repeats that were allowed do not tell the two apart).
-        free: split of the free run, step.
-        imposed: split of the run under the other's decisions, step; None where there is none.
-        e_foldings: growth rate times the steps gained: how many e-foldings the flips of this pair were worth;
-            infinite for a cause.
-        threshold: delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise;
-            None where no pairs were counted.
-        count: of the pair and its repeats, those that split later; None where none were counted.
-        reasons: the criteria: codes, each with its numbers.
-    """
-
+    # "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon, or no
+    # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
+    # pairs such as this split later without them, by more than one e-folding of the separation), "bystander"
+    # (the split came before any flip, or most pairs do not split later by that much), "undecided" (the
+    # repeats that were allowed do not tell the two apart)
     word: Word
-    free: int | None
-    imposed: int | None
+    free: int | None  # split of the free run, step
+    imposed: int | None  # split of the run under the other's decisions, step; None where there is none
+    # growth rate times the steps gained: how many e-foldings the flips of this pair were worth; infinite for
+    # a cause
     e_foldings: float | None
-    reasons: tuple[Reason, ...]
+    reasons: tuple[Reason, ...]  # the criteria: codes, each with its numbers
+    # delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise; None where no
+    # pairs were counted
     threshold: float | None = None
+    # of the pair and its repeats, those that split later; None where none were counted
     count: Count | None = None
 
     @property
@@ -455,20 +428,14 @@ SERIES: Mapping[tuple[Name, Name, Name], str] = {
 
 @dataclass(frozen=True)
 class SplitCell:
-    """When one run splits from another.
+    """When one run splits from another."""
 
-    Attributes:
-        arithmetic, decisions: whose they are in the run.
-        reference: the free run that it is compared with.
-        split: step; None where it does not split.
-        until: the last step at which it was compared.
-    """
-
+    # arithmetic, decisions: whose they are in the run
     arithmetic: Name
     decisions: Name
-    reference: Name
-    split: int | None
-    until: int
+    reference: Name  # the free run that it is compared with
+    split: int | None  # step; None where it does not split
+    until: int  # the last step at which it was compared
 
     @property
     def same(self) -> bool:
@@ -478,21 +445,13 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """How much of a split one difference is worth: by how much it comes later without it.
+    """How much of a split one difference is worth: by how much it comes later without it."""
 
-    Attributes:
-        what: the difference that is taken away; the other one stays.
-        reference: the run that is compared with.
-        steps: by which the split comes later; below 0 where it comes earlier.
-        at_least: whether the split had not come when it was followed no longer.
-        e_foldings: growth rate times steps: e-foldings of the separation; None without a rate.
-    """
-
-    what: What
-    reference: Name
-    steps: int
-    at_least: bool
-    e_foldings: float | None
+    what: What  # the difference that is taken away; the other one stays
+    reference: Name  # the run that is compared with
+    steps: int  # by which the split comes later; below 0 where it comes earlier
+    at_least: bool  # whether the split had not come when it was followed no longer
+    e_foldings: float | None  # growth rate times steps: e-foldings of the separation; None without a rate
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:

@@ -5,39 +5,23 @@ Nothing here is imported before it is used: ASE, MDAnalysis and jax each cost a 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mdnum.references.ase_models import MdnumCalculator
-    from mdnum.references.energy_check import check_dynamics, check_energy
-    from mdnum.references.oracle import all_pairs
-    from mdnum.references.pair_check import Search, all_searches, check_pairs, effective_cutoff
+    from mdnum.references.ase_models import MdnumCalculator as MdnumCalculator
+    from mdnum.references.energy_check import check_dynamics as check_dynamics
+    from mdnum.references.energy_check import check_energy as check_energy
+    from mdnum.references.oracle import all_pairs as all_pairs
+    from mdnum.references.pair_check import Search as Search
+    from mdnum.references.pair_check import all_searches as all_searches
+    from mdnum.references.pair_check import check_pairs as check_pairs
+    from mdnum.references.pair_check import effective_cutoff as effective_cutoff
 
-__all__ = [
-    "MdnumCalculator",
-    "Search",
-    "all_pairs",
-    "all_searches",
-    "check_dynamics",
-    "check_energy",
-    "check_pairs",
-    "effective_cutoff",
-]
-
-_HOMES = {
-    "MdnumCalculator": "ase_models",
-    "Search": "pair_check",
-    "all_pairs": "oracle",
-    "all_searches": "pair_check",
-    "check_dynamics": "energy_check",
-    "check_energy": "energy_check",
-    "check_pairs": "pair_check",
-    "effective_cutoff": "pair_check",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"mdnum.references.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = on_first_use(__name__, {
+    "ase_models": "MdnumCalculator",
+    "energy_check": "check_dynamics check_energy",
+    "oracle": "all_pairs",
+    "pair_check": "Search all_searches check_pairs effective_cutoff",
+})  # fmt: skip

@@ -60,11 +60,7 @@ class Reference:
 
 
 def reference(system: System) -> Reference:
-    """The best judge there is for a system: ASE where it has the class, else plain numpy.
-
-    Args:
-        system: `mdnum.systems.System`.
-    """
+    """The best judge there is for a system: ASE where it has the class, else plain numpy."""
     kind = system.spec.potential.kind
     if kind == "eam":
         (file,) = system.tables
@@ -96,11 +92,7 @@ def reference(system: System) -> Reference:
 
 
 def independent(system: System) -> Reference:
-    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second.
-
-    Args:
-        system: `mdnum.systems.System`.
-    """
+    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second."""
     kind = system.spec.potential.kind
     models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
     make_model = models.get(kind) or (lambda: PairModel(pair_forms(system.spec, system.species)))

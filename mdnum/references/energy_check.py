@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
-from ase.geometry import complete_cell
 from jaxtyping import Int
 from numpy import ndarray
 
@@ -19,18 +18,16 @@ from mdnum.references.independent import SLACK, Edges, PairModel, edges_of, pair
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import System, build, schema
 from mdnum.systems.build import Evaluation
+from mdnum.systems.structures import with_images
 
+#: What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale.
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
-"""What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
-
+#: Steps to the later of the two frames compared by default.
 SOME_STEPS = 200
-"""Steps to the later of the two frames compared by default."""
-
+#: Larger systems are compared by a sample: groups of atoms with all their neighbors.
 SAMPLED = 10_000
-"""Larger systems are compared by a sample: groups of atoms with all their neighbors."""
-
+#: What narrower precision must meet: this many times the rounding expected of one typical number.
 ROUNDINGS = 5.0
-"""What narrower precision must meet: this many times the rounding expected of one typical number."""
 
 
 @dataclass(frozen=True)
@@ -335,12 +332,10 @@ def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, fl
             yield x, np.asarray(segment.unsorted("v", row), np.float64), float(potential[row])
 
 
+#: Largest deviation of a position after 100 steps, in units of r_cut.
+#: Rounding starts near 1e-16 (6e-8) and chaos multiplies it, by e³ per LJ time in a liquid; five orders of
+#: magnitude are left for that. A wrong force or time step shows at 1e-6 or more within ten steps.
 AGREEMENT = {"float64": 1e-9, "float32": 1e-2, "float16": 1e-1, "bfloat16": 1e-1}
-"""Largest deviation of a position after 100 steps, in units of r_cut.
-
-Rounding starts near 1e-16 (6e-8) and chaos multiplies it, by e³ per LJ time in a liquid; five orders of
-magnitude are left for that. A wrong force or time step shows at 1e-6 or more within ten steps.
-"""
 
 _SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
 
@@ -387,8 +382,6 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
     trajectories must agree although the energies have different zeros.
 
     Args:
-        system: what to run.
-        steps: how many steps.
         judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
     """
     # its optimizers come with it, and a run that is only compared needs none
@@ -480,7 +473,7 @@ def neighborhoods(
     Yields:
         (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
     """
-    x, origin = _with_images(atoms, reach)
+    x, origin = with_images(atoms, reach)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
     limit = (reach * (1 + 1e-9)) ** 2
     rng = np.random.default_rng(seed)
@@ -495,22 +488,3 @@ def neighborhoods(
         around = there[(apart <= limit).any(axis=1)]
         rows = np.concatenate([chosen, np.setdiff1d(around, chosen)])
         yield Atoms(numbers=numbers[origin[rows]], positions=x[rows]), origin[chosen]
-
-
-def _with_images(atoms: Atoms, reach: float) -> tuple[ndarray, ndarray]:
-    """Positions in the box, then their images out to twice the reach beyond its faces; whose each is."""
-    cell = complete_cell(np.where(atoms.pbc[:, None], atoms.cell, 0.0))
-    inverse = np.linalg.inv(cell)
-    x = atoms.positions
-    fractional = x @ inverse
-    x = x - np.where(atoms.pbc, np.floor(fractional), 0.0) @ cell
-    fractional = x @ inverse
-    margin = 2.001 * reach * np.linalg.norm(inverse, axis=0)
-    origin = np.arange(len(x))
-    for axis in np.flatnonzero(atoms.pbc):
-        low, high = fractional[:, axis] < margin[axis], fractional[:, axis] >= 1 - margin[axis]
-        shift = np.eye(3)[axis]
-        fractional = np.concatenate([fractional, fractional[low] + shift, fractional[high] - shift])
-        x = np.concatenate([x, x[low] + cell[axis], x[high] - cell[axis]])
-        origin = np.concatenate([origin, origin[low], origin[high]])
-    return x, origin

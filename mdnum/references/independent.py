@@ -114,11 +114,7 @@ class ClassicalCalculator(Calculator):
 
 
 class OnNeighborList(ClassicalCalculator):
-    """An ASE calculator for a model of edges, on ASE's neighbor list.
-
-    Args:
-        model: what to evaluate.
-    """
+    """An ASE calculator for a model of edges, on ASE's neighbor list."""
 
     def __init__(self, model: Model, **kwargs: Any):
         super().__init__(**kwargs)
@@ -171,10 +167,6 @@ class PairForm:
 
 def pair_forms(spec: SystemSpec, species: tuple[str, ...]) -> dict[tuple[str, str], PairForm]:
     """The interaction of every two species, both orders.
-
-    Args:
-        spec: a system with a pair potential.
-        species: chemical symbols present.
     Raises:
         InputError: a pair of species has no constants or no radius.
     """

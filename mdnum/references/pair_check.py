@@ -250,7 +250,6 @@ def check_pairs(
     otherwise is "at the cutoff", which is rounding or convention and not an error.
 
     Args:
-        system: what to check.
         searches: default: mdnum's own and those of every library that is installed.
         positions: instead of the system's own.
         effective: also bisect each search's effective cutoff.

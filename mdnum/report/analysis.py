@@ -16,15 +16,10 @@ _AT_ONCE = 1_000_000
 
 @dataclass(frozen=True)
 class Stays:
-    """How long pairs keep a decision, in steps, between two flips of the same pair.
+    """How long pairs keep a decision, in steps, between two flips of the same pair."""
 
-    Attributes:
-        inside: from entering to leaving: how many stays last 0, 1, 2, ... steps.
-        outside: from leaving to entering again, likewise.
-    """
-
-    inside: Int[np.ndarray, "lengths"]
-    outside: Int[np.ndarray, "lengths"]
+    inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
+    outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
 
     @property
     def total(self) -> int:
@@ -102,7 +97,8 @@ class Scan:
         ratio = margins_in_bounds(flips)
         self._ratios.append(ratio)
         self._keep_nearest(flips, ratio)
-        self._recent.append((_pair_key(flips), step, came))
+        pair = (flips["i"].astype(np.int64) << 32) | flips["j"].astype(np.int64)
+        self._recent.append((pair, step, came))
         # sorted with all pairs so far, so not before they are as many
         if sum(len(part[0]) for part in self._recent) > max(_AT_ONCE, len(self._key)):
             self._follow()
@@ -218,7 +214,3 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
     pairs = series["pairs"]
     net = np.cumsum(series["entered"].astype(np.int64) - series["left"])
     return pairs == pairs[0] + net - net[0]
-
-
-def _pair_key(flips: Flips) -> Int[np.ndarray, "flips"]:
-    return (flips["i"].astype(np.int64) << 32) | flips["j"].astype(np.int64)

@@ -19,29 +19,21 @@ STATIC_ROWS = 20
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table that can be searched.
+    """A column of a table that can be searched."""
 
-    Attributes:
-        name, unit: its heading.
-        values: a value for each row; a pair of them for a "pair".
-        kind: how a value is written and searched. A "count" is whole, and searched as `name:10..20`; a "pair"
-            is two subjects joined by a dash; a "word" is one of `words`, which are searched for; a "ratio" is
-            in rounding bounds, ambiguous at 1 and below; "fixed" has so many decimals, "number" digits.
-        words: for "word": what values 0, 1, ... are called.
-        aliases: for "word": what else may be typed for them.
-        colors: for "word": class of the cell by value.
-        subject: whether a bare number, or the column's name and a number, is looked for in it.
-    """
-
+    # name, unit: its heading
     name: str
-    values: Any
+    values: Any  # a value for each row; a pair of them for a "pair"
+    # how a value is written and searched. A "count" is whole, and searched as `name:10..20`; a "pair" is two
+    # subjects joined by a dash; a "word" is one of `words`, which are searched for; a "ratio" is in rounding
+    # bounds, ambiguous at 1 and below; "fixed" has so many decimals, "number" digits
     kind: Literal["count", "pair", "number", "fixed", "word", "text", "ratio"] = "number"
     unit: str = ""
     digits: int = 3
-    words: tuple[str, ...] = ()
-    aliases: tuple[str, ...] = ()
-    colors: tuple[str, ...] = ()
-    subject: bool = False
+    words: tuple[str, ...] = ()  # for "word": what values 0, 1, ... are called
+    aliases: tuple[str, ...] = ()  # for "word": what else may be typed for them
+    colors: tuple[str, ...] = ()  # for "word": class of the cell by value
+    subject: bool = False  # whether a bare number, or the column's name and a number, is looked for in it
 
     @property
     def missing(self) -> str:
@@ -84,17 +76,11 @@ def flipped(entered: Any) -> Column:
 
 @dataclass(frozen=True)
 class Browse:
-    """A table that can be sorted, searched and paged in the browser, and read without a script.
+    """A table that can be sorted, searched and paged in the browser, and read without a script."""
 
-    Attributes:
-        name: id of the table.
-        noun: what is searched, in the plural.
-        placeholder: examples of what can be searched for.
-    """
-
-    name: str
-    noun: str
-    placeholder: str
+    name: str  # id of the table
+    noun: str  # what is searched, in the plural
+    placeholder: str  # examples of what can be searched for
     columns: Sequence[Column]
 
     @cached_property

@@ -409,22 +409,13 @@ def markup(figure: Canvas, name: str) -> str:
 
 
 def inline(text: str, title: str) -> str:
-    """An <svg> element for an HTML page that defines the colors as custom properties.
-
-    Args:
-        text: what `markup` gave.
-        title: what a screen reader says.
-    """
+    """An <svg> element for an HTML page that defines the colors as custom properties."""
     text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
     return text.replace('role="img">', f'role="img" aria-label="{escape(title)}">', 1)
 
 
 def standalone(text: str) -> str:
-    """A whole SVG file, which carries both sets of colors and follows the viewer's preference.
-
-    Args:
-        text: what `markup` gave.
-    """
+    """A whole SVG file, which carries both sets of colors and follows the viewer's preference."""
     rules = (
         f"svg {{ {_properties(LIGHT)} }} "
         f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "

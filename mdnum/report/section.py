@@ -24,22 +24,16 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values under named columns.
+    """Rows of values under named columns."""
 
-    Attributes:
-        columns: names, with their unit in parentheses; all empty for a table without a head, whose first
-            column then names its rows.
-        rows: plain values; floats are written with 3 digits, None as a dash, text as it is.
-        title: a small heading, empty for none.
-        shown: rows that are shown at once; the others unfold.
-        bad: rows that are marked, by their number.
-    """
-
+    # names, with their unit in parentheses; all empty for a table without a head, whose first column then
+    # names its rows
     columns: tuple[str, ...]
+    # plain values; floats are written with 3 digits, None as a dash, text as it is
     rows: Sequence[Sequence[Any]]
-    title: str = ""
-    shown: int = 20
-    bad: frozenset[int] = frozenset()
+    title: str = ""  # a small heading, empty for none
+    shown: int = 20  # rows that are shown at once; the others unfold
+    bad: frozenset[int] = frozenset()  # rows that are marked, by their number
 
     def numeric(self, column: int) -> bool:
         """Whether a column holds numbers alone, which are set flush right."""
@@ -100,33 +94,23 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command to copy, folded under its title.
+    """A file or a command to copy, folded under its title."""
 
-    Attributes:
-        title: what it is.
-        text: word for word.
-    """
-
-    title: str
-    text: str
+    title: str  # what it is
+    text: str  # word for word
 
 
 @dataclass(frozen=True)
 class Series:
-    """One set of points of a plot.
-
-    Attributes:
-        x, y: equally long; NaN leaves a gap.
-        role: its color.
-        dashed: for what is expected rather than measured.
-    """
+    """One set of points of a plot."""
 
     label: str
+    # x, y: equally long; NaN leaves a gap
     x: np.ndarray
     y: np.ndarray
     mark: Mark = "line"
-    role: Role = "first"
-    dashed: bool = False
+    role: Role = "first"  # its color
+    dashed: bool = False  # for what is expected rather than measured
 
 
 #: Roles of lines that are drawn in order.
@@ -177,41 +161,30 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """A map over a grid: small integers with a word for each (a stability map, say).
+    """A map over a grid: small integers with a word for each (a stability map, say)."""
 
-    Attributes:
-        x, y: centers of the cells, shapes (columns,) and (rows,).
-        value: class of each cell, shape (rows, columns).
-        words: what each class means, in the order 0, 1, 2, ...
-    """
-
+    # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray
     y: np.ndarray
-    value: np.ndarray
-    words: tuple[str, ...]
+    value: np.ndarray  # class of each cell, shape (rows, columns)
+    words: tuple[str, ...]  # what each class means, in the order 0, 1, 2, ...
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure that is declared: values against values.
+    """A figure that is declared: values against values."""
 
-    Attributes:
-        name: of figures/<name>.svg, unique on its page.
-        title: what is seen, a phrase.
-        x_label, y_label: quantities with their units.
-        caption: what to see in it; the title by default.
-        verticals, horizontals: marked values with a word for each.
-    """
-
-    name: str
-    title: str
+    name: str  # of figures/<name>.svg, unique on its page
+    title: str  # what is seen, a phrase
+    # x_label, y_label: quantities with their units
     x_label: str
     y_label: str
     series: tuple[Series, ...] = ()
     region: Region | None = None
     x_scale: AxisScale = "linear"
     y_scale: AxisScale = "linear"
-    caption: str = ""
+    caption: str = ""  # what to see in it; the title by default
+    # verticals, horizontals: marked values with a word for each
     verticals: tuple[tuple[float, str], ...] = ()
     horizontals: tuple[tuple[float, str], ...] = ()
 
@@ -243,21 +216,13 @@ class Plot:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure that is drawn with matplotlib.
+    """A figure that is drawn with matplotlib."""
 
-    Attributes:
-        name: of figures/<name>.svg, unique on its page.
-        caption: what to see in it.
-        alt: what it shows, in words and numbers, for who cannot see it.
-        draw: draws into an empty matplotlib figure, in the colors of `figures`.
-        height: inches, of a width of `figures.WIDTH`.
-    """
-
-    name: str
-    caption: str
-    alt: str
-    draw: Callable[[Canvas], None]
-    height: float = 3.0
+    name: str  # of figures/<name>.svg, unique on its page
+    caption: str  # what to see in it
+    alt: str  # what it shows, in words and numbers, for who cannot see it
+    draw: Callable[[Canvas], None]  # draws into an empty matplotlib figure, in the colors of `figures`
+    height: float = 3.0  # inches, of a width of `figures.WIDTH`
 
 
 #: What a section is made of; text is a paragraph.
@@ -266,19 +231,12 @@ Part = Any  # str | Table | Browse | Code | Plot | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with what stands below it, in order.
+    """A heading with what stands below it, in order."""
 
-    Attributes:
-        title: also what a finding names that this section shows.
-        parts: paragraphs, tables, code, plots and figures.
-        terminal: whether its tables and text are printed in a terminal too.
-        level: 2, or 3 for a section within the one before.
-    """
-
-    title: str
-    parts: Sequence[Part] = ()
-    terminal: bool = False
-    level: Literal[2, 3] = 2
+    title: str  # also what a finding names that this section shows
+    parts: Sequence[Part] = ()  # paragraphs, tables, code, plots and figures
+    terminal: bool = False  # whether its tables and text are printed in a terminal too
+    level: Literal[2, 3] = 2  # 2, or 3 for a section within the one before
 
 
 @dataclass(frozen=True)
@@ -292,21 +250,11 @@ class Key:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole answer.
+    """A whole answer."""
 
-    Attributes:
-        title: heading.
-        about: one line below it.
-        keys: the numbers in brief.
-        sections: in order; findings come before them, provenance after.
-        files: what is in the folder, a sentence.
-        system_toml: the system that was run, empty where none was.
-        provenance: of the folder.
-    """
-
-    title: str
-    about: str = ""
-    keys: Sequence[Key] = ()
-    sections: Sequence[Section] = ()
-    system_toml: str = ""
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    title: str  # heading
+    about: str = ""  # one line below it
+    keys: Sequence[Key] = ()  # the numbers in brief
+    sections: Sequence[Section] = ()  # in order; findings come before them, provenance after
+    system_toml: str = ""  # the system that was run, empty where none was
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # of the folder

@@ -66,7 +66,6 @@ class Pins:
         atoms = len(table.order)
         shape = (count, table.slots // 8, atoms)
         told, where = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-        place = np.argsort(table.order)
         steps = np.arange(first, first + count)
         index = table.index.reshape(-1, atoms)
         for pin in self.pins:
@@ -75,8 +74,8 @@ class Pins:
                 continue
             inside = pin.at(steps)
             for atom, other in ((pin.i, pin.j), (pin.j, pin.i)):
-                column = place[atom]
-                for slot in np.flatnonzero(index[:, column] == place[other]):
+                column = table.place[atom]
+                for slot in np.flatnonzero(index[:, column] == table.place[other]):
                     bit = np.uint8(1 << (slot % 8))
                     where[held, slot // 8, column] |= bit
                     told[held & inside, slot // 8, column] |= bit

@@ -264,7 +264,7 @@ class PairRecorder:
         pairs, ends = pairs[:kept], ends[:kept]
         if replaced is not None:
             keys, now = replaced
-            a, b = np.argsort(table.order)[np.stack(np.divmod(keys, self.simulation.atoms))]
+            a, b = table.place[np.stack(np.divmod(keys, self.simulation.atoms))]
             added = np.stack([np.zeros(len(keys), np.int64), a, b, now], axis=1).astype(np.int32)
             pairs = np.concatenate([added, pairs])
             ends = np.concatenate([np.concatenate([x[0][:, a], x[0][:, b], v[0][:, a], v[0][:, b]]).T, ends])
@@ -355,7 +355,7 @@ def pair_keys(
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
     """Sorted keys of the pairs inside."""
     keys = np.empty(count_set(bits), np.int64)
-    return keys[: _write_keys(bits, table.index, table.order, np.argsort(table.order), keys)].copy()
+    return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 
 
 @numba.njit(cache=True, nogil=True)

@@ -195,19 +195,13 @@ _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 @dataclass
 class Manifest:
-    """A folder's manifest.
+    """A folder's manifest."""
 
-    Attributes:
-        world: which tables the folder has, a key of `TABLES`.
-        finished: whether its writing came to an end.
-        files: digests that a file may have, by its name in the folder.
-        version: of the mdnum that began it.
-    """
-
-    world: str
-    finished: bool = False
+    world: str  # which tables the folder has, a key of `TABLES`
+    finished: bool = False  # whether its writing came to an end
+    # digests that a file may have, by its name in the folder
     files: dict[str, list[str]] = field(default_factory=dict)
-    version: str = __version__
+    version: str = __version__  # of the mdnum that began it
 
 
 def digest_of(data: bytes | memoryview) -> str:

@@ -622,9 +622,6 @@ class RunFolder:
 def restoring(path: Path) -> Iterator[None]:
     """Whatever goes wrong in here because a file holds what mdnum would not write there is told in one line.
 
-    Args:
-        path: of the file.
-
     Raises:
         FolderError: it does.
     """

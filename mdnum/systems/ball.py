@@ -15,7 +15,7 @@ from pydantic_core import PydanticKnownError
 
 from mdnum.ball.limits import largest, rounded, smallest, smallest_tolerance, spacing
 from mdnum.systems.schema import ForkTable
-from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, from_array, unusable
+from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, flat, from_array, unusable
 
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
 ParameterName = Literal[
@@ -268,22 +268,11 @@ class GradientTable(TomlTable):
     )
 
 
-def _flatten(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        here = f"{path}.{key}" if path else str(key)
-        if isinstance(value, Mapping):
-            yield from _flatten(value, here)
-        else:
-            yield here, value
-
-
 def _changes(value: Any) -> Any:
     """Tables of changes with dotted keys, also where TOML made tables of the dots."""
     if not isinstance(value, Mapping):
         return value
-    return {
-        name: dict(_flatten(table)) if isinstance(table, Mapping) else table for name, table in value.items()
-    }
+    return {name: flat(table) if isinstance(table, Mapping) else table for name, table in value.items()}
 
 
 Variants = Annotated[dict[str, dict[str, Any]], BeforeValidator(_changes)]

@@ -207,6 +207,11 @@ class Simulation:
             return self
         return self.with_cutoff(self.cutoff.continuous)
 
+    def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
+        """The same system in floats of these roles, by default float64 throughout."""
+        decider = replace(self.decider, dtype=policy.decision, state=policy.state)
+        return replace(self, policy=policy, decider=decider, lattice=None)
+
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
         check_radius(cell, self.r_cut, 0.0)

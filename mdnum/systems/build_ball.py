@@ -35,32 +35,20 @@ _RULES: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class BallVariant:
-    """The problem with some keys of its file changed.
+    """The problem with some keys of its file changed."""
 
-    Attributes:
-        name: what the file calls it.
-        changes: dotted keys to values.
-        problem: what comes of them.
-    """
-
-    name: str
-    changes: Mapping[str, Any]
-    problem: BallProblem
+    name: str  # what the file calls it
+    changes: Mapping[str, Any]  # dotted keys to values
+    problem: BallProblem  # what comes of them
 
 
 @dataclass(frozen=True)
 class BallSimulation:
-    """A ball's system as objects.
+    """A ball's system as objects."""
 
-    Attributes:
-        system: what the file says.
-        problem: world, start, steps and loss.
-        variants: the same with some keys changed.
-    """
-
-    system: BallSystem
-    problem: BallProblem
-    variants: tuple[BallVariant, ...]
+    system: BallSystem  # what the file says
+    problem: BallProblem  # world, start, steps and loss
+    variants: tuple[BallVariant, ...]  # the same with some keys changed
 
 
 def build_ball(
@@ -89,11 +77,6 @@ def build_ball(
 
 def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
     """World, start, steps and loss of the tables of a file.
-
-    Args:
-        spec: checked tables.
-        steps: instead of the file's.
-        where: what to blame.
 
     Raises:
         InputError: a number that the world refuses.

@@ -275,12 +275,6 @@ class BallSystem:
 def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
     """The system with keys changed, checked.
 
-    Args:
-        name: what to call it.
-        changes: dotted keys to values.
-        base: what is changed.
-        where: what to blame.
-
     Raises:
         InputError: it cannot be run.
     """

@@ -17,12 +17,6 @@ from mdnum.errors import InputError
 from mdnum.systems import schema
 from mdnum.systems.schema import SystemSpec, pair_key
 
-_BUILT_IN_RADIUS = {
-    # longest interaction in Å: a·σ of Stillinger and Weber's silicon; R + D of Tersoff's T3 silicon
-    ("stillinger-weber", "Si"): 1.8 * 2.0951,
-    ("tersoff", "Si"): 3.0,
-}
-
 Table = Float64[np.ndarray, "species species"]
 
 
@@ -104,51 +98,22 @@ def cutoff_radii(spec: SystemSpec, species: tuple[str, ...]) -> tuple[Table, Tab
 
 
 def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
-    """The distance beyond which no pair of atoms interacts directly (length).
-
-    Args:
-        spec: the system.
-        species: chemical symbols present.
-        folder: where a potential table is looked for.
-    """
+    """The distance beyond which no pair of atoms interacts directly (length)."""
     potential = spec.potential
+    if isinstance(potential, schema.PairPotentialTable):
+        radius, _ = cutoff_radii(spec, species)
+        pair_constants(spec, species)
+        return float(radius.max())
+    from mdnum.md import manybody
+
     if isinstance(potential, schema.EmbeddedAtomTable):
-        return _setfl_header(folder / potential.file, species)
-    if isinstance(potential, schema.ManyBodyTable):
-        unknown = [name for name in species if name != potential.parameters]
-        if unknown:
-            raise InputError(
-                f"{potential.kind} has constants for {potential.parameters}, but the structure holds "
-                f"{', '.join(unknown)}",
-                remedy="Correct the structure or the potential",
-            )
-        return _BUILT_IN_RADIUS[potential.kind, potential.parameters]
-    radius, _ = cutoff_radii(spec, species)
-    pair_constants(spec, species)
-    return float(radius.max())
-
-
-def _setfl_header(path: Path, species: tuple[str, ...]) -> float:
-    try:
-        with path.open(encoding="utf-8") as file:
-            lines = [next(file) for _ in range(5)]
-        elements = lines[3].split()[1:]
-        cutoff = float(lines[4].split()[4])
-    except FileNotFoundError:
-        raise InputError(
-            "no such potential table", where=str(path), remedy="Correct potential.file"
-        ) from None
-    except (OSError, UnicodeDecodeError, StopIteration, IndexError, ValueError) as error:
-        raise InputError(
-            f"not a setfl table ({type(error).__name__} in its five header lines)",
-            where=str(path),
-            remedy="An .eam.alloy file has three comment lines, the elements, then nrho drho nr dr cutoff",
-        ) from error
-    unknown = [name for name in species if name not in elements]
+        return manybody.read_setfl(folder / potential.file, species).r_cut
+    unknown = [name for name in species if name != potential.parameters]
     if unknown:
         raise InputError(
-            f"the table has {', '.join(elements)}, but the structure holds {', '.join(unknown)}",
-            where=str(path),
+            f"{potential.kind} has constants for {potential.parameters}, but the structure holds "
+            f"{', '.join(unknown)}",
             remedy="Correct the structure or the potential",
         )
-    return cutoff
+    made = manybody.tersoff if potential.kind == "tersoff" else manybody.stillinger_weber
+    return made(potential.parameters).r_cut

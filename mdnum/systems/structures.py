@@ -19,21 +19,17 @@ from mdnum.systems import schema
 if TYPE_CHECKING:
     from ase import Atoms
 
-_AXES = "xyz"
+    from mdnum.md.cell import Cell
 
+#: Closer than this (Å) is a mistake in any structure of metal units without a pair sigma.
 _SMALLEST_DISTANCE = 0.3
-"""Closer than this (Å) is a mistake in any structure of metal units without a pair sigma."""
-
+#: Atoms of a crystal that is built; their positions alone take half a gigabyte.
 _MOST_ATOMS = 20_000_000
-"""Atoms of a crystal that is built; their positions alone take half a gigabyte."""
-
 _ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
-
+#: Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff.
 _FARTHEST = 1e8
-"""Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff."""
-
+#: Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair.
 _SMALLEST_IN_SIGMA = 0.4
-"""Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair."""
 
 
 def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
@@ -166,38 +162,25 @@ def _set_masses(
     atoms.set_array("masses", masses, float, ())
 
 
-def perpendicular_widths(
-    cell: Float64[np.ndarray, "3 3"], pbc: Sequence[bool] | np.ndarray
-) -> Float64[np.ndarray, " 3"]:
-    """Distance between opposite faces of the box along each cell vector (length); inf where it is free.
-
-    Half the smallest one is the longest distance for which the nearest image is the only one.
-    """
-    from ase.geometry import complete_cell
-
-    whole = complete_cell(cell)
-    reciprocal = np.linalg.inv(whole)
-    widths = 1.0 / np.linalg.norm(reciprocal, axis=0)
-    return np.where(np.asarray(pbc, dtype=bool), widths, np.inf)
-
-
 def check(atoms: Atoms, spec: schema.SystemSpec, r_cut: float, length: str) -> None:
     """Refuse a structure that cannot be simulated.
 
     Args:
-        atoms: the structure.
-        spec: the system it belongs to.
         r_cut: longest interaction (length).
         length: name of the unit of length, for messages.
 
     Raises:
         InputError: non-finite numbers, a missing cell vector, a box too small for r_cut + skin, overlaps.
     """
+    from mdnum.md.cell import Cell
+
     _check_finite(atoms)
     _check_size(atoms, r_cut, length)
-    _check_cell(atoms)
-    _check_width(atoms, r_cut, spec.skin, length)
-    _check_overlap(atoms, _smallest_distance(spec), length)
+    # ASE, which the run is compared with, wants vectors of free axes to span a volume too
+    Cell.create(atoms.cell, atoms.pbc | atoms.cell.array.any(axis=1))
+    cell = Cell.create(atoms.cell, atoms.pbc)
+    _check_width(cell, r_cut, spec.skin, length)
+    _check_overlap(atoms, cell, _smallest_distance(spec), length)
 
 
 def _check_finite(atoms: Atoms) -> None:
@@ -237,31 +220,11 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
         )
 
 
-def _check_cell(atoms: Atoms) -> None:
-    cell = np.asarray(atoms.cell)
-    if not np.isfinite(cell).all():
-        raise InputError("the cell holds a number that is not finite", remedy="Correct the structure's cell")
-    for axis in range(3):
-        if atoms.pbc[axis] and not cell[axis].any():
-            raise InputError(
-                f"periodic along {_AXES[axis]}, but the structure has no cell vector there",
-                remedy='Give the structure a cell (extxyz: Lattice="..."), or set structure.pbc = '
-                "[false, false, false]",
-            )
-    from ase.geometry import complete_cell
-
-    used = cell[cell.any(axis=1)]
-    lengths = np.prod(np.linalg.norm(used, axis=1))
-    if len(used) and abs(np.linalg.det(complete_cell(cell))) < 1e-9 * lengths:
-        raise InputError("the cell vectors lie in a plane", remedy="Correct the structure's cell")
-
-
-def _check_width(atoms: Atoms, r_cut: float, skin: float, length: str) -> None:
-    widths = perpendicular_widths(np.asarray(atoms.cell), atoms.pbc)
-    half = float(widths.min()) / 2
+def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
+    half = float(cell.widths.min()) / 2
     if r_cut + skin <= half:
         return
-    axis = "abc"[int(np.argmin(widths))]
+    axis = "abc"[int(np.argmin(cell.widths))]
     allowed = (
         f"a skin up to {half - r_cut:.4g} {length}" if r_cut < half else f"a cutoff below {half:.4g} {length}"
     )
@@ -284,13 +247,12 @@ def _smallest_distance(spec: schema.SystemSpec) -> float:
     return _SMALLEST_DISTANCE if spec.units == "metal" else 1e-3
 
 
-def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
-    from mdnum.md.cell import Cell, wrap_positions
+def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> None:
+    from mdnum.md.cell import wrap_positions
     from mdnum.md.host_search import neighbor_table
 
     if len(atoms) < 2:
         return
-    cell = Cell.create(np.asarray(atoms.cell), atoms.pbc)
     wrapped, _ = wrap_positions(cell, atoms.positions)
     if not neighbor_table(wrapped, cell, smallest, 1)[2]:
         return
@@ -311,31 +273,41 @@ def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
     """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs."""
-    from ase.geometry import complete_cell
     from scipy.spatial import KDTree
 
-    whole = complete_cell(np.asarray(atoms.cell))
-    at = atoms.positions @ np.linalg.inv(whole)
-    at = np.where(atoms.pbc, at - np.floor(at), at)
-    index = np.arange(len(atoms))
-    widths = perpendicular_widths(np.asarray(atoms.cell), atoms.pbc)
-    for axis in np.flatnonzero(atoms.pbc):
-        # what lies near one face is seen from beyond the other; twice what is needed, for the rounding
-        reach = 2 * within / widths[axis]
-        low, high = np.flatnonzero(at[:, axis] < reach), np.flatnonzero(at[:, axis] > 1 - reach)
-        images = at[np.concatenate([low, high])]
-        images[: len(low), axis] += 1.0
-        images[len(low) :, axis] -= 1.0
-        at, index = np.concatenate([at, images]), np.concatenate([index, index[low], index[high]])
-    places = at @ whole
     count = len(atoms)
+    places, origin = with_images(atoms, within)
     everything, own = KDTree(places, balanced_tree=False), KDTree(places[:count], balanced_tree=False)
     found = everything.query(places[:count], k=2, distance_upper_bound=np.nextafter(within, np.inf))
     near, who = (np.asarray(part) for part in found)
-    column = np.where(index[np.minimum(who[:, 0], len(index) - 1)] == np.arange(count), 1, 0)
     rows = np.arange(count)
+    column = np.where(origin[np.minimum(who[:, 0], len(origin) - 1)] == rows, 1, 0)
     pairs = (int(own.count_neighbors(everything, within)) - count) // 2
-    return near[rows, column], index[np.minimum(who[rows, column], len(index) - 1)], pairs
+    return near[rows, column], origin[np.minimum(who[rows, column], len(origin) - 1)], pairs
+
+
+def with_images(
+    atoms: Atoms, reach: float
+) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
+    """Positions in the box, then their images out to twice the reach beyond its faces; whose each is."""
+    from mdnum.md.cell import complete
+
+    cell = complete(atoms.cell.array, atoms.pbc)
+    inverse = np.linalg.inv(cell)
+    x = atoms.positions
+    fractional = x @ inverse
+    x = x - np.where(atoms.pbc, np.floor(fractional), 0.0) @ cell
+    fractional = x @ inverse
+    # twice, and a little more for the rounding
+    margin = 2.001 * reach * np.linalg.norm(inverse, axis=0)
+    origin = np.arange(len(x))
+    for axis in np.flatnonzero(atoms.pbc):
+        low, high = fractional[:, axis] < margin[axis], fractional[:, axis] >= 1 - margin[axis]
+        shift = np.eye(3)[axis]
+        fractional = np.concatenate([fractional, fractional[low] + shift, fractional[high] - shift])
+        x = np.concatenate([x, x[low] + cell[axis], x[high] - cell[axis]])
+        origin = np.concatenate([origin, origin[low], origin[high]])
+    return x, origin
 
 
 #: What `to_extxyz` writes above the atoms of a system.

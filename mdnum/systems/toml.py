@@ -271,13 +271,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Models that the table at a key may have, that of the kind which the data names first; none of a value.
-
-    Args:
-        root: the model of the whole file.
-        key: of a table.
-        data: the tables as read.
-    """
+    """Models that the table at a key may have, that of the kind which data names first; none of a value."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -322,6 +316,14 @@ def _literals(model: type[TomlTable], name: str) -> tuple[Any, ...]:
     return typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
 
 
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as one, by dotted keys."""
+    rows: dict[str, Any] = {}
+    for key, value in table.items():
+        rows |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return rows
+
+
 # --- messages -----------------------------------------------------------------------------------------
 
 _EXPECTED = {
@@ -346,21 +348,13 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Source:
-    """A system file as it was read.
+    """A system file as it was read."""
 
-    Attributes:
-        name: what the system was called by.
-        path: the file.
-        where: the file, as a message names it.
-        text: what it holds.
-        values: overrides, by key.
-    """
-
-    name: str
-    path: Path
-    where: str
-    text: str = ""
-    values: Mapping[Key, Any] = field(default_factory=dict)
+    name: str  # what the system was called by
+    path: Path  # the file
+    where: str  # the file, as a message names it
+    text: str = ""  # what it holds
+    values: Mapping[Key, Any] = field(default_factory=dict)  # overrides, by key
 
     def place(self, key: Key) -> str:
         """The file with line, or the override, that a key came from."""

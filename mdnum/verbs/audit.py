@@ -421,13 +421,9 @@ def _finding(one: Observed, section: str, cause: str) -> Finding:
 
 @dataclass(frozen=True)
 class AuditView(View):
-    """The folder of an audit.
+    """The folder of an audit."""
 
-    Attributes:
-        given: what it has found, where that is known; it is read otherwise.
-    """
-
-    given: AuditState | None = None
+    given: AuditState | None = None  # what it has found, where that is known; it is read otherwise
 
     @cached_property
     def state(self) -> AuditState:

@@ -148,7 +148,6 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
     """Each derivative that was asked for, as a plain mapping.
 
     Args:
-        problem: of what.
         asked: the [gradient] table.
         first: only the first method.
     """

@@ -200,7 +200,6 @@ def compared(
     """Where a variant diverges from the run, and what that does to the loss and its gradient.
 
     Args:
-        variant: what was changed.
         found: where it diverges from the run.
         other: the run with the change.
         gradient, theirs: derivatives of both, the first method's first.
@@ -234,8 +233,6 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
     projection (the ball with restitution) or a sharp penalty (the ball on a spring).
 
     Args:
-        system: what the file says.
-        run: of it.
         gradient: derivatives, of which those of the final height are compared.
     """
     spec, contact = system.spec, system.spec.contact

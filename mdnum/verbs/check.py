@@ -20,15 +20,10 @@ TEXTS = Texts(__file__)
 
 @dataclass(frozen=True)
 class Checked:
-    """The answer of a check.
+    """The answer of a check."""
 
-    Attributes:
-        report: what was compared, with `ok` and rows for people.
-        verdict: its findings.
-    """
-
-    report: Any
-    verdict: Verdict
+    report: Any  # what was compared, with `ok` and rows for people
+    verdict: Verdict  # its findings
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -42,7 +37,6 @@ def check(question: str, system: System) -> Checked:
 
     Args:
         question: "energy", "pairs" or "dynamics".
-        system: what to check.
     """
     from mdnum.references.energy_check import check_dynamics, check_energy
     from mdnum.references.pair_check import check_pairs

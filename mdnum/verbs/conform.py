@@ -73,19 +73,12 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """What answers.json holds, and an examination is resumed from.
+    """What answers.json holds, and an examination is resumed from."""
 
-    Attributes:
-        word: what names the list; empty where it has no name.
-        tested: name and version of the list.
-        options: that it was begun with.
-        seconds: that were spent.
-    """
-
-    word: str = field(kw_only=True)
-    tested: tuple[str, str | None] = field(kw_only=True)
-    options: Options = field(kw_only=True)
-    seconds: Annotated[float, Ge(0)] = 0.0
+    word: str = field(kw_only=True)  # what names the list; empty where it has no name
+    tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
+    options: Options = field(kw_only=True)  # that it was begun with
+    seconds: Annotated[float, Ge(0)] = 0.0  # that were spent
 
 
 def conform(

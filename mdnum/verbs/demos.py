@@ -35,44 +35,28 @@ _LISTED = 16
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a demonstration that was tested while it ran.
+    """A statement of a demonstration that was tested while it ran."""
 
-    Attributes:
-        what: the statement, in words.
-        seen: the number or word that was found.
-        expected: what it was held against, in words ("0.0009765625", "below 1e-12").
-        ok: whether it held.
-    """
-
-    what: str
-    seen: Any
-    expected: str
-    ok: bool
+    what: str  # the statement, in words
+    seen: Any  # the number or word that was found
+    expected: str  # what it was held against, in words ("0.0009765625", "below 1e-12")
+    ok: bool  # whether it held
 
 
 @dataclass(frozen=True)
 class Demo:
-    """The outcome of one demonstration.
+    """The outcome of one demonstration."""
 
-    Attributes:
-        title: a short heading.
-        question: what it asks, one sentence.
-        answer: what it shows, one to three sentences, with its numbers in words.
-        numbers: the numbers it must show, plain values by name; the first is the headline.
-        checks: statements tested while it ran.
-        tables, plots: what it shows.
-        in_md: the counterpart in molecular dynamics, one sentence.
-        data: more plain values for `--json` (histories and the like).
-    """
-
-    title: str
-    question: str
-    answer: str
-    numbers: Mapping[str, Any]
-    checks: Sequence[Claim]
+    title: str  # a short heading
+    question: str  # what it asks, one sentence
+    answer: str  # what it shows, one to three sentences, with its numbers in words
+    numbers: Mapping[str, Any]  # the numbers it must show, plain values by name; the first is the headline
+    checks: Sequence[Claim]  # statements tested while it ran
+    # tables, plots: what it shows
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
-    in_md: str = ""
+    in_md: str = ""  # the counterpart in molecular dynamics, one sentence
+    # more plain values for `--json` (histories and the like)
     data: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -117,13 +117,12 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
     """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
     from mdnum.forks.certified import certified_horizon
-    from mdnum.forks.exact.program import with_policy
     from mdnum.numerics import PrecisionPolicy
 
     numbers, rows, ranking = {}, [], answer.result.ranking
     for k, row in enumerate(ranking):
         frame.say(answer.log, "bounding decisions", k, len(ranking), unit="policies")
-        sure = certified_horizon(with_policy(simulation, PrecisionPolicy(**row.roles)), answer.result.steps)
+        sure = certified_horizon(simulation.with_policy(PrecisionPolicy(**row.roles)), answer.result.steps)
         numbers[row.name] = {"total": sure.total, "horizon": sure.horizon, "wrong": sure.wrong}
         rows += [{"policy": row.name, **vars(decision)} for decision in sure.decisions]
     answer.tables["ambiguous"] = rows

@@ -60,15 +60,10 @@ KINDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class View:
-    """A folder as the findings and sections of its verb read it.
+    """A folder as the findings and sections of its verb read it."""
 
-    Attributes:
-        folder: on disk.
-        summary: as written, without what was judged.
-    """
-
-    folder: RunFolder
-    summary: Mapping[str, Any]
+    folder: RunFolder  # on disk
+    summary: Mapping[str, Any]  # as written, without what was judged
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @property
@@ -115,19 +110,12 @@ class View:
 
 @dataclass(frozen=True)
 class Verb:
-    """How a kind of folder is judged and shown.
+    """How a kind of folder is judged and shown."""
 
-    Attributes:
-        judge: findings and headline, from the folder alone.
-        page: everything else that is shown.
-        view: how they read the folder.
-        unfinished: whether a folder without a summary can be judged (a run that was killed can).
-    """
-
-    judge: Callable[[Any], Verdict]
-    page: Callable[[Any, Verdict], Page]
-    view: type[View] = View
-    unfinished: bool = False
+    judge: Callable[[Any], Verdict]  # findings and headline, from the folder alone
+    page: Callable[[Any, Verdict], Page]  # everything else that is shown
+    view: type[View] = View  # how they read the folder
+    unfinished: bool = False  # whether a folder without a summary can be judged (a run that was killed can)
 
 
 @dataclass(frozen=True)
@@ -201,23 +189,14 @@ class Keep(TypedDict, total=False):
 
 @dataclass
 class Answer:
-    """What a question puts into its folder while it is answered.
+    """What a question puts into its folder while it is answered."""
 
-    Attributes:
-        folder: that is filled.
-        log: passes progress on and writes it to log.txt.
-        summary: of summary.json, anything with plain values.
-        tables: as `store` takes them.
-        result: for who asked from Python.
-        outcome: judged and shown, once it is filled.
-    """
-
-    folder: RunFolder
-    log: Progress
-    summary: dict[str, Any] = field(default_factory=dict)
-    tables: dict[str, Any] = field(default_factory=dict)
-    result: Any = None
-    outcome: Outcome = field(init=False)
+    folder: RunFolder  # that is filled
+    log: Progress  # passes progress on and writes it to log.txt
+    summary: dict[str, Any] = field(default_factory=dict)  # of summary.json, anything with plain values
+    tables: dict[str, Any] = field(default_factory=dict)  # as `store` takes them
+    result: Any = None  # for who asked from Python
+    outcome: Outcome = field(init=False)  # judged and shown, once it is filled
 
 
 @contextmanager

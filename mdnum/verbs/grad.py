@@ -158,8 +158,6 @@ def plan(
     """The methods to run, and what was not asked for and is not run: what, why, and how to ask.
 
     Args:
-        problem: of what.
-        names: full names of the parameters.
         asked: names of methods; None for those that answer soon.
         replicas: starts of averages; 0 for their own number, and for no average where nothing was asked.
 

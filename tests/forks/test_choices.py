@@ -24,7 +24,7 @@ from mdnum.forks.choices.arithmetic import FORMATS
 from mdnum.forks.choices.start import exact_images
 from mdnum.forks.pair import screen
 from mdnum.forks.reordered import ReorderedSimulation, ShuffledBuilder
-from mdnum.forks.worlds import flat, varied
+from mdnum.forks.worlds import varied
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.integrators import Langevin
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
@@ -34,6 +34,7 @@ from mdnum.numerics.sums import Halves, Sequential, Twice
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
+from mdnum.systems.toml import flat
 
 BATH, MIXTURE, TILTED = "argon/langevin-500", "binary/kob-andersen-1000", "argon/tilted-500"
 SHIPPED = shipped("md")

@@ -192,7 +192,7 @@ def flatten(atoms: Atoms) -> None:
         (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å apart, closer than 1.362"),
         (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) are 0.1 Å apart"),
         (lean, "half the smallest perpendicular width of the box (along a) is 8.02"),
-        (flatten, "the cell vectors lie in a plane"),
+        (flatten, "the lattice vectors span no volume"),
     ],
 )
 def test_a_structure_that_cannot_be_simulated(folder: Path, damage, words: str):
@@ -200,6 +200,13 @@ def test_a_structure_that_cannot_be_simulated(folder: Path, damage, words: str):
     damage(atoms)
     change(folder, atoms)
     assert words in refusal(folder)
+
+
+def test_vectors_in_a_plane_are_refused_where_nothing_repeats(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    flatten(atoms)
+    change(folder, atoms)
+    assert "the lattice vectors span no volume" in refusal(folder, {"structure.pbc": "[false, false, false]"})
 
 
 def test_what_just_fits_and_free_boundaries_have_no_width(folder: Path):
@@ -212,7 +219,7 @@ def test_periodic_without_a_cell(folder: Path):
     change(folder, Atoms("Ar2", positions=[[0, 0, 0], [4, 0, 0]]))
     assert not load(folder / "system.toml").atoms.pbc.any()
     said = refusal(folder, {"structure.pbc": "[true, false, false]"})
-    assert "periodic along x, but the structure has no cell vector there" in said
+    assert "axis a is periodic but its lattice vector is zero" in said
 
 
 def test_unknown_species(folder: Path):
@@ -249,6 +256,6 @@ def test_a_table_that_is_not_setfl(folder: Path):
     edit(folder, LJ, 'kind = "eam"\nfile = "ar.eam.alloy"')
     assert "ar.eam.alloy: no such potential table" in refusal(folder)
     (folder / "ar.eam.alloy").write_text("one\ntwo\n")
-    assert "not a setfl table" in refusal(folder)
+    assert "this is no setfl table" in refusal(folder)
     (folder / "ar.eam.alloy").write_text("a\nb\nc\n1 Cu\n100 0.1 100 0.05 5.0\n")
-    assert "the table has Cu, but the structure holds Ar" in refusal(folder)
+    assert "a table for Cu, but the structure holds Ar" in refusal(folder)

@@ -162,7 +162,8 @@ def test_overrides_are_part_of_what_is_written(tmp_path: Path):
 def test_a_system_with_a_table_takes_it_along(tmp_path: Path):
     source = tmp_path / "source"
     source.mkdir()
-    (source / "cu.eam.alloy").write_text("a\nb\nc\n1 Cu\n100 0.1 100 0.05 5.0\n")
+    zeros = "0.0\n" * 300
+    (source / "cu.eam.alloy").write_text(f"a\nb\nc\n1 Cu\n100 0.1 100 0.05 5.0\n29 63.5 3.6 fcc\n{zeros}")
     (source / "cu.toml").write_text(
         'units = "metal"\n[structure]\nbuilder = "fcc"\nsymbol = "Cu"\nlattice_constant = 3.6\n'
         "repeat = [4, 4, 4]\n"
@@ -214,14 +215,6 @@ def test_a_builder_with_tilt_shears_cell_and_atoms_alike():
     assert np.allclose(np.asarray(tilted.atoms.cell), sheared)
     scaled, same = (system.atoms.get_scaled_positions(wrap=False) for system in (tilted, plain))
     assert np.allclose(scaled, same)
-
-
-def test_perpendicular_widths():
-    assert structures.perpendicular_widths(np.diag([3.0, 4.0, 5.0]), [True, True, True]).tolist() == [3, 4, 5]
-    widths = structures.perpendicular_widths(np.diag([3.0, 4.0, 0.0]), [True, False, False])
-    assert widths.tolist() == [3.0, np.inf, np.inf]
-    sheared = np.array([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert np.allclose(structures.perpendicular_widths(sheared, [True] * 3), [np.sqrt(0.5), 1.0, 1.0])
 
 
 def test_copy_gives_a_system_that_loads_and_overwrites_nothing(tmp_path: Path):

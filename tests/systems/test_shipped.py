@@ -7,9 +7,9 @@ import pytest
 from ase.neighborlist import neighbor_list
 
 from mdnum import systems
+from mdnum.md.cell import Cell
 from mdnum.systems import load
 from mdnum.systems.ball import remarks
-from mdnum.systems.structures import perpendicular_widths
 
 
 # which there are, and how large they are, is a record of `mdnum systems list`
@@ -25,8 +25,9 @@ def test_each_ball_loads_with_variants_and_a_gradient_to_show(name: str):
 def test_each_loads_fits_its_box_and_has_the_temperature_of_its_file(name: str):
     system = load(name)
     assert system.name == name and len(system.spec.about) > 40 and system.spec.dynamics.steps >= 1000
-    widths = perpendicular_widths(np.asarray(system.atoms.cell), system.atoms.pbc)
-    assert system.r_cut + system.spec.skin <= widths.min() / 2
+    assert (
+        system.r_cut + system.spec.skin <= Cell.create(system.atoms.cell, system.atoms.pbc).widths.min() / 2
+    )
     temperature = system.spec.dynamics.temperature
     if system.velocities is None or temperature == 0:
         # drawn from the seed at the start of a run, or a pair with speeds of its own

@@ -46,11 +46,6 @@ class PrecisionChoice(Choice):
 
     Sixteen bits are for pair forces alone in molecular dynamics: in any other role they make another model
     rather than another rounding (`mdnum.numerics.roles.check_role` says why).
-
-    Attributes:
-        role: "state", "force" (of a ball "arithmetic"), "decision" or "accumulate"; None for all of a ball,
-            for all but the state of molecular dynamics, of which sixteen bits are for the force.
-        dtype: "float64", "float32", "float16" or "bfloat16".
     """
 
     screened: ClassVar = {
@@ -62,8 +57,10 @@ class PrecisionChoice(Choice):
             for dtype in ALL
         ),
     }
+    # "state", "force" (of a ball "arithmetic"), "decision" or "accumulate"; None for all of a ball, for all
+    # but the state of molecular dynamics, of which sixteen bits are for the force
     role: str | None = None
-    dtype: str = "float32"
+    dtype: str = "float32"  # "float64", "float32", "float16" or "bfloat16"
 
     def __post_init__(self):
         known = dict.fromkeys((*ROLES["md"], *ROLES["ball"]))
@@ -114,15 +111,11 @@ class PrecisionChoice(Choice):
 
 @choice("reduction")
 class Summation(Choice):
-    """Another order of a sum: of the forces on an atom, of the residuals that stop a solver.
-
-    Attributes:
-        word: as `mdnum.numerics.reductions.parse` reads it: "exact", "permuted:3", "blocked:8".
-    """
+    """Another order of a sum: of the forces on an atom, of the residuals that stop a solver."""
 
     screened = " ".join(f"reduction={word}" for word in reductions.BY_NAME)
     shown = True
-    word: str = "exact"
+    word: str = "exact"  # as `mdnum.numerics.reductions.parse` reads it: "exact", "permuted:3", "blocked:8"
 
     def __post_init__(self):
         reductions.parse(self.word)
@@ -158,10 +151,7 @@ def sums_residuals(system: Any) -> None:
 class Order(Summed):
     """The neighbors of each atom, or the balls of the batch, in another order.
 
-    Attributes:
-        both: reduction of both runs; of a ball "exact" sums of residuals, or "alone": each ball stopped by
-            itself; None for the system's own.
-        seed: of the shuffle.
+    Of balls, `both` is "exact" sums of residuals, or "alone": each ball stopped by itself.
     """
 
     worlds = ("md", "ball")
@@ -169,7 +159,7 @@ class Order(Summed):
         "md": "order order@exact order@fixed-point",
         "ball": "order order@exact order@alone",
     }
-    seed: int = 1
+    seed: int = 1  # of the shuffle
 
     def __post_init__(self):
         if self.both != "alone":
@@ -241,16 +231,11 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """The neighbors of each atom in the order in which another format of the list adds them.
-
-    Attributes:
-        both: reduction of both runs; None for the system's own.
-        word: "dense", "sparse" or "ordered-sparse", as jax-md names its formats.
-    """
+    """The neighbors of each atom in the order in which another format of the list adds them."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
-    word: str = "ordered-sparse"
+    word: str = "ordered-sparse"  # "dense", "sparse" or "ordered-sparse", as jax-md names its formats
 
     def __post_init__(self):
         super().__post_init__()
@@ -272,15 +257,10 @@ class FormatChoice(Summed):
 
 @choice("builder")
 class Builder(Summed):
-    """Lists by another search for neighbors.
-
-    Attributes:
-        both: reduction of both runs.
-        word: "host" or "jax-md"; None for the one that the system does not use.
-    """
+    """Lists by another search for neighbors."""
 
     screened = "builder builder@exact"
-    word: str | None = None
+    word: str | None = None  # "host" or "jax-md"; None for the one that the system does not use
 
     def __post_init__(self):
         from mdnum.md.neighbors import BUILDERS
@@ -301,14 +281,10 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: more or fewer pairs that do not interact, found at other times.
-
-    Attributes:
-        both: reduction of both runs.
-        length: of the skin; None for half as much again, or three quarters where the box has no room.
-    """
+    """Another skin: more or fewer pairs that do not interact, found at other times."""
 
     screened = "skin skin@exact"
+    # of the skin; None for half as much again, or three quarters where the box has no room
     length: float | None = None
 
     def __post_init__(self):
@@ -328,14 +304,10 @@ class Skin(Summed):
 
 @choice("rebuild")
 class RebuildChoice(Summed):
-    """Another rule for when a list is rebuilt.
-
-    Attributes:
-        both: reduction of both runs.
-        every: rebuild blindly every so many steps; None: when an atom has moved by half the skin.
-    """
+    """Another rule for when a list is rebuilt."""
 
     screened = "rebuild=every:1 rebuild=every:10 rebuild=half-skin rebuild=every:1@exact"
+    # rebuild blindly every so many steps; None: when an atom has moved by half the skin
     every: int | None = 1
 
     def __post_init__(self):

@@ -24,16 +24,12 @@ RULES = {
 
 @choice("stop")
 class Stopping(Choice):
-    """Another rule that stops the solver, with the same tolerance.
-
-    Attributes:
-        rule: "sum", "per-instance" or "maximum".
-    """
+    """Another rule that stops the solver, with the same tolerance."""
 
     worlds = ("ball",)
     screened = " ".join(f"stop={rule}" for rule in RULES)
     shown = True
-    rule: str = "per-instance"
+    rule: str = "per-instance"  # "sum", "per-instance" or "maximum"
 
     def __post_init__(self):
         check(self.rule in RULES, f"no rule {self.rule!r}; there are {', '.join(RULES)}", "stop")
@@ -55,15 +51,11 @@ class Stopping(Choice):
 
 @choice("max_iter")
 class Cap(Choice):
-    """More iterations before the solver gives up, or of a fixed number of them.
-
-    Attributes:
-        more: how many, with sign.
-    """
+    """More iterations before the solver gives up, or of a fixed number of them."""
 
     worlds = ("ball",)
     shown = True
-    more: int = 1
+    more: int = 1  # how many, with sign
 
     def __post_init__(self):
         some(self.more, self.name)
@@ -95,18 +87,15 @@ def _check_place(system: BallSystem, step: int | None, ball: int | None) -> None
 
 @choice("contact")
 class ContactStep(Choice):
-    """One contact decision of one ball taken otherwise; everything else is decided as ever.
-
-    Attributes:
-        at: "earlier" or "later": a contact begins a step earlier or later; or the step, from 1, of the
-            decision that is inverted.
-        which: of all contacts that begin in the run, from 1, the first where None; or whose decision it is.
-    """
+    """One contact decision of one ball taken otherwise; everything else is decided as ever."""
 
     worlds = ("ball",)
     screened = "contact=earlier contact=later"
     shown = True
+    # "earlier" or "later": a contact begins a step earlier or later; or the step, from 1, of the decision
+    # that is inverted
     at: int | str = "earlier"
+    # of all contacts that begin in the run, from 1, the first where None; or whose decision it is
     which: int | None = None
 
     def __post_init__(self):
@@ -147,19 +136,13 @@ class ContactStep(Choice):
 
 @choice("iterations")
 class Iterations(Choice):
-    """One solve goes on for more iterations, or for fewer, than its rule says.
-
-    Attributes:
-        more: how many, with sign.
-        step: of the solve; None for the first that iterates.
-        ball: whose, where each ball has a solve of its own; None for the first that iterates.
-    """
+    """One solve goes on for more iterations, or for fewer, than its rule says."""
 
     worlds = ("ball",)
     shown = True
-    more: int = 1
-    step: int | None = None
-    ball: int | None = None
+    more: int = 1  # how many, with sign
+    step: int | None = None  # of the solve; None for the first that iterates
+    ball: int | None = None  # whose, where each ball has a solve of its own; None for the first that iterates
 
     def __post_init__(self):
         some(self.more, "iterations")

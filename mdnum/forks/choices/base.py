@@ -274,14 +274,10 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice of molecular dynamics whose two runs may be given a reduction: without an order it must hold.
-
-    Attributes:
-        both: reduction of both runs; None for the system's own.
-    """
+    """A choice of molecular dynamics whose runs may be given a reduction: without an order it must hold."""
 
     worlds = ("md",)
-    both: str | None = None
+    both: str | None = None  # reduction of both runs; None for the system's own
 
     def __post_init__(self):
         if self.both is not None:

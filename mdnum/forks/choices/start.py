@@ -61,15 +61,10 @@ def _frame(simulation: Any, **parts: Any) -> Any:
 
 @choice("relabel")
 class Relabel(Summed):
-    """The atoms in another order of the file.
-
-    Attributes:
-        both: reduction of both runs.
-        seed: of the permutation.
-    """
+    """The atoms in another order of the file."""
 
     screened = "relabel relabel@exact"
-    seed: int = 1
+    seed: int = 1  # of the permutation
 
     def __post_init__(self):
         super().__post_init__()
@@ -91,16 +86,13 @@ class Rotate(Summed):
 
     An exchange is exact, but squares of components are added in another order. Where a sign changes, the
     start is rounded once as it is wrapped.
-
-    Attributes:
-        both: reduction of both runs.
-        axes: what stands in place of xyz: axis k of the second run is the k-th axis named, of the first, with
-            its sign ("yzx", "-x-yz"); None: the first of these that leaves the box as it is, all three in
-            turn where it can be, the inversion "-x-y-z" where nothing else does.
     """
 
     screened = "rotate rotate@exact"
     must_hold = False  # type: ignore[assignment]
+    # what stands in place of xyz: axis k of the second run is the k-th axis named, of the first, with its
+    # sign ("yzx", "-x-yz"); None: the first of these that leaves the box as it is, all three in turn where it
+    # can be, the inversion "-x-y-z" where nothing else does
     axes: str | None = None
 
     def __post_init__(self):
@@ -139,17 +131,12 @@ def _read(word: str) -> tuple[list[int], list[float]]:
 
 @choice("translate")
 class Translate(Summed):
-    """Everything moved by a share of the lattice vectors: coordinates of another size are rounded otherwise.
-
-    Attributes:
-        both: reduction of both runs.
-        share: of each periodic lattice vector.
-    """
+    """Everything moved by a share of the lattice vectors: larger coordinates are rounded otherwise."""
 
     screened = "translate=0.25 translate=lattice"
     must_hold = False  # type: ignore[assignment]
     shown = True
-    share: float = 0.25
+    share: float = 0.25  # of each periodic lattice vector
 
     def __post_init__(self):
         super().__post_init__()
@@ -180,15 +167,13 @@ class Images(Choice):
     Positions are wrapped before the first step, so this cannot change a bit, as long as the images can be
     written down: the sum of a position and a lattice vector is rounded. Both runs start where that sum is
     exact, within an ulp of a lattice vector from the file's positions.
-
-    Attributes:
-        seed: of a random image of each atom, one lattice vector away at most; None: every atom one lattice
-            vector further along every periodic axis.
     """
 
     worlds = ("md",)
     screened = "unwrapped"
     must_hold = True
+    # of a random image of each atom, one lattice vector away at most; None: every atom one lattice vector
+    # further along every periodic axis
     seed: int | None = None
 
     @property
@@ -247,16 +232,12 @@ class Ulps(Choice):
     """A number of the system file, moved to a float near it in the format that it is used in.
 
     The temperature of a run at constant energy is that of its drawn velocities: both runs draw theirs.
-
-    Attributes:
-        key: dotted, such as "cutoff.radius", "potential.pairs.A-B.sigma" or "stop.tol".
-        ulps: how many floats away, with sign.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}
     shown = True
-    key: str = ""
-    ulps: int = 1
+    key: str = ""  # dotted, such as "cutoff.radius", "potential.pairs.A-B.sigma" or "stop.tol"
+    ulps: int = 1  # how many floats away, with sign
 
     def __post_init__(self):
         check(bool(self.key), "no number is named", "ulps", "Write such as ulps=cutoff.radius:+1")
@@ -290,20 +271,16 @@ def _drawn(system: System) -> System:
 
 @choice("start")
 class StartUlp(Choice):
-    """One coordinate of the start, moved to a float near it.
-
-    Attributes:
-        which: the atom or the ball; None for that of the largest value. An ulp of a small coordinate would be
-            lost in the first addition.
-        what: 0, 1 or 2 for the axis of an atom's position, "height" or "velocity" of a ball; None for the
-            largest coordinate, or the height.
-        ulps: how many floats of the state's dtype away, with sign.
-    """
+    """One coordinate of the start, moved to a float near it."""
 
     screened: ClassVar = {"md": "start", "ball": "start start=velocity:+1"}
+    # the atom or the ball; None for that of the largest value. An ulp of a small coordinate would be lost in
+    # the first addition
     which: int | None = None
+    # 0, 1 or 2 for the axis of an atom's position, "height" or "velocity" of a ball; None for the largest
+    # coordinate, or the height
     what: int | str | None = None
-    ulps: int = 1
+    ulps: int = 1  # how many floats of the state's dtype away, with sign
 
     def __post_init__(self):
         known = "0, 1 or 2 of an atom, height or velocity of a ball"
@@ -374,14 +351,10 @@ class StartUlp(Choice):
 
 @choice("noise")
 class NoiseChoice(Choice):
-    """Another key of the thermostat's noise.
-
-    Attributes:
-        seed: of the key; None for the next after the system's own.
-    """
+    """Another key of the thermostat's noise."""
 
     worlds = ("md",)
-    seed: int | None = None
+    seed: int | None = None  # of the key; None for the next after the system's own
 
     def __post_init__(self):
         check(self.seed is None or self.seed >= 0, f"seed {self.seed} is negative", "noise")

@@ -44,30 +44,25 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """How long a run in one precision keeps to the exact history.
+    """How long a run in one precision keeps to the exact history."""
 
-    Attributes:
-        name, roles: of the precision, and its dtype by role.
-        decision: the first that is not the exact one, exact (A) and the run's (B), with the exact margin in
-            the quantity's space; None where there is none.
-        separation, growth: largest distance from the exact places at each step, length, and its growth.
-        failed: how the run ended, where badly.
-        gain: share of the steps that double precision gains over single which this policy gains; an upper
-            bound where double precision never left; NaN where unknown.
-        closer: bits by which its positions are closer to the exact ones than those of single precision
-            throughout, while both decide exactly; NaN where unknown.
-        reason_unavailable: why it cannot run in this precision; None where it did.
-    """
-
+    # name, roles: of the precision, and its dtype by role
     name: str
     roles: Roles
+    # the first that is not the exact one, exact (A) and the run's (B), with the exact margin in the
+    # quantity's space; None where there is none
     decision: Decision | None = None
+    # separation, growth: largest distance from the exact places at each step, length, and its growth
     separation: Float[np.ndarray, "rows"] | None = None
     growth: Growth | None = None
-    failed: str = ""
+    failed: str = ""  # how the run ended, where badly
+    # share of the steps that double precision gains over single which this policy gains; an upper bound where
+    # double precision never left; NaN where unknown
     gain: float = float("nan")
+    # bits by which its positions are closer to the exact ones than those of single precision throughout,
+    # while both decide exactly; NaN where unknown
     closer: float = float("nan")
-    reason_unavailable: str | None = None
+    reason_unavailable: str | None = None  # why it cannot run in this precision; None where it did
 
     @property
     def horizon(self) -> int | None:
@@ -86,21 +81,14 @@ class PolicyHorizon:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The exact history of a system, and the horizons of real runs against it.
+    """The exact history of a system, and the horizons of real runs against it."""
 
-    Attributes:
-        steps: last step.
-        timestep: in the user's units of time.
-        exact: the history, a `program.ExactHistory`, or a `BallRun`.
-        ranking: precisions, longest horizon first; those that cannot run come last.
-        steps_per_bit: by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the
-            separation from the exact run; NaN where no growth was seen.
-    """
-
-    steps: int
-    timestep: float
-    exact: Any
-    ranking: tuple[PolicyHorizon, ...]
+    steps: int  # last step
+    timestep: float  # in the user's units of time
+    exact: Any  # the history, a `program.ExactHistory`, or a `BallRun`
+    ranking: tuple[PolicyHorizon, ...]  # precisions, longest horizon first; those that cannot run come last
+    # by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the separation from the
+    # exact run; NaN where no growth was seen
     steps_per_bit: float
 
 
@@ -153,7 +141,7 @@ def _row(
 
 
 def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: Progress):
-    from mdnum.forks.exact.program import ExactProgram, with_policy
+    from mdnum.forks.exact.program import ExactProgram
     from mdnum.forks.tape import first_difference, taped
     from mdnum.md.cell import HostCell
     from mdnum.numerics import PrecisionPolicy
@@ -184,7 +172,7 @@ def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: 
             failed = segment.closes if segment.closes in FAILURES else ""
             parts.append(rows_of(segment, frame, failed).x)
 
-        other = replace(program, simulation=with_policy(simulation, PrecisionPolicy(**roles)))
+        other = replace(program, simulation=simulation.with_policy(PrecisionPolicy(**roles)))
         decision = first_difference(exact.tape, taped(other, last, watch))
         x = np.concatenate(parts)
         common = min(len(exact.x), len(x))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from mdnum.md.cell import complete
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
-from mdnum.numerics import PrecisionPolicy, gamma
+from mdnum.numerics import gamma
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation
 
@@ -75,29 +75,21 @@ def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: fl
 
 @dataclass(frozen=True)
 class ExactHistory:
-    """The certified history.
+    """The certified history."""
 
-    Attributes:
-        tape: every decision, proven.
-        margin: smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about
-            ten digits.
-        radius: binary logarithm of the largest radius of a coordinate's ball at each step (length), shape
-            (steps + 1,); minus infinity where all are exact.
-        x: centers of the coordinates as doubles, not wrapped, length, shape (steps + 1, atoms, 3).
-        bits: precision that proved it.
-        restarts: runs given up because a decision was not proven.
-        close: decisions that needed the balls; all others were proven by a bound in double precision.
-        seconds: of the run that succeeded.
-    """
-
-    tape: DecisionTape
+    tape: DecisionTape  # every decision, proven
+    # smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about ten
+    # digits
     margin: Float[np.ndarray, "rows"]
+    # binary logarithm of the largest radius of a coordinate's ball at each step (length), shape (steps + 1,);
+    # minus infinity where all are exact
     radius: Float[np.ndarray, "rows"]
+    # centers of the coordinates as doubles, not wrapped, length, shape (steps + 1, atoms, 3)
     x: Float[np.ndarray, "rows atoms 3"]
-    bits: int
-    restarts: int
-    close: int
-    seconds: float
+    bits: int  # precision that proved it
+    restarts: int  # runs given up because a decision was not proven
+    close: int  # decisions that needed the balls; all others were proven by a bound in double precision
+    seconds: float  # of the run that succeeded
 
     @property
     def bits_per_step(self) -> float:
@@ -179,7 +171,7 @@ class ExactProgram:
         error = unsupported(simulation)
         if error is not None:
             raise error
-        begin = first_state(_wide(simulation))
+        begin = first_state(simulation.with_policy())
         self._x = np.asarray(begin.state.x, np.float64).T.copy()
         self._v = np.asarray(begin.state.v, np.float64).T.copy()
         self.simulation = simulation
@@ -198,7 +190,7 @@ class ExactProgram:
         self._timestep = float(simulation.integrator.timestep)
         self._i, self._j = np.triu_indices(atoms, 1)
         self._kind = np.asarray(simulation.type_of(self._i, self._j))
-        decider = _wide(simulation).decider
+        decider = simulation.with_policy().decider
         self._inclusive, self._space = decider.compare.endswith("<="), decider.space
         self._held = [t.value for t in decider.thresholds]
         squared = [value * value if self._space == "r" else value for value in self._held]
@@ -405,14 +397,3 @@ def _log2_radius(ball) -> float:
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()
     return float(int(exponent) + int(mantissa).bit_length())
-
-
-def _wide(simulation: Simulation) -> Simulation:
-    """The same system with every role in double precision."""
-    return with_policy(simulation, PrecisionPolicy())
-
-
-def with_policy(simulation: Simulation, policy: PrecisionPolicy) -> Simulation:
-    """The same system under another precision policy."""
-    decider = replace(simulation.decider, dtype=policy.decision, state=policy.state)
-    return replace(simulation, policy=policy, decider=decider)

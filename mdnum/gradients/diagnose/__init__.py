@@ -52,43 +52,30 @@ _ERRORS = 5.0
 
 @dataclass(frozen=True)
 class Opinion:
-    """What one method gives.
+    """What one method gives."""
 
-    Attributes:
-        method: its name. description: which derivative it gives, one sentence.
-        found: the gradient; None where there is none. missing: why: it does not apply, or it failed.
-        seconds: wall time, compiling included.
-    """
-
-    method: str
-    description: str
-    found: Gradient | None
-    missing: str = ""
-    seconds: float = 0.0
+    method: str  # its name
+    description: str  # which derivative it gives, one sentence
+    found: Gradient | None  # the gradient; None where there is none
+    missing: str = ""  # why: it does not apply, or it failed
+    seconds: float = 0.0  # wall time, compiling included
 
 
 @dataclass(frozen=True)
 class GradientDifference:
-    """The derivatives of two methods by one parameter.
+    """The derivatives of two methods by one parameter."""
 
-    Attributes:
-        name: full name of the parameter. method, reference: names of the two methods.
-        size: Euclidean norm of the reference's derivative (a scalar's magnitude).
-        difference: norm of the difference; signed (method minus reference) for a scalar.
-        relative: |difference| over `size`; infinite where only the reference is 0.
-        meaning: "agree", "missing saltation", "rounding", "truncation and noise", "events between shifts",
-            "another program", "an average", "statistical" or "unexplained".
-        values: the numbers that this rests on.
-    """
-
-    name: str
+    name: str  # full name of the parameter
+    # method, reference: names of the two methods
     method: str
     reference: str
-    size: float
-    difference: float
-    relative: float
+    size: float  # Euclidean norm of the reference's derivative (a scalar's magnitude)
+    difference: float  # norm of the difference; signed (method minus reference) for a scalar
+    relative: float  # |difference| over `size`; infinite where only the reference is 0
+    # "agree", "missing saltation", "rounding", "truncation and noise", "events between shifts", "another
+    # program", "an average", "statistical" or "unexplained"
     meaning: str
-    values: dict[str, float] = field(default_factory=dict)
+    values: dict[str, float] = field(default_factory=dict)  # the numbers that this rests on
 
 
 @dataclass(frozen=True)

@@ -46,60 +46,40 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class NotFinite:
-    """Where a reverse pass stops being finite.
+    """Where a reverse pass stops being finite."""
 
-    Attributes:
-        found: whether it does at all. forward: whether the forward run, its loss included, is finite.
-        step: the first step, in the order of the reverse pass (last in time); -1 where all is finite.
-        operation: the first operation there whose inputs are finite and whose result is not; empty where no
-            single operation is. inputs: its numbers at that place.
-        source: file:line:function that wrote it; empty where it is not known.
-        part: "loss", "forces", "crossings", "drift" or "parameters".
-        i, j: the pair at fault, i < j; -1 where it is no pair (j alone -1: an atom).
-        distance: of the pair, length; NaN where there is none.
-    """
-
-    found: bool = False
-    forward: bool = True
-    step: int = -1
+    found: bool = False  # whether it does at all
+    forward: bool = True  # whether the forward run, its loss included, is finite
+    step: int = -1  # the first step, in the order of the reverse pass (last in time); -1 where all is finite
+    # the first operation there whose inputs are finite and whose result is not; empty where no single
+    # operation is
     operation: str = ""
-    inputs: tuple[float, ...] = ()
-    source: str = ""
-    part: str = ""
+    inputs: tuple[float, ...] = ()  # its numbers at that place
+    source: str = ""  # file:line:function that wrote it; empty where it is not known
+    part: str = ""  # "loss", "forces", "crossings", "drift" or "parameters"
+    # i, j: the pair at fault, i < j; -1 where it is no pair (j alone -1: an atom)
     i: int = -1
     j: int = -1
-    distance: float = float("nan")
+    distance: float = float("nan")  # of the pair, length; NaN where there is none
 
 
 @dataclass(frozen=True)
 class Operation:
-    """An operation whose result is not finite.
+    """An operation whose result is not finite."""
 
-    Attributes:
-        name: of the primitive, such as "div".
-        source: file:line:function that wrote it, innermost one outside of JAX; empty where it is not known.
-        functions: all functions on the way to it, outermost first.
-        index: of the first number that is not finite, in the result. shape: of the result.
-        rounds: rounds of the loops around it, outermost first.
-        inputs: the numbers at that place of inputs that have the shape of the result, or no shape.
-        count: how many operations ran before it.
-    """
-
-    name: str
-    source: str
-    functions: tuple[str, ...]
-    index: tuple[int, ...]
-    shape: tuple[int, ...]
-    rounds: tuple[int, ...]
+    name: str  # of the primitive, such as "div"
+    source: str  # file:line:function that wrote it, innermost one outside of JAX; empty where it is not known
+    functions: tuple[str, ...]  # all functions on the way to it, outermost first
+    index: tuple[int, ...]  # of the first number that is not finite, in the result
+    shape: tuple[int, ...]  # of the result
+    rounds: tuple[int, ...]  # rounds of the loops around it, outermost first
+    # the numbers at that place of inputs that have the shape of the result, or no shape
     inputs: tuple[float, ...]
-    count: int
+    count: int  # how many operations ran before it
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
     """The operation that makes the result of a function of arrays not finite; it is not compiled.
-
-    Args:
-        args: pytrees of arrays.
 
     Returns:
         None where every number of the result is finite, or one of the arguments is not.
@@ -137,18 +117,12 @@ def _inexact(leaf: Any) -> bool:
 
 @dataclass
 class _Interpreter:
-    """One run of a program, operation by operation, up to and including its end.
+    """One run of a program, operation by operation, up to and including its end."""
 
-    Attributes:
-        mended: numbers of operations whose results are made finite.
-        found: the first operation at fault.
-        count: operations so far. rounds: of the loops that it is in.
-    """
-
-    mended: list[int]
-    found: Operation | None = None
-    count: int = 0
-    rounds: list[int] = field(default_factory=list)
+    mended: list[int]  # numbers of operations whose results are made finite
+    found: Operation | None = None  # the first operation at fault
+    count: int = 0  # operations so far
+    rounds: list[int] = field(default_factory=list)  # of the loops that it is in
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
         """The results of a program."""
@@ -327,9 +301,12 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
     """The arguments of a reverse pass over some of the rows."""
     out = list(arguments)
-    for k in (4, 5, 7, 9):
+    for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
     out[6] = end - first
+    if out[9] is not None:
+        # crossings of all rows lie one after the other; a span tells which are a row's
+        out[9] = out[9]._replace(spans=out[9].spans[first:end])
     return tuple(out)
 
 

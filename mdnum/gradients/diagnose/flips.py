@@ -42,27 +42,21 @@ class FlipTerms:
     """What each flip on the way adds to the gradient, heaviest first.
 
     A number is a scalar parameter, or an entry of one that has several: "potential.sigma[1]".
-
-    Attributes:
-        table: a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the
-            decision, `radial_speed` (negative where the pair enters), `weight` (derivative of the loss by the
-            cutoff of this one crossing), `grazing` (slower than the guard and left out: its weight is what it
-            would have been) and `contribution.<number>`, which sum to event-aware minus symmetric.
-        flips, grazing: how many.
-        smooth: the gradient with decisions held fixed, by number. total: with the flips.
-        share: of the total, by number, then SMOOTH, ENTERS and LEAVES.
-        half: number of flips, heaviest first, that have half of the weight of all, by number.
-        skipped: number of entries of parameters that have too many of them for contributions.
     """
 
+    # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
+    # `radial_speed` (negative where the pair enters), `weight` (derivative of the loss by the cutoff of this
+    # one crossing), `grazing` (slower than the guard and left out: its weight is what it would have been) and
+    # `contribution.<number>`, which sum to event-aware minus symmetric
     table: dict[str, np.ndarray]
+    # flips, grazing: how many
     flips: int
     grazing: int
-    smooth: dict[str, float]
-    total: dict[str, float]
-    share: dict[str, dict[str, float]]
-    half: dict[str, int]
-    skipped: dict[str, int]
+    smooth: dict[str, float]  # the gradient with decisions held fixed, by number
+    total: dict[str, float]  # with the flips
+    share: dict[str, dict[str, float]]  # of the total, by number, then SMOOTH, ENTERS and LEAVES
+    half: dict[str, int]  # number of flips, heaviest first, that have half of the weight of all, by number
+    skipped: dict[str, int]  # number of entries of parameters that have too many of them for contributions
 
 
 def flips(
@@ -139,28 +133,24 @@ def flips(
 
 @dataclass(frozen=True)
 class DecisionEdge:
-    """The nearest boundary of decisions on one side of a parameter, and the gradient across it.
+    """The nearest boundary of decisions on one side of a parameter, and the gradient across it."""
 
-    Attributes:
-        side: "below" or "above". runs: that the search took. found: whether there is one within reach.
-        inside, beyond: adjacent floats; the run at `inside` decides as the one asked about, that at `beyond`
-            does not. distance: from the parameter's value to `inside`, in its units.
-        step, i, j: the first decision that differs.
-        value_inside, value_beyond: the loss on either side. gradient_inside, gradient_beyond: derivative by
-            this parameter, by method.
-    """
-
-    side: str
-    runs: int
-    found: bool = False
+    side: str  # "below" or "above"
+    runs: int  # that the search took
+    found: bool = False  # whether there is one within reach
+    # inside, beyond: adjacent floats; the run at `inside` decides as the one asked about, that at `beyond`
+    # does not
     inside: float = float("nan")
     beyond: float = float("nan")
-    distance: float = float("nan")
+    distance: float = float("nan")  # from the parameter's value to `inside`, in its units
+    # step, i, j: the first decision that differs
     step: int = -1
     i: int = -1
     j: int = -1
+    # value_inside, value_beyond: the loss on either side
     value_inside: float = float("nan")
     value_beyond: float = float("nan")
+    # gradient_inside, gradient_beyond: derivative by this parameter, by method
     gradient_inside: dict[str, float] = field(default_factory=dict)
     gradient_beyond: dict[str, float] = field(default_factory=dict)
 

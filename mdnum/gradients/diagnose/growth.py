@@ -190,27 +190,21 @@ def growth(
 
 @dataclass(frozen=True)
 class Scaling:
-    """Whether the cotangents of a reverse pass fit a narrow type, step by step.
+    """Whether the cotangents of a reverse pass fit a narrow type, step by step."""
 
-    Attributes:
-        format: the type, one of numerics.formats. numbers: in each step.
-        table: by `horizon`, numbers of the step that are beyond the largest of the format (`overflow`), lost
-            below half the smallest (`underflow`), have lost digits (`subnormal`), the `largest` and
-            `smallest` magnitude (zeros left out), and the counts with the scale (`scaled_...`).
-        scale, power: a power of two by which the loss is multiplied so that the fewest numbers are lost and
-            none overflows, NaN where more than half are lost with any; and its exponent.
-        usable: whether there is anything finite to scale. fits: whether no step loses more than 1 % of its
-            numbers with it. worst: largest share that a step loses.
-    """
-
-    format: str
-    numbers: int
+    format: str  # the type, one of numerics.formats
+    numbers: int  # in each step
+    # by `horizon`, numbers of the step that are beyond the largest of the format (`overflow`), lost below
+    # half the smallest (`underflow`), have lost digits (`subnormal`), the `largest` and `smallest` magnitude
+    # (zeros left out), and the counts with the scale (`scaled_...`)
     table: dict[str, np.ndarray]
+    # scale, power: a power of two by which the loss is multiplied so that the fewest numbers are lost and
+    # none overflows, NaN where more than half are lost with any; and its exponent
     scale: float
     power: int
-    usable: bool
-    fits: bool
-    worst: float
+    usable: bool  # whether there is anything finite to scale
+    fits: bool  # whether no step loses more than 1 % of its numbers with it
+    worst: float  # largest share that a step loses
 
 
 class ScalingWatch:
@@ -282,44 +276,33 @@ class Spectrum:
     """How small changes of the start stretch: singular values of the product of all step Jacobians.
 
     Lengths of changes are those of positions, and of velocities times `clock`.
-
-    Attributes:
-        steps: of the run. clock: internal time.
-        log_singular: natural logarithm of the largest singular values, largest first.
-        residual: |Phi^T u - s v| / s of each with its vectors u and v: how exact it is.
-        exponents, exponents_time: finite-time Lyapunov exponents per step, and per unit of time of the file.
-        horizon, curve: steps, and log stretch of the k-th direction of an orthonormal frame carried forward.
-        transposed: relative defect of <w, Phi v> = <Phi^T w, v>: a rounding error.
-        word: one of WORDS.
     """
 
-    steps: int
-    clock: float
+    steps: int  # of the run
+    clock: float  # internal time
+    # natural logarithm of the largest singular values, largest first
     log_singular: Float[np.ndarray, "values"]
+    # |Phi^T u - s v| / s of each with its vectors u and v: how exact it is
     residual: Float[np.ndarray, "values"]
+    # exponents, exponents_time: finite-time Lyapunov exponents per step, and per unit of time of the file
     exponents: Float[np.ndarray, "values"]
     exponents_time: Float[np.ndarray, "values"]
+    # horizon, curve: steps, and log stretch of the k-th direction of an orthonormal frame carried forward
     horizon: Int[np.ndarray, "points"]
     curve: Float[np.ndarray, "points values"]
-    transposed: float
-    word: str
+    transposed: float  # relative defect of <w, Phi v> = <Phi^T w, v>: a rounding error
+    word: str  # one of WORDS
 
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Where a block of orthonormal vectors went: basis @ exp(log_scale) mixing.
+    """Where a block of orthonormal vectors went: basis @ exp(log_scale) mixing."""
 
-    Attributes:
-        basis: orthonormal, shape (coordinates, vectors).
-        mixing: upper triangular, of size one, shape (vectors, vectors). log_scale: log of what was taken out.
-        steps: number of steps after which `stretches` was noted, shape (points,).
-        stretches: log of the diagonal of the mixing so far, shape (points, vectors).
-    """
-
-    basis: Float[np.ndarray, "coordinates vectors"]
-    mixing: Float[np.ndarray, "vectors vectors"]
-    log_scale: float
-    steps: np.ndarray
+    basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
+    mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)
+    log_scale: float  # log of what was taken out
+    steps: np.ndarray  # number of steps after which `stretches` was noted, shape (points,)
+    # log of the diagonal of the mixing so far, shape (points, vectors)
     stretches: Float[np.ndarray, "points vectors"]
 
 

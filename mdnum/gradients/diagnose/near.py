@@ -115,15 +115,11 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collects turning points while a reverse pass, tangents and other runs go by.
-
-    Attributes:
-        pace: how often the loss looks. rows: of the longest stretch.
-    """
+    """Collects turning points while a reverse pass, tangents and other runs go by."""
 
     simulation: Simulation
-    pace: Pace
-    rows: int = 0
+    pace: Pace  # how often the loss looks
+    rows: int = 0  # of the longest stretch
     #: Tables by the first step of their stretch, last one first.
     _found: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
 
@@ -181,7 +177,7 @@ class Near:
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
         """One stretch of another run, which makes `per` steps where this one makes one."""
-        cell, place = HostCell(self.simulation.cell), np.argsort(stretch.table.order)
+        cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
                 row = per * (found["step"] - earlier) - stretch.first

@@ -27,7 +27,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, GradientGrowth, GrowthWatch
 from mdnum.gradients.diagnose.near import Near, Turns
-from mdnum.gradients.differences import in_float64, replica
+from mdnum.gradients.differences import replica
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.parameters import ParameterEntry, columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
@@ -62,17 +62,13 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """One loss for several runs that are the first steps of one run: its sums have an axis of horizons.
-
-    Attributes:
-        inner: the loss.
-        table: whether the loss of a run of each horizon looks at each step.
-        per: steps that are made for each of these; it looks at the last of them.
-    """
+    """One loss for several runs that are the first steps of one run: its sums have an axis of horizons."""
 
     name = "shorter"
-    inner: Loss = eqx.field(kw_only=True)
+    inner: Loss = eqx.field(kw_only=True)  # the loss
+    # whether the loss of a run of each horizon looks at each step
     table: Bool[Array, "rows horizons"] = eqx.field(kw_only=True)
+    # steps that are made for each of these; it looks at the last of them
     per: Int[Array, ""] = eqx.field(kw_only=True)
 
     def looks_at(self, steps, last):
@@ -121,19 +117,13 @@ def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Pr
 
 @dataclass(frozen=True)
 class Horizons:
-    """Losses and gradients of runs of several lengths.
+    """Losses and gradients of runs of several lengths."""
 
-    Attributes:
-        at: horizons, steps. columns: the numbers that are differentiated by.
-        value: the loss, by horizon. gradient: by horizon and column.
-        flips: step, pair and whether it entered, of each flip of the run, in order.
-    """
-
-    at: Int[np.ndarray, "points"]
-    columns: tuple[ParameterEntry, ...]
-    value: Float[np.ndarray, "points"]
-    gradient: Float[np.ndarray, "points columns"]
-    flips: Int[np.ndarray, "flips 4"]
+    at: Int[np.ndarray, "points"]  # horizons, steps
+    columns: tuple[ParameterEntry, ...]  # the numbers that are differentiated by
+    value: Float[np.ndarray, "points"]  # the loss, by horizon
+    gradient: Float[np.ndarray, "points columns"]  # by horizon and column
+    flips: Int[np.ndarray, "flips 4"]  # step, pair and whether it entered, of each flip of the run, in order
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
         """The gradient by parameter."""
@@ -220,20 +210,14 @@ def first_difference(a: Horizons, b: Horizons) -> int | None:
 
 @dataclass(frozen=True)
 class Limit:
-    """One of the things that end trust in a gradient.
+    """One of the things that end trust in a gradient."""
 
-    Attributes:
-        what: ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER.
-        horizon: the longest horizon, in steps, at which it did no harm; None where it was not examined.
-        reached: whether it was met within the horizon asked for; else trust holds at least that far.
-        code: what was seen, or why it was not examined. values: the numbers of it.
-    """
-
-    what: str
+    what: str  # ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER
+    # the longest horizon, in steps, at which it did no harm; None where it was not examined
     horizon: int | None
-    reached: bool
-    code: str
-    values: dict[str, Any] = field(default_factory=dict)
+    reached: bool  # whether it was met within the horizon asked for; else trust holds at least that far
+    code: str  # what was seen, or why it was not examined
+    values: dict[str, Any] = field(default_factory=dict)  # the numbers of it
 
 
 @dataclass(frozen=True)
@@ -275,7 +259,7 @@ def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[
     gradient is made of roundings, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
-        return in_float64(simulation), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
+        return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
     x = simulation.positions
     # of the largest coordinate: one of a coordinate near zero would be absorbed by the first step
     moved = x + np.spacing(np.abs(x).max()) * np.random.default_rng(seed).choice([-1.0, 1.0], x.shape)

@@ -6,39 +6,36 @@ subclass in a library's own tests; `cases` and `boxes` are hypothesis strategies
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mdnum.references.conformance.adoption import NeighborListConformance
-    from mdnum.references.conformance.case import Case, Still
-    from mdnum.references.conformance.judge import Report
-    from mdnum.references.conformance.lists import LISTS, KeptList, ListLimits, PairList, from_object
-    from mdnum.references.conformance.peers import installed, known, load
-    from mdnum.references.conformance.questions import boxes, cases
-    from mdnum.references.conformance.reproduction import script
-    from mdnum.references.conformance.suite import examine
+    from mdnum.references.conformance.adoption import NeighborListConformance as NeighborListConformance
+    from mdnum.references.conformance.case import Case as Case
+    from mdnum.references.conformance.case import Still as Still
+    from mdnum.references.conformance.judge import Report as Report
+    from mdnum.references.conformance.lists import LISTS as LISTS
+    from mdnum.references.conformance.lists import KeptList as KeptList
+    from mdnum.references.conformance.lists import ListLimits as ListLimits
+    from mdnum.references.conformance.lists import PairList as PairList
+    from mdnum.references.conformance.lists import from_object as from_object
+    from mdnum.references.conformance.peers import installed as installed
+    from mdnum.references.conformance.peers import known as known
+    from mdnum.references.conformance.peers import load as load
+    from mdnum.references.conformance.questions import boxes as boxes
+    from mdnum.references.conformance.questions import cases as cases
+    from mdnum.references.conformance.reproduction import script as script
+    from mdnum.references.conformance.suite import examine as examine
 
 # no module here has the name of what is exported: importing it would put the module in its place
-_HOMES = {
-    "adoption": ("NeighborListConformance",),
-    "case": ("Case", "Still"),
-    "judge": ("Report",),
-    "lists": ("LISTS", "KeptList", "ListLimits", "PairList", "from_object"),
-    "peers": ("installed", "known", "load"),
-    "questions": ("boxes", "cases"),
-    "reproduction": ("script",),
-    "suite": ("examine",),
-}
-
-__all__ = [
-    "LISTS", "Case", "KeptList", "ListLimits", "NeighborListConformance", "PairList", "Report", "Still",
-    "boxes", "cases", "examine", "from_object", "installed", "known", "load", "script",
-]  # fmt: skip
-
-
-def __getattr__(name: str) -> Any:
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"{__name__}.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = on_first_use(__name__, {
+    "adoption": "NeighborListConformance",
+    "case": "Case Still",
+    "judge": "Report",
+    "lists": "LISTS KeptList ListLimits PairList from_object",
+    "peers": "installed known load",
+    "questions": "boxes cases",
+    "reproduction": "script",
+    "suite": "examine",
+})  # fmt: skip

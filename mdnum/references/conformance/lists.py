@@ -133,39 +133,25 @@ LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(ListLimit
 
 @dataclass(frozen=True)
 class PairList:
-    """A neighbor list under test.
+    """A neighbor list under test."""
 
-    Attributes:
-        name: what people write.
-        make: gives a function of (positions, cell, pbc, r_cut), or a `KeptList`.
-        kept: whether it is a `KeptList`.
-        package: distribution whose version counts.
-        full: every pair from both atoms, or once; None to find out.
-        unit: roundoff of its arithmetic; None to find out.
-        superset: pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept.
-        limits: what it does not claim to do.
-        source: lines that define or import it, for a script without mdnum.
-        call: an expression that is the function, or the class of lists that are kept, in that script.
-        affords: the share of the random cases that it is asked: slow ones take 0.01.
-        known: what is known of why it fails, by code of the failure.
-        description: one line.
-        word: what `load` finds it by in another process; empty where it cannot.
-    """
-
-    name: str
-    make: Callable[[], Any]
-    kept: bool = False
-    package: str | None = None
-    full: bool | None = None
-    unit: float | None = None
+    name: str  # what people write
+    make: Callable[[], Any]  # gives a function of (positions, cell, pbc, r_cut), or a `KeptList`
+    kept: bool = False  # whether it is a `KeptList`
+    package: str | None = None  # distribution whose version counts
+    full: bool | None = None  # every pair from both atoms, or once; None to find out
+    unit: float | None = None  # roundoff of its arithmetic; None to find out
+    # pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept
     superset: bool | None = None
-    limits: ListLimits = field(default_factory=ListLimits)
-    source: str = ""
+    limits: ListLimits = field(default_factory=ListLimits)  # what it does not claim to do
+    source: str = ""  # lines that define or import it, for a script without mdnum
+    # an expression that is the function, or the class of lists that are kept, in that script
     call: str = "pairs"
-    affords: float = 1.0
+    affords: float = 1.0  # the share of the random cases that it is asked: slow ones take 0.01
+    # what is known of why it fails, by code of the failure
     known: Mapping[str, str] = field(default_factory=dict)
-    description: str = ""
-    word: str = ""
+    description: str = ""  # one line
+    word: str = ""  # what `load` finds it by in another process; empty where it cannot
 
     @property
     def version(self) -> str | None:

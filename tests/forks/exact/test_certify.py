@@ -13,7 +13,6 @@ from mdnum.errors import InputError
 from mdnum.forks import certified
 from mdnum.forks.certified import certified_horizon, exact_margin
 from mdnum.forks.exact.certify import BALL_POLICIES, MD_POLICIES, certify
-from mdnum.forks.exact.program import with_policy
 from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
@@ -37,7 +36,7 @@ def liquid(seed: int = 3) -> System:
 @cache
 def simulation(policy: PrecisionPolicy | None = None) -> Simulation:
     whole = build(liquid(11))
-    return whole if policy is None else with_policy(whole, policy)
+    return whole if policy is None else whole.with_policy(policy)
 
 
 @pytest.fixture
