@@ -12,10 +12,10 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from tempfile import NamedTemporaryFile
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -83,33 +83,44 @@ class _ProcessPart:
     first: Members | None = None  # the pairs inside at the first; of later parts, at the frame before it
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
+    file: BinaryIO | None = None  # with the flips, column after column, where another process found them
+    count: int = 0  # flips in it
+
     def __getstate__(self) -> dict[str, Any]:
         """From a process to its parent, which would wait for flips to come through a pipe: through a file."""
         if parent_process() is None or "distributed" in sys.modules:
             # to nobody knows where, and how often it is read
             return vars(self)
-        with NamedTemporaryFile(prefix="mdnum-flips-", delete=False) as file:
+        # a frame's column is short: many of them are written at once
+        with NamedTemporaryFile(prefix="mdnum-flips-", delete=False, buffering=1 << 20) as file:
             try:
                 for name in vars(FlipTable.none()):
                     file.writelines(getattr(one, name).data for one in self.flips)
             except BaseException:
                 os.unlink(file.name)
                 raise
-        return {**vars(self), "flips": (file.name, sum(map(len, self.flips)))}
+        return {**vars(self), "flips": [], "file": file.name, "count": sum(map(len, self.flips))}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        if isinstance(state["flips"], list):
-            vars(self).update(state)
-            return
-        name, count = state["flips"]
-        columns, at = [], 0
-        for none in vars(FlipTable.none()).values():
-            size = count * none.itemsize
-            mapped = np.memmap(name, none.dtype, "c", at, count) if count else none
-            columns.append(mapped.view(np.ndarray))
-            at += size
-        os.unlink(name)
-        vars(self).update(state, flips=[FlipTable(*columns)] * bool(count))
+        vars(self).update(state)
+        if isinstance(self.file, str):
+            name, self.file = self.file, open(self.file, "rb")  # noqa: SIM115 -- until it is read
+            os.unlink(name)
+
+    def __len__(self) -> int:
+        return self.count + sum(map(len, self.flips))
+
+    def move(self, columns: Sequence[np.ndarray]) -> None:
+        """Moves the flips to where they are wanted: pages that are new to a process are touched once."""
+        if self.file is not None:
+            with self.file as file:
+                for column in columns:
+                    if file.readinto(column.data) < column.nbytes:
+                        raise OSError("the file ends in which a process left its flips")
+        elif self.flips:
+            for name, column in zip(vars(self.flips[0]), columns, strict=True):
+                np.concatenate([getattr(one, name) for one in self.flips], out=column)
+        self.flips, self.file = [], None
 
 
 @dataclass(frozen=True)
@@ -394,8 +405,8 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     Raises:
         InputError: two processes found other pairs at the frame between them: the file changed meanwhile.
     """
-    flips: list[FlipTable] = []
-    done, last = 0, None
+    columns = [np.empty(sum(map(len, parts)), none.dtype) for none in vars(FlipTable.none()).values()]
+    table, at, done, last = FlipTable(*columns), 0, 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
             raise InputError(
@@ -403,12 +414,13 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
                 remedy="The file was changed while it was read; run again",
             )
         # a part after the first has counted the frame before its own too
-        shift = done - (done > 0)
-        flips += [replace(rows, frame=rows.frame + shift) for rows in part.flips]
+        end = at + len(part)
+        part.move([column[at:end] for column in columns])
+        table.frame[at:end] += done - (done > 0)
+        at = end
         done += len(part.rows)
         last = last if part.last is None else part.last
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
-    table = FlipTable.concatenate(flips) if flips else FlipTable.none()
     initial, none = parts[0].first if parts else None, Members.none()
     pairs, near = rows[:, :2].T.astype(np.int64)
     return RuleResult(rule, table, pairs, near, rows[:, 2], initial or none, last or none)
