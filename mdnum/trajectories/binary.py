@@ -101,6 +101,8 @@ class XtcFile:
     def check(self, number: int) -> None:
         """Looks at a frame without decoding it."""
         self._stream(number, look=True)
+        if len(self._starts) == number + 1:
+            self._starts.append(self._file.tell())
 
     def read(self, number: int) -> Any:
         """A frame as the library decodes it, in nm and ps, once it has been checked."""
@@ -166,20 +168,6 @@ class XtcFile:
 
 
 @numba.njit(cache=True, nogil=True)
-def _bits(stream, at, count):
-    """The number that `count` bits hold, the first of them the largest."""
-    value = 0
-    while count > 0:
-        free = 8 - (at & 7)
-        take = min(free, count)
-        part = (np.int64(stream[at >> 3]) >> (free - take)) & ((1 << take) - 1)
-        value = (value << take) | part
-        at += take
-        count -= take
-    return value
-
-
-@numba.njit(cache=True, nogil=True)
 def _walk(stream, atoms, whole, small):
     """Bits that the coordinates of so many atoms take; -8 where the stream is none.
 
@@ -193,14 +181,19 @@ def _walk(stream, atoms, whole, small):
         done += 1
         if at >= most:
             return -8
-        flag = _bits(stream, at, 1)
+        # the flag and the five bits behind it, which lie in two bytes
+        place = at >> 3
+        pair = np.int64(stream[place]) << 8
+        if place + 1 < stream.shape[0]:
+            pair |= np.int64(stream[place + 1])
+        value = pair >> (10 - (at & 7)) & 0x3F
         at += 1
         change = 0
-        if flag:
-            if at + 5 > most:
-                return -8
-            value = _bits(stream, at, 5)
+        if value & 0x20:
             at += 5
+            if at > most:
+                return -8
+            value &= 0x1F
             run = value - value % 3
             change = value % 3 - 1
         at += run // 3 * small
@@ -230,6 +223,8 @@ class XtcTrajectory(Trajectory):
             # a frame that is cut is one to read
             self._count = whole + (not file.ends_at(whole))
         self._has(atoms)
+        # of the last frame, which has the same box as the next in most files
+        self._box = b"", Box()
         self.notes = (NARROWED, *self.table.notes)
 
     def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
@@ -241,9 +236,11 @@ class XtcTrajectory(Trajectory):
         from MDAnalysis.lib.mdamath import triclinic_box
 
         ten = np.float32(10)
-        dimensions: Any = triclinic_box(*raw.box)
-        dimensions[:3] *= ten
-        return Frame(number, float(raw.time), (np.array(raw.x) * ten).astype(np.float64), box_of(dimensions))
+        if (vectors := raw.box.tobytes()) != self._box[0]:
+            dimensions: Any = triclinic_box(*raw.box)
+            dimensions[:3] *= ten
+            self._box = vectors, box_of(dimensions)
+        return Frame(number, float(raw.time), (raw.x * ten).astype(np.float64), self._box[1])
 
 
 # ---- NetCDF

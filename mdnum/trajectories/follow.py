@@ -85,7 +85,7 @@ class NeighborCounts:
 
     def __init__(self, members: Members, atoms: int, groups: Groups, directed: bool):
         self._sides = [None if one is None else np.isin(np.arange(atoms), one) for one in groups]
-        self._atoms = np.arange(atoms) if groups[0] is None else np.asarray(groups[0])
+        self._atoms = None if groups[0] is None else np.asarray(groups[0])
         self._directed, self._now = directed, np.zeros(atoms, np.int64)
         # by number of neighbors, atoms and frames at which an atom had as many
         self.seen = np.zeros(1, np.int64)
@@ -104,12 +104,13 @@ class NeighborCounts:
 
     def count(self) -> tuple[int, float, int]:
         """(fewest, mean, most) over the atoms at this frame, which is added to what was seen."""
-        here = np.bincount(self._now[self._atoms])
+        here = np.bincount(self._now if self._atoms is None else self._now[self._atoms])
         if len(here) > len(self.seen):
             self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
         self.seen[: len(here)] += here
         total = int(here @ np.arange(len(here)))
-        return int(np.flatnonzero(here)[0]), total / len(self._atoms), len(here) - 1
+        atoms = len(self._now if self._atoms is None else self._atoms)
+        return int(here.nonzero()[0][0]), total / atoms, len(here) - 1
 
 
 @dataclass

@@ -40,6 +40,19 @@ class Box:
         """Whether any direction repeats."""
         return bool(self.pbc.any())
 
+    @cached_property
+    def longest(self) -> float:
+        """The longest lattice vector, length; 0 where it does not repeat along each, or one is not finite."""
+        if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
+            return 0.0
+        return float(np.linalg.norm(self.matrix, axis=1).max())
+
+    @cached_property
+    def broken(self) -> Int[np.ndarray, "axes"]:
+        """Axes along which it repeats, but without a vector."""
+        vectors = self.matrix.any(axis=1) & np.isfinite(self.matrix).all(axis=1)
+        return np.flatnonzero(self.pbc & ~vectors)
+
     def plain(self) -> dict[str, Any]:
         """As plain values."""
         return {"matrix": np.asarray(self.matrix, float).tolist(), "pbc": np.asarray(self.pbc, bool).tolist()}
@@ -136,12 +149,13 @@ class FrameCheck:
                 "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
             )
         x = frame.positions if atoms is None else frame.positions[atoms]
-        for axis in np.flatnonzero(frame.box.pbc):
-            if not (vector := frame.box.matrix[axis]).any() or not np.isfinite(vector).all():
-                raise refused(
-                    f": the box repeats along {'abc'[axis]}, but its vector there is {vector.tolist()}",
-                    "Give the frames a box, or say that this direction does not repeat",
-                )
+        if len(frame.box.broken):
+            axis = frame.box.broken[0]
+            vector = frame.box.matrix[axis].tolist()
+            raise refused(
+                f": the box repeats along {'abc'[axis]}, but its vector there is {vector}",
+                "Give the frames a box, or say that this direction does not repeat",
+            )
         if not np.isfinite(frame.furthest_of(atoms)):
             bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
             raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
@@ -191,7 +205,7 @@ def far_out(
         return None
     # how far a distance is off between coordinates of size 1, twice over
     unit = 2 * 4 * float(np.sqrt(3)) * _UNIT[bits]
-    top, box = frame.furthest_of(atoms), _box(frame)
+    top, box = frame.furthest_of(atoms), frame.box.longest
     if ((box and top <= _FAR_BOXES * box / 2) or not top) and unit * top <= radius:
         return None
     away = np.abs(x - np.median(x, axis=0)).max(axis=1)
@@ -218,7 +232,7 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
     """
     x = now.positions if atoms is None else now.positions[atoms]
     moved = x - (before.positions if atoms is None else before.positions[atoms])
-    box = _box(now)
+    box = now.box.longest
     if len(moved) < 2 or (box and furthest(moved) <= _LEAP_BOXES * box / 2):
         return None
     # all of them may be shifted together
@@ -234,13 +248,6 @@ def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
     """The largest number in size; 0 without any."""
     # twice as fast as through their absolute values, and six times as by atom
     return float(max(x.max(initial=0.0), -x.min(initial=0.0)))
-
-
-def _box(frame: Frame) -> float:
-    """The longest lattice vector along which the frame repeats, length; 0 where it does not along each."""
-    if not frame.box.pbc.all() or not np.isfinite(frame.box.matrix).all():
-        return 0.0
-    return float(np.linalg.norm(frame.box.matrix, axis=1).max())
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
