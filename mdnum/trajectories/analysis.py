@@ -11,11 +11,13 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
-from tempfile import NamedTemporaryFile
-from typing import Any, BinaryIO
+from shutil import rmtree
+from tempfile import mkdtemp, mkstemp
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -33,6 +35,9 @@ from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_
 from mdnum.trajectories.topology import READING_FAILS, AtomTable, first_line, formats_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.trajectories.trajectory import SAMPLE
+
+# flips that a process holds before it writes them down
+_BLOCK = 100_000
 
 
 @dataclass(frozen=True)
@@ -76,51 +81,61 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """What one process found with one rule, frames counted from the first that it examined."""
+    """What one process found with one rule, frames counted from the first that it examined.
 
-    flips: list[FlipTable] = field(default_factory=list)  # of its frames that have any
+    From a process to its parent flips go through a file, into which they are written as they come: a pipe
+    would keep the parent waiting, and new pages of memory can cost more than what is done in them.
+    """
+
+    folder: str | None = None  # where the file is to be; None where flips are to be kept in memory
+    flips: list[FlipTable] = field(default_factory=list)  # of frames that have any, and are not in the file
+    held: int = 0  # rows of them
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
     first: Members | None = None  # the pairs inside at the first; of later parts, at the frame before it
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
+    path: str | None = None  # of the file: blocks of rows, column after column in each
+    blocks: list[int] = field(default_factory=list)  # rows of each
 
-    file: BinaryIO | None = None  # with the flips, column after column, where another process found them
-    count: int = 0  # flips in it
+    def add(self, flips: FlipTable) -> None:
+        """The flips of the next frame."""
+        self.flips.append(flips)
+        self.held += len(flips)
+        if self.held >= _BLOCK:
+            self._write()
+
+    def _write(self) -> None:
+        if self.folder is None or not self.held:
+            return
+        if self.path is None:
+            number, self.path = mkstemp(dir=self.folder)
+            os.close(number)
+        # a frame's column is short: many of them are written at once
+        with open(self.path, "ab", buffering=1 << 20) as file:
+            for name in vars(FlipTable.none()):
+                file.writelines(getattr(one, name).data for one in self.flips)
+        self.blocks.append(self.held)
+        self.flips, self.held = [], 0
 
     def __getstate__(self) -> dict[str, Any]:
-        """From a process to its parent, which would wait for flips to come through a pipe: through a file."""
-        if parent_process() is None or "distributed" in sys.modules:
-            # to nobody knows where, and how often it is read
-            return vars(self)
-        # a frame's column is short: many of them are written at once
-        with NamedTemporaryFile(prefix="mdnum-flips-", delete=False, buffering=1 << 20) as file:
-            try:
-                for name in vars(FlipTable.none()):
-                    file.writelines(getattr(one, name).data for one in self.flips)
-            except BaseException:
-                os.unlink(file.name)
-                raise
-        return {**vars(self), "flips": [], "file": file.name, "count": sum(map(len, self.flips))}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        if isinstance(self.file, str):
-            name, self.file = self.file, open(self.file, "rb")  # noqa: SIM115 -- until it is read
-            os.unlink(name)
+        self._write()
+        return vars(self)
 
     def __len__(self) -> int:
-        return self.count + sum(map(len, self.flips))
+        return sum(self.blocks) + self.held
 
     def move(self, columns: Sequence[np.ndarray]) -> None:
-        """Moves the flips to where they are wanted: pages that are new to a process are touched once."""
-        if self.file is not None:
-            with self.file as file:
+        """Moves the flips to where they are wanted."""
+        at = 0
+        with nullcontext() if self.path is None else open(self.path, "rb") as file:
+            for rows in self.blocks:
                 for column in columns:
-                    if file.readinto(column.data) < column.nbytes:
+                    wanted = column[at : at + rows]
+                    if file is None or file.readinto(wanted.data) < wanted.nbytes:
                         raise OSError("the file ends in which a process left its flips")
-        elif self.flips:
-            for name, column in zip(vars(self.flips[0]), columns, strict=True):
-                np.concatenate([getattr(one, name) for one in self.flips], out=column)
-        self.flips, self.file = [], None
+                at += rows
+        for name, column in zip(vars(FlipTable.none()), columns, strict=True):
+            np.concatenate([column[:0], *(getattr(one, name) for one in self.flips)], out=column[at:])
+        self.flips, self.held, self.blocks = [], 0, []
 
 
 @dataclass(frozen=True)
@@ -224,6 +239,8 @@ class NeighborFlips(AnalysisBase):
         self._library: LibraryFrames | None = None
         self._done, self._reading = 0, True
         self._to_the_end = False
+        # of what other processes found, as long as there are any
+        self._folder: str | None = None
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
         """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
@@ -234,7 +251,12 @@ class NeighborFlips(AnalysisBase):
             UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
             FrameError: likewise, a frame that holds what cannot be right.
         """
-        super().run(*args, **kwargs)
+        try:
+            super().run(*args, **kwargs)
+        finally:
+            if self._folder is not None:
+                rmtree(self._folder, ignore_errors=True)
+                self._folder = None
         failure = self.results.failure
         if failure is not None:
             kind = UnreadableFrame if failure.read else FrameError
@@ -258,6 +280,7 @@ class NeighborFlips(AnalysisBase):
                         remedy="Use backend='serial', or make it an "
                         "MDAnalysis.transformations.TransformationBase with parallelizable=True",
                     )
+            self._folder = mkdtemp(prefix="mdnum-flips-")
         return super()._configure_backend(backend, *args, **kwargs)
 
     def _setup_computation_groups(
@@ -330,7 +353,9 @@ class NeighborFlips(AnalysisBase):
         self._trackers = [
             Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
         ]
-        self.results.parts = [[_ProcessPart() for _ in self.rules]]
+        # in the process that was asked, or sent to nobody knows where and how often it is read: in memory
+        folder = None if parent_process() is None or "distributed" in sys.modules else self._folder
+        self.results.parts = [[_ProcessPart(folder) for _ in self.rules]]
         self.results.bounds = [[]]
         if self._at:
             # the frame before the first of this part
@@ -347,7 +372,7 @@ class NeighborFlips(AnalysisBase):
         bound, found = self._examined(self._ts)
         for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
             if len(flips):
-                part.flips.append(flips)
+                part.add(flips)
             part.first = tracker.members() if part.first is None else part.first
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)

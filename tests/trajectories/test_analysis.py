@@ -123,6 +123,8 @@ def test_a_split_between_two_frames_loses_nothing(water, parts):
 def test_other_processes_find_the_same_to_the_last_bit(backend, tmp_path, monkeypatch):
     # what they send comes through files there, of which none is left
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    # in more than one go
+    monkeypatch.setattr("mdnum.trajectories.analysis._BLOCK", 30)
 
     def group():
         made = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD)
