@@ -388,12 +388,9 @@ def neighbor_table(
     components = np.ascontiguousarray(positions.T, np.float64)
     inverse = np.asarray(cell.inverse, np.float64)
     # not as a product of matrices: BLAS's threads look for more work long after it, on the cores of the loop
-    fractional = np.empty_like(components)
-    for k in range(3):
-        first, *rest = np.flatnonzero(inverse[:, k])
-        fractional[k] = components[first] * inverse[first, k]
-        for c in rest:
-            fractional[k] += components[c] * inverse[c, k]
+    fractional = np.zeros_like(components)
+    for c, k in zip(*np.nonzero(inverse), strict=True):
+        fractional[k] += components[c] * inverse[c, k]
     extent = cell.widths.copy()
     for k in range(3):
         if cell.pbc[k]:
