@@ -387,7 +387,10 @@ def neighbor_table(
     atoms = len(positions)
     components = np.ascontiguousarray(positions.T, np.float64)
     inverse = np.asarray(cell.inverse, np.float64)
-    fractional = inverse.T @ components
+    # not as a product of matrices: BLAS's threads look for more work long after it, on the cores of the loop
+    fractional = np.zeros_like(components)
+    for c, k in zip(*np.nonzero(inverse), strict=True):
+        fractional[k] += components[c] * inverse[c, k]
     extent = cell.widths.copy()
     for k in range(3):
         if cell.pbc[k]:

@@ -176,8 +176,9 @@ class VerletList:
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild
     r_cut: float  # largest interaction radius, length
-    # room kept beyond the largest occupancy seen, so that a denser moment does not recompile
-    slack: float = 1.04
+    # room kept beyond the largest occupancy seen, so that a denser moment does not recompile: of a liquid at
+    # the start it grows by 7 % in 250 steps of 108,000 atoms, and eight slots too many cost 1 % of the forces
+    slack: float = 1.08
     # added to the list radius to cover the rounding of displacements in a narrow state, length
     guard: float = 0.0
     slots: int = field(default=0)  # room per atom; 0 lets the density decide

@@ -254,7 +254,8 @@ class Engine:
         """The record buffer whose turn it is; it is donated to the epoch that fills it."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
-        changes = None if self.rows else max(2 * most, min(16 * most, _RECORD_BYTES // _CHANGE_BYTES))
+        # as many as a list's life brings, or a large system sorts its atoms several times for one list
+        changes = None if self.rows else max(6 * most, min(16 * most, _RECORD_BYTES // _CHANGE_BYTES))
         had = None if held is None or held.changes is None else len(held.changes.pairs)
         if held is not None and held.bits.shape[:2] == (rows, words) and had == changes:
             return held

@@ -95,7 +95,8 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     # as they were noted: they come from further away than their places, which are near one another
     for q in range(flips):
         f = place[q]
-        row, now, k = pairs[q, 0], pairs[q, 3] != 0, kinds[species[i[q]], species[j[q]]]
+        row, now = pairs[q, 0], pairs[q, 3] != 0
+        k = kinds[species[i[q]], species[j[q]]] if len(kinds) > 1 else np.int64(0)
         x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
         dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz
