@@ -126,6 +126,12 @@ class Scan:
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
 
     @property
+    def pairs(self) -> int:
+        """How many pairs flipped."""
+        self._follow()
+        return len(self._key)
+
+    @property
     def busiest(self) -> PairCounts:
         """The pairs that flipped, those that did so most often first."""
         self._follow()

@@ -275,9 +275,8 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
     inside = f"{count(int(series['pairs'].min()))} to {count(int(series['pairs'].max()))}"
     alt = f"Flips per step against time: at most {count(most)} one way in a step; pairs inside: {inside}."
     yield Figure("flips", TEXTS("flips_caption"), alt, draw, 3.5)
-    pairs_flipped = len(run.flips.busiest.i)
     if run.flips.total and run.steps:
-        yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=pairs_flipped)
+        yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=run.flips.pairs)
     else:
         yield TEXTS("no_flips")
 
