@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 Flips = Mapping[str, np.ndarray]
 
 # flips that are followed pair by pair at a time, at least
-_AT_ONCE = 1_000_000
+_AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True)

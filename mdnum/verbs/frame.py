@@ -64,6 +64,7 @@ class View:
 
     folder: RunFolder  # on disk
     summary: dict[str, Any]  # as written, without what was judged
+    pictures: dict[str, str] = field(default_factory=dict, repr=False)  # figures drawn before the page was
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @property
@@ -105,7 +106,8 @@ class View:
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
         """A page of this folder, with its system and provenance; sections without content are left out."""
         kept = [section for section in sections if section.parts]
-        return Page(title, about, list(keys), kept, self.system_toml, self.folder.provenance)
+        said = self.system_toml, self.folder.provenance, self.pictures
+        return Page(title, about, list(keys), kept, *said)
 
 
 @dataclass(frozen=True)

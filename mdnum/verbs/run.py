@@ -22,7 +22,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
-from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, page
+from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -113,9 +113,14 @@ def run(
         view = RunView(folder, folder.summary)
         if check:
             say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
-            with folder.explained():
-                # followed pair by pair beside the comparison
-                _ = view.flips.alternates
+        # after the comparison
+        drawn = thread.submit(draw_first, view) if report else None
+        with folder.explained():
+            # which are followed pair by pair beside both
+            _ = view.flips.alternates
+            if drawn is not None:
+                drawn.result()
+        if check:
             _keep(view, compared[0].result())
             _beside_float64(view, result)
     return finish(folder, report=report, result=result, progress=progress, view=view)
