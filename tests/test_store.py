@@ -203,6 +203,24 @@ def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path, monkey
     assert folder.load_checkpoint()["step"] == 7
 
 
+@pytest.mark.parametrize("then", [RunFolder.finalize, lambda folder: folder.checkpoint({}, force=True)])
+def test_what_goes_wrong_beside_a_run_is_raised_by_what_comes_next(tmp_path, monkeypatch, then):
+    folder = RunFolder.create(tmp_path / "run")
+    write_run(folder, 0, 30, chunk=30)
+    folder.append("series", series_rows(30, 40))
+
+    def full(*_: object) -> None:
+        raise FolderError("cannot write: the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mdnum.store.checkpoint.write", full)
+        folder.checkpoint_beside(lambda: state_at(40))
+        with pytest.raises(FolderError, match="the disk is full"):
+            then(folder)
+    folder.close()
+    assert RunFolder.open(folder.path).resume()["step"] == 30
+
+
 def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
     folder = RunFolder.create(tmp_path / "run")

@@ -57,10 +57,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
-    # imports and compilers make millions of objects that stay: walking them again and again for garbage
-    # takes a sixth of a short command's time
-    gc.set_threshold(50_000, 20, 20)
-    # nor does it look for any among them when it ends, several times over
+    # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
+    # short command's time, and walking them once more as the process ends half a second
+    gc.set_threshold(1_000_000, 20, 20)
     atexit.register(gc.freeze)
     _keep_programs()
     try:

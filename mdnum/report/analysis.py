@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 Flips = Mapping[str, np.ndarray]
 
 # flips that are followed pair by pair at a time, at least
-_AT_ONCE = 1_000_000
+_AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -124,6 +124,12 @@ class Scan:
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs flipped."""
+        self._follow()
+        return len(self._key)
 
     @property
     def busiest(self) -> PairCounts:

@@ -40,7 +40,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     pictures, notes = {}, {}
     for part in parts:
         if isinstance(part, Figure | Plot):
-            image = drawing.markup(drawing.draw(part), part.name)
+            image = page.pictures.get(part.name) or drawing.markup(drawing.draw(part), part.name)
             write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", drawing.standalone(image))
             pictures[part.name] = Markup(drawing.inline(image, typeset(part.alt)))
             notes[part.name] = drawing.notes(part)

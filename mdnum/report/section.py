@@ -258,3 +258,4 @@ class Page:
     sections: Sequence[Section] = ()  # in order; findings come before them, provenance after
     system_toml: str = ""  # the system that was run, empty where none was
     provenance: Mapping[str, Any] = field(default_factory=dict)  # of the folder
+    pictures: Mapping[str, str] = field(default_factory=dict)  # figures that are drawn already, by their name

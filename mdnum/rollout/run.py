@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -232,14 +233,17 @@ class Rollout:
         return atoms
 
     def _checkpoint(self, segment: Segment, *, force: bool) -> None:
-        if force or self.folder.checkpoint_due():
-            self.folder.checkpoint(self._to_dict(resume_point(segment), segment.due), force=True)
+        if not (force or self.folder.checkpoint_due()):
+            return
+        state = self._to_dict(resume_point(segment))
+        # what it holds takes longer to list than all the rest, and this one goes on
+        held = copy(self.recorder).held if segment.due else None
+        self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
-    def _to_dict(self, point: Start, new_list: bool = False) -> dict[str, Any]:
-        """Everything that a resumed run needs to go on from a point as if nothing had happened."""
-        held = self.recorder.held() if new_list else None
+    def _to_dict(self, point: Start) -> dict[str, Any]:
+        """What a resumed run needs to go on from a point; after a spent list also what that one held."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
-        frames = {"first": self.done.first, "last": last, "held": held}
+        frames = {"first": self.done.first, "last": last}
         return {
             **point.to_arrays(),
             **{name: values for name, values in frames.items() if values is not None},

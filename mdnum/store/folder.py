@@ -10,7 +10,8 @@ import re
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -83,6 +84,8 @@ class RunFolder:
         self._checked: dict[str, tuple[tuple[int, int], str]] = {}
         # what the manifest lists, and which file that was read from
         self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
+        # the checkpoint that is being written
+        self._writing: Future[None] | None = None
         self._began = time.monotonic()
         self._written = -math.inf
         # what the last checkpoint took (s), making its state included; and when it was found due
@@ -213,13 +216,49 @@ class RunFolder:
         if not force and not self.checkpoint_due():
             self._pending = (dict(state), self._rows())
             return False
-        self._write_checkpoint(state)
+        self.checkpoint_beside(lambda: state)
+        self._settle()
         return True
+
+    def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
+        """As a forced `checkpoint`, made and written by a thread beside what comes next.
+
+        What goes wrong there is raised by the next checkpoint, or by `finalize`.
+
+        Args:
+            state: makes it, of what nobody changes meanwhile.
+        """
+        self._settle()
+        began = time.monotonic() if self._asked is None else self._asked
+        self._asked = self._pending = None
+        # parts first, then the checkpoint that counts them: a kill in between only leaves rows to drop
+        for stream in self._streams.values():
+            stream.flush()
+        log = self.path / "log.txt"
+        store = {
+            "rows": {**dict.fromkeys(TABLES[self.world], 0), **self._rows()},
+            "frames": self._frames.mark(),
+            "log": log.stat().st_size if log.exists() else 0,
+        }
+        written = {}
+        for stream in self._streams.values():
+            written |= {name: each for name, each in stream.written.items() if name.startswith("parts/")}
+            stream.written = {}
+
+        def write() -> None:
+            checkpoint.write(self.path / "checkpoint.npz", state(), store, written)
+            self._written = time.monotonic()
+            self._cost = self._written - began
+
+        self._written = time.monotonic()
+        thread = ThreadPoolExecutor(1)
+        self._writing = thread.submit(write)
+        thread.shutdown(wait=False)
 
     def finalize(self) -> None:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
-            self._write_checkpoint(self._pending[0])
+            self.checkpoint(self._pending[0], force=True)
         for name in TABLES[self.world]:
             self._stream(name)
         self.merge()
@@ -232,11 +271,13 @@ class RunFolder:
 
     def merge(self) -> None:
         """Makes one file of each table that has rows; they can be read before the folder is finished."""
+        self._settle()
         for stream in self._streams.values():
             stream.merge()
 
     def close(self) -> None:
         """Closes files and gives up the lock; rows after the last checkpoint are dropped."""
+        wait([self._writing] if self._writing is not None else [])
         self._frames.close()
         for stream in self._streams.values():
             stream.close()
@@ -543,26 +584,12 @@ class RunFolder:
     def _rows(self) -> dict[str, int]:
         return {name: stream.rows for name, stream in self._streams.items()}
 
-    def _write_checkpoint(self, state: Mapping[str, Any]) -> None:
-        began = time.monotonic()
-        # parts first, then the checkpoint that counts them: a kill in between only leaves rows to drop
-        for stream in self._streams.values():
-            stream.flush()
-        log = self.path / "log.txt"
-        store = {
-            "rows": {**dict.fromkeys(TABLES[self.world], 0), **self._rows()},
-            "frames": self._frames.mark(),
-            "log": log.stat().st_size if log.exists() else 0,
-        }
-        written = {}
-        for stream in self._streams.values():
-            written |= {name: each for name, each in stream.written.items() if name.startswith("parts/")}
-            stream.written = {}
-        checkpoint.write(self.path / "checkpoint.npz", state, store, written)
-        self._written = time.monotonic()
-        self._cost = self._written - (began if self._asked is None else self._asked)
-        self._asked = None
-        self._pending = None
+    def _settle(self) -> None:
+        """Waits for the checkpoint that is being written, and raises what has kept it from that."""
+        if self._writing is not None:
+            wait([self._writing])
+            written, self._writing = self._writing, None
+            written.result()
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():

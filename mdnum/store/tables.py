@@ -189,8 +189,6 @@ _RESUMED = frozenset({"md"})
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
 _GROUP_ROWS = 262_144
-# every page carries a checksum, which whoever reads the file can ask for
-_WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
 _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before", "radial_speed"})
 
@@ -381,11 +379,18 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table]) -> None:
-        """Writes rows into a file of this table, which the manifest expects before it is there."""
+        """Writes rows into a file of this table, which the manifest expects before it is there.
+
+        Every page carries a checksum, which whoever reads the file can ask for.
+        """
         schema = self._schema
+        # a part is read once more and removed: packing it takes longer than all the rest
+        packed = "zstd" if path == self.merged_path else "none"
         with replacing(path) as file:
             repeating: Any = [field.name for field in schema or () if field.name not in _DISTINCT]
-            with pq.ParquetWriter(file, schema, use_dictionary=repeating, **_WRITTEN) as writer:
+            with pq.ParquetWriter(
+                file, schema, use_dictionary=repeating, compression=packed, write_page_checksum=True
+            ) as writer:
                 for table in tables:
                     writer.write_table(table, row_group_size=_GROUP_ROWS)
             file.flush()

@@ -338,14 +338,16 @@ def _from_extxyz(path: Path) -> Atoms | None:
             csv.ParseOptions(delimiter=" ", quote_char=False, ignore_empty_lines=False),
             csv.ConvertOptions(column_types=dict(zip(names, kinds, strict=True)), null_values=[]),
         )
-        numbers = Atoms(as_numpy(table["0"])).numbers
+        # of a hundred thousand atoms there are few kinds
+        symbols = table["0"].combine_chunks().dictionary_encode()
+        numbers = Atoms(as_numpy(symbols.dictionary)).numbers[as_numpy(symbols.indices)]
         cell = None if lattice is None else np.array(lattice.split(" "), np.float64).reshape(3, 3)
     except (ValueError, KeyError, ArrowInvalid):
         return None
     if table.num_rows != int(count):
         return None
     columns = np.stack([as_numpy(table[name]) for name in names[1:]], axis=1)
-    atoms = Atoms(numbers, columns[:, :3], cell=cell, pbc=[face == "T" for face in faces])
+    atoms = Atoms(numbers=numbers, positions=columns[:, :3], cell=cell, pbc=[face == "T" for face in faces])
     if momenta:
         atoms.set_array("momenta", columns[:, 3:6], float, (3,))
     if masses:
@@ -361,6 +363,7 @@ def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str
         names: of the arrays that are written beside symbols and positions, where the atoms have them.
     """
     import pyarrow as pa
+    from ase.data import chemical_symbols
     from pyarrow import csv
 
     from mdnum.store.tables import as_arrow
@@ -374,7 +377,9 @@ def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str
     comment = [f'Lattice="{" ".join(map(repr, cell.ravel().tolist()))}"'] if cell.any() else []
     comment.append(f"Properties={':'.join(words)}")
     comment.append(f'pbc="{" ".join("T" if flag else "F" for flag in atoms.pbc)}"')
-    columns = [as_arrow(atoms.get_chemical_symbols(), pa.string())]
+    kinds, which = np.unique(atoms.numbers, return_inverse=True)
+    named = as_arrow([chemical_symbols[kind] for kind in kinds], pa.string())
+    columns = [named.take(as_arrow(which, pa.int64()))]
     columns += [as_arrow(values, pa.float64()) for values in np.hstack(list(arrays.values())).T]
     sink = pa.BufferOutputStream()
     table = pa.table(columns, names=[str(at) for at in range(len(columns))])

@@ -63,7 +63,8 @@ class View:
     """A folder as the findings and sections of its verb read it."""
 
     folder: RunFolder  # on disk
-    summary: Mapping[str, Any]  # as written, without what was judged
+    summary: dict[str, Any]  # as written, without what was judged
+    pictures: dict[str, str] = field(default_factory=dict, repr=False)  # figures drawn before the page was
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @property
@@ -105,7 +106,8 @@ class View:
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
         """A page of this folder, with its system and provenance; sections without content are left out."""
         kept = [section for section in sections if section.parts]
-        return Page(title, about, list(keys), kept, self.system_toml, self.folder.provenance)
+        said = self.system_toml, self.folder.provenance, self.pictures
+        return Page(title, about, list(keys), kept, *said)
 
 
 @dataclass(frozen=True)
@@ -263,11 +265,13 @@ def finish(
     report: bool = True,
     result: Any = None,
     progress: Progress | None = None,
+    view: View | None = None,
 ) -> Outcome:
     """Judges a folder, writes findings and verdict into its summary.json, and its page if it is wanted.
 
     Args:
         result: what the verb computed, for who called it from Python.
+        view: of the folder, where it was looked at already.
 
     Raises:
         FolderError: it holds no answer, is damaged or cannot be written.
@@ -276,14 +280,14 @@ def finish(
     verb = verb_of(folder)
     say(progress, "report" if report else "check")
     with folder.explained():
-        summary = folder.summary
+        summary = folder.summary if view is None else view.summary
         if not summary and not verb.unfinished:
             raise FolderError(
                 f"holds no answer: `mdnum {folder.verb}` was stopped before it had one",
                 remedy=folder.again,
                 where=str(folder.path),
             )
-        view = verb.view(folder, summary)
+        view = verb.view(folder, summary) if view is None else view
         verdict = verb.judge(view)
         judged = verdict.store(folder, summary)
         page = verb.page(view, verdict)

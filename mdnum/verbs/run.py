@@ -22,7 +22,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
-from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, page
+from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -109,12 +109,21 @@ def run(
             # it had ended before
             for positions in result.frames:
                 shown(result.simulation, positions)
-    folder = RunFolder.open(result.folder)
-    if check:
-        say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
-        _keep(folder, compared[0].result())
-        _beside_float64(folder, result)
-    return finish(folder, report=report, result=result, progress=progress)
+        folder = RunFolder.open(result.folder)
+        view = RunView(folder, folder.summary)
+        if check:
+            say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
+        # after the comparison
+        drawn = thread.submit(draw_first, view) if report else None
+        with folder.explained():
+            # which are followed pair by pair beside both
+            _ = view.flips.alternates
+            if drawn is not None:
+                drawn.result()
+        if check:
+            _keep(view, compared[0].result())
+            _beside_float64(view, result)
+    return finish(folder, report=report, result=result, progress=progress, view=view)
 
 
 def _compile_beside() -> None:
@@ -160,23 +169,22 @@ def _beside_the_loop(
     return check_energy(simulation, named())
 
 
-def _keep(folder: RunFolder, compared: EnergyReport | None) -> None:
+def _keep(run: RunView, compared: EnergyReport | None) -> None:
     """Puts the comparison with ASE into the summary."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
-    summary = folder.summary
-    summary["ase"] = compared.worst
-    summary["findings"] = [*summary["findings"], *map(plain, energy_findings(compared))]
-    folder.write_summary(summary)
+    run.summary["ase"] = plain(compared.worst)
+    run.summary["findings"] += map(plain, energy_findings(compared))
+    run.folder.write_summary(run.summary)
 
 
-def _beside_float64(folder: RunFolder, result: RunResult) -> None:
+def _beside_float64(run: RunView, result: RunResult) -> None:
     """Puts how well a run in fixed-point numbers keeps its energy into the summary, and float64's."""
     from mdnum.md.integrators import Langevin
     from mdnum.rollout.engine import FAILURES, Engine
 
-    simulation, summary = result.simulation, folder.summary
+    simulation, summary = result.simulation, run.summary
     if simulation.lattice is None or isinstance(simulation.integrator, Langevin):
         return
     steps = min(int(summary["steps"]), _BESIDE)
@@ -185,11 +193,11 @@ def _beside_float64(folder: RunFolder, result: RunResult) -> None:
         if segment.closes in FAILURES:
             return
         float64.append(segment.rows_of("potential") + segment.rows_of("kinetic"))
-    ours = np.asarray(folder.read("series")["total"])[: steps + 1]
+    ours = run.series["total"][: steps + 1]
     for key, energy in (("energy_std", ours), ("energy_std_float64", np.concatenate(float64))):
         summary["lattice"][key] = float(np.std(energy)) / simulation.atoms
     summary["lattice"]["energy_steps"] = steps
-    folder.write_summary(summary)
+    run.folder.write_summary(summary)
 
 
 # -- what is wrong with a run, or should be known about it -------------------------------------------

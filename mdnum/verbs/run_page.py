@@ -137,6 +137,15 @@ def page(run: RunView, verdict: Verdict) -> Page:
     return run.page(run.name, ", ".join(about), _keys(run), sections)
 
 
+def draw_first(run: RunView) -> None:
+    """Draws the figures that say nothing of single flips, while those are followed."""
+    from mdnum.report import drawing
+
+    for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
+        if isinstance(part, Figure | Plot):
+            run.pictures[part.name] = drawing.markup(drawing.draw(part), part.name)
+
+
 def _keys(run: RunView) -> Iterator[Key]:
     summary, atoms = run.summary, run.summary.get("atoms")
     entered, left = (int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left"))
@@ -275,9 +284,8 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
     inside = f"{count(int(series['pairs'].min()))} to {count(int(series['pairs'].max()))}"
     alt = f"Flips per step against time: at most {count(most)} one way in a step; pairs inside: {inside}."
     yield Figure("flips", TEXTS("flips_caption"), alt, draw, 3.5)
-    pairs_flipped = len(run.flips.busiest.i)
     if run.flips.total and run.steps:
-        yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=pairs_flipped)
+        yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=run.flips.pairs)
     else:
         yield TEXTS("no_flips")
 
