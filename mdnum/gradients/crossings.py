@@ -125,7 +125,7 @@ class Crossings:
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
         """Values of padded rows, one crossing after the other."""
-        return values[self.row, np.arange(len(self)) - self.spans(len(values))[self.row, 0]]
+        return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
         """With the weights that the reverse pass found."""
