@@ -187,6 +187,8 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel("atoms")
+        # room for the legend
+        axes.margins(y=0.4)
         axes.legend()
     save(drawn, path)
 
