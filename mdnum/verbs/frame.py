@@ -64,8 +64,8 @@ class View:
 
     folder: RunFolder  # on disk
     summary: dict[str, Any]  # as written, without what was judged
-    pictures: dict[str, str] = field(default_factory=dict, repr=False)  # figures drawn before the page was
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
+    pictures: dict[str, str] = field(default_factory=dict, repr=False)  # figures drawn before the page was
 
     @property
     def name(self) -> str:
