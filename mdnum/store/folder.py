@@ -8,10 +8,10 @@ import math
 import os
 import re
 import sys
+import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -84,8 +84,9 @@ class RunFolder:
         self._checked: dict[str, tuple[tuple[int, int], str]] = {}
         # what the manifest lists, and which file that was read from
         self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
-        # the checkpoint that is being written
-        self._writing: Future[None] | None = None
+        # the checkpoint that is being written, and what has kept it from that
+        self._writing: threading.Thread | None = None
+        self._failed: list[BaseException] = []
         self._began = time.monotonic()
         self._written = -math.inf
         # what the last checkpoint took (s), making its state included; and when it was found due
@@ -246,14 +247,18 @@ class RunFolder:
             stream.written = {}
 
         def write() -> None:
-            checkpoint.write(self.path / "checkpoint.npz", state(), store, written)
+            try:
+                checkpoint.write(self.path / "checkpoint.npz", state(), store, written)
+            except BaseException as error:
+                self._failed.append(error)
             self._written = time.monotonic()
             self._cost = self._written - began
 
         self._written = time.monotonic()
-        thread = ThreadPoolExecutor(1)
-        self._writing = thread.submit(write)
-        thread.shutdown(wait=False)
+        # a pool that is interrupted as it begins would keep the process from ending
+        thread = threading.Thread(target=write, daemon=True)
+        thread.start()
+        self._writing = thread
 
     def finalize(self) -> None:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
@@ -277,7 +282,8 @@ class RunFolder:
 
     def close(self) -> None:
         """Closes files and gives up the lock; rows after the last checkpoint are dropped."""
-        wait([self._writing] if self._writing is not None else [])
+        if self._writing is not None:
+            self._writing.join()
         self._frames.close()
         for stream in self._streams.values():
             stream.close()
@@ -587,9 +593,10 @@ class RunFolder:
     def _settle(self) -> None:
         """Waits for the checkpoint that is being written, and raises what has kept it from that."""
         if self._writing is not None:
-            wait([self._writing])
-            written, self._writing = self._writing, None
-            written.result()
+            self._writing.join()
+            self._writing = None
+        if self._failed:
+            raise self._failed.pop()
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():
