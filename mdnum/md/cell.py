@@ -55,8 +55,12 @@ class Cell(eqx.Module):
                 f"axis {axis} is periodic but its lattice vector is zero",
                 remedy="Give the structure a cell or set structure.pbc = false for that axis",
             )
-        full = complete(matrix, flags)
-        if abs(np.linalg.det(full)) < 1e-9 * np.prod(np.linalg.norm(full, axis=1)):
+        try:
+            full = complete(matrix, flags)
+        except np.linalg.LinAlgError:
+            full = np.zeros((3, 3))
+        # parallel vectors beside a free axis have no perpendicular: not a number, which is not small
+        if not abs(np.linalg.det(full)) > 1e-9 * np.prod(np.linalg.norm(full, axis=1)):
             raise InputError("the lattice vectors span no volume")
         inverse = np.linalg.inv(full)
         inverse[:, ~flags] = 0.0

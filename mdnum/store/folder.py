@@ -8,10 +8,10 @@ import math
 import os
 import re
 import sys
-import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -84,9 +84,9 @@ class RunFolder:
         self._checked: dict[str, tuple[tuple[int, int], str]] = {}
         # what the manifest lists, and which file that was read from
         self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
-        # the checkpoint that is being written, and what has kept it from that
-        self._writing: threading.Thread | None = None
-        self._failed: list[BaseException] = []
+        # what writes checkpoints, and the one that is being written
+        self._beside = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
         self._began = time.monotonic()
         self._written = -math.inf
         # what the last checkpoint took (s), making its state included; and when it was found due
@@ -247,18 +247,12 @@ class RunFolder:
             stream.written = {}
 
         def write() -> None:
-            try:
-                checkpoint.write(self.path / "checkpoint.npz", state(), store, written)
-            except BaseException as error:
-                self._failed.append(error)
+            checkpoint.write(self.path / "checkpoint.npz", state(), store, written)
             self._written = time.monotonic()
             self._cost = self._written - began
 
         self._written = time.monotonic()
-        # a pool that is interrupted as it begins would keep the process from ending
-        thread = threading.Thread(target=write, daemon=True)
-        thread.start()
-        self._writing = thread
+        self._writing = self._beside.submit(write)
 
     def finalize(self) -> None:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
@@ -282,8 +276,8 @@ class RunFolder:
 
     def close(self) -> None:
         """Closes files and gives up the lock; rows after the last checkpoint are dropped."""
-        if self._writing is not None:
-            self._writing.join()
+        # also for one that began as the run was interrupted
+        self._beside.shutdown()
         self._frames.close()
         for stream in self._streams.values():
             stream.close()
@@ -593,10 +587,8 @@ class RunFolder:
     def _settle(self) -> None:
         """Waits for the checkpoint that is being written, and raises what has kept it from that."""
         if self._writing is not None:
-            self._writing.join()
-            self._writing = None
-        if self._failed:
-            raise self._failed.pop()
+            written, self._writing = self._writing, None
+            written.result()
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():

@@ -236,11 +236,13 @@ class XtcTrajectory(Trajectory):
         from MDAnalysis.lib.mdamath import triclinic_box
 
         ten = np.float32(10)
-        if (vectors := raw.box.tobytes()) != self._box[0]:
+        known, box = self._box
+        if (vectors := raw.box.tobytes()) != known:
             dimensions: Any = triclinic_box(*raw.box)
             dimensions[:3] *= ten
-            self._box = vectors, box_of(dimensions)
-        return Frame(number, float(raw.time), (raw.x * ten).astype(np.float64), self._box[1])
+            box = box_of(dimensions)
+            self._box = vectors, box
+        return Frame(number, float(raw.time), (raw.x * ten).astype(np.float64), box)
 
 
 # ---- NetCDF

@@ -207,6 +207,12 @@ def test_vectors_in_a_plane_are_refused_where_nothing_repeats(folder: Path):
     flatten(atoms)
     change(folder, atoms)
     assert "the lattice vectors span no volume" in refusal(folder, {"structure.pbc": "[false, false, false]"})
+    # two that are parallel and none along the third axis have no perpendicular
+    parallel = Atoms("Ar2", positions=[[0, 0, 0], [4, 0, 0]], cell=[[20, 0, 0], [40, 0, 0], [0, 0, 0]])
+    for pbc in ([False] * 3, [True, True, False]):
+        parallel.pbc = pbc
+        change(folder, parallel)
+        assert "the lattice vectors span no volume" in refusal(folder)
 
 
 def test_what_just_fits_and_free_boundaries_have_no_width(folder: Path):
