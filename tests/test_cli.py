@@ -109,6 +109,13 @@ def test_mistakes_are_one_line_and_exit_2(rollout: Recorder, capsys, words: str)
     assert not rollout.calls
 
 
+def interrupted_as_it_returns() -> SystemError:
+    """What control-C becomes where it meets a compiled function as that returns."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
@@ -116,6 +123,7 @@ def test_mistakes_are_one_line_and_exit_2(rollout: Recorder, capsys, words: str)
         (NumericalError("potential energy is NaN", where="step 12"), 2),
         (OSError(28, "No space left on device", "runs/x-1/series.parquet"), 2),
         (KeyboardInterrupt(), 130),
+        (interrupted_as_it_returns(), 130),
     ],
 )
 def test_errors_of_a_run_are_one_line(rollout: Recorder, capsys, error: BaseException, expected: int):
@@ -134,9 +142,10 @@ def test_errors_of_a_run_are_one_line(rollout: Recorder, capsys, error: BaseExce
 
 
 def test_a_bug_keeps_its_traceback(rollout: Recorder):
-    rollout.error = RuntimeError("a defect of mdnum")
-    with pytest.raises(RuntimeError, match="a defect"):
-        main(["run", "x"])
+    for kind in (RuntimeError, SystemError):
+        rollout.error = kind("a defect of mdnum")
+        with pytest.raises(kind, match="a defect"):
+            main(["run", "x"])
 
 
 def test_default_folders_count_up(tmp_path: Path):

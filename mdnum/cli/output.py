@@ -341,7 +341,10 @@ def watched(remedy: Callable[[], str | None] | None = None) -> Iterator[Progress
     try:
         with ProgressBar() as progress:
             yield progress
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        # one that meets a compiled function as it returns comes as the cause of another error
+        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
         raise Stopped("stopped", remedy=remedy() if remedy is not None else None) from None
 
 
