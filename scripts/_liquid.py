@@ -25,12 +25,10 @@ def liquid(atoms: int) -> System:
     apart: their energies and list lengths are those of a liquid from the first step on.
     """
     cells = max(4, round((atoms / 4) ** (1 / 3)))
-    sizes = range(4, _LARGEST_MELT + 1)
     # thirteen cells, say, are no copies of anything that a cutoff fits into
-    while not (copies := [cells // size for size in sizes if cells % size == 0]):
+    while not (sizes := [size for size in range(4, _LARGEST_MELT + 1) if cells % size == 0]):
         cells += 1
-    copies = copies[-1]
-    melted = _melt(cells // copies).repeat(copies)
+    melted = _melt(sizes[-1]).repeat(cells // sizes[-1])
     return _system(melted, TEMPERATURE, seed=2)
 
 

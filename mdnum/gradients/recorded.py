@@ -282,18 +282,17 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
     """Counts of the crossings, and those that weigh most."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     step, subject, entered = (joined(crossings, name, ledger=True) for name in ("step", "subject", "entered"))
-    order = -np.abs(weight)
-    # of half a million few are named: only those are sorted
-    heavy = np.arange(len(weight))
+    key, heavy = -np.abs(weight), np.arange(len(weight))
     if len(weight) > _NAMED:
-        heavy = np.flatnonzero(~(order > np.partition(order, _NAMED)[_NAMED]))
+        # of half a million few are named: only those are sorted, and what weighs as much as the last
+        heavy = np.flatnonzero(~(key > np.partition(key, _NAMED)[_NAMED]))
     rows = [
         {
             "step": int(step[k]), "i": int(subject[k, 0]), "j": int(subject[k, 1]),
             "entered": bool(entered[k]), "radial_speed": float(speed[k]), "weight": float(weight[k]),
             "grazing": bool(grazing[k]),
         }
-        for k in heavy[np.argsort(order[heavy], kind="stable")[:_NAMED]]
+        for k in heavy[np.argsort(key[heavy], kind="stable")[:_NAMED]]
     ]  # fmt: skip
     return {
         "crossings": len(weight), "grazing": int(grazing.sum()),

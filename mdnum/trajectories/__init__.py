@@ -5,18 +5,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.analysis import NeighborFlips
+    from mdnum.trajectories.analysis import NeighborFlips as NeighborFlips
 
-__all__ = ["NeighborFlips"]
-
-
-def __getattr__(name: str) -> Any:
-    if name != "NeighborFlips":
-        raise AttributeError(f"module 'mdnum.trajectories' has no attribute {name!r}")
-    # on first use: MDAnalysis takes seconds to import
-    from mdnum.trajectories.analysis import NeighborFlips
-
-    return NeighborFlips
+# MDAnalysis takes seconds to import
+__getattr__, __dir__, __all__ = on_first_use(__name__, {"analysis": "NeighborFlips"})

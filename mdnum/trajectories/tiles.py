@@ -104,7 +104,6 @@ class Tiles:
     columns: Float32[np.ndarray, "clusters 3 16"]  # followed coordinates less the center, at the last frame
     boxes: Float32[np.ndarray, "clusters 6"]  # around each cluster then
     flips: Flips
-    largest: float = 0.0  # coordinate of the boxes in size
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
         """Follow the atoms to a frame; whether every pair within clear of its radius is in a tile there."""
@@ -127,14 +126,16 @@ class Tiles:
             lattice.periodic, self.center, self.columns,
         )  # fmt: skip
         _box(self.columns, self.boxes)
-        self.largest = float(np.abs(self.boxes).max(initial=0.0))
         return math.sqrt(most), math.sqrt(second), math.sqrt(total / max(len(now.positions), 1))
 
     def doubt(self, now: Placed, radius: float) -> float:
         """How far a distance near the radius can be off through float32, length."""
-        vectors = float(np.abs(now.lattice.vectors).sum())
+        largest, vectors = (
+            float(np.abs(self.boxes).max(initial=0.0)),
+            float(np.abs(now.lattice.vectors).sum()),
+        )
         # rounding of two coordinates and a shift, of a difference with each, and of the square
-        return 2.0 * _UNIT * (3.0 * self.largest + 2.0 * vectors + 4.0 * radius) + 8.0 * now.rounding
+        return 2.0 * _UNIT * (3.0 * largest + 2.0 * vectors + 4.0 * radius) + 8.0 * now.rounding
 
     def examine(
         self, now: Placed, *, bound: float, horizon: float, pairs: int, record: bool = True
@@ -223,7 +224,7 @@ def tiles_of(
         Flips.room(4096) if spare is None else spare.flips,
     )  # fmt: skip
     made._follow(before, before, np.zeros((3, 3)))
-    old_columns, old_home, old_largest = columns.copy(), made.home.copy(), made.largest
+    old_columns, old_home = columns.copy(), made.home.copy()
     made.boxes = boxes[1]
     change = now.lattice.vectors - lattice.vectors
     most, second, typical = made._follow(before, now, change)
@@ -253,10 +254,10 @@ def tiles_of(
             if meets and limit >= 0:
                 tiled = _tiled(nodes, runs, a, b, codes, shifts, np.float32(limit + made.clear + size))
                 made.kinds.append((limit, tiled))
-    new = made.columns, made.home, made.boxes, made.largest
-    made.columns, made.home, made.boxes, made.largest = old_columns, old_home, boxes[0], old_largest
+    new_columns, new_home, new_boxes = made.columns, made.home, made.boxes
+    made.columns, made.home, made.boxes = old_columns, old_home, boxes[0]
     made.examine(before, bound=0.0, horizon=0.0, pairs=pairs, record=False)
-    made.columns, made.home, made.boxes, made.largest = new
+    made.columns, made.home, made.boxes = new_columns, new_home, new_boxes
     if not margin:
         made.clear = -np.inf
     return made
