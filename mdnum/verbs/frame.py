@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]
 
+#: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
+#: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
+PARTIAL, UNDECIDED = "partial", "undecided"
+
 #: Lines of log.txt for a phase of a run that is followed step by step.
 STEPWISE = 50
 
