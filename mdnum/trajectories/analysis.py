@@ -27,12 +27,13 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import FrameCheck, FrameError, UnreadableFrame
+from mdnum.reading import FrameError, UnreadableFrame
+from mdnum.trajectories.frame import FrameCheck
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.resolution import Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
-from mdnum.trajectories.topology import READING_FAILS, AtomTable, first_line, formats_of
+from mdnum.trajectories.topology import AtomTable, formats_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.trajectories.trajectory import SAMPLE
 
@@ -237,7 +238,7 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._library: LibraryFrames | None = None
-        self._done, self._reading = 0, True
+        self._done = 0
         self._to_the_end = False
         # of what other processes found, as long as there are any
         self._folder: str | None = None
@@ -302,7 +303,7 @@ class NeighborFlips(AnalysisBase):
         for number in self._numbers[:SAMPLE]:
             try:
                 sample.append(self.library.frame(self.library.timestep(int(number)), int(number)))
-            except READING_FAILS:
+            except UnreadableFrame:
                 # met again in its turn, and told there
                 break
         if sample:
@@ -326,18 +327,12 @@ class NeighborFlips(AnalysisBase):
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
-        self._done, self._reading = 0, True
+        self._done = 0
         self.results, failure = Results(failures=[None]), None
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            failure = _Failure(error.frame, error.message, False)
-        except READING_FAILS as error:
-            if not self._reading:
-                raise
-            # reading the frame before the first of this part has failed where done is -1
-            number = int(self._numbers[self._at + self._done])
-            failure = _Failure(number, f"frame {number} cannot be read ({first_line(error)})", True)
+            failure = _Failure(error.frame, error.message, isinstance(error, UnreadableFrame))
         if failure is not None:
             self.results.failures, done = [failure], max(self._done, 0)
             self.frames, self.times = self.frames[:done], self.times[:done]
@@ -360,15 +355,12 @@ class NeighborFlips(AnalysisBase):
         if self._at:
             # the frame before the first of this part
             self._done = -1
-            ts = self.library.timestep(int(self._numbers[self._at - 1]))
-            self._reading = False
-            self._examined(ts)
+            self._examined(self.library.timestep(int(self._numbers[self._at - 1])))
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
                 part.first = tracker.members()
-            self._done, self._reading = 0, True
+            self._done = 0
 
     def _single_frame(self) -> None:
-        self._reading = False
         bound, found = self._examined(self._ts)
         for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
             if len(flips):
@@ -377,7 +369,6 @@ class NeighborFlips(AnalysisBase):
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
         self._done += 1
-        self._reading = True
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""

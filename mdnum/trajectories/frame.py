@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mdnum.errors import InputError
+from mdnum.reading import FrameError
+from mdnum.reading import UnreadableFrame as UnreadableFrame
 
 # Sizes of the system from its middle at which nothing is any more: unwrapped coordinates of a liquid get
 # some thousand boxes far in a second; what flies off into empty space gets further.
@@ -77,23 +78,6 @@ class Frame:
     def furthest_of(self, atoms: AtomIndices) -> float:
         """The same of some atoms."""
         return self.furthest if atoms is None else furthest(self.positions[atoms])
-
-
-class FrameError(InputError):
-    """A frame holds what cannot be right; it has this number in its file, from 0."""
-
-    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
-        super().__init__(message, remedy=remedy, where=where)
-        self.frame = frame
-
-
-class UnreadableFrame(FrameError):
-    """A frame in the middle of a file cannot be read; those before it were given out."""
-
-    def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
-        before = f"The frames before it were read; to stop there add @:{frame} to the path"
-        remedy = remedy or (before if frame else "Check that the file is whole and of the kind its name says")
-        super().__init__(message, frame=frame, remedy=remedy, where=where)
 
 
 @dataclass

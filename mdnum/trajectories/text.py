@@ -15,28 +15,27 @@ from __future__ import annotations
 import io
 import re
 import tomllib
-import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from ase.io.formats import UnknownFileTypeError, filetype, iread
+from ase.io.formats import UnknownFileTypeError, filetype, get_ioformat
 from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Bool, Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
-from mdnum.trajectories.topology import CHECK, AtomTable
+from mdnum.reading import ase_images, reading, with_elements
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.topology import AtomTable
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
-# what the end of the file looks like to ASE's reader of traj
-_ENDS = "buffer is smaller than requested size"
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -44,8 +43,6 @@ class AseFrames(Trajectory):
     """Frames that are ASE's Atoms once they are read."""
 
     reader = "ASE"
-    # ASE's reader of each format raises what it likes on files that end early or hold something else
-    _fails = (Exception,)
     _timed, _per_time = False, 1.0
 
     def _atoms_of(self, raw: Any) -> Any:
@@ -81,41 +78,28 @@ class AseTrajectory(AseFrames):
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
         self.format = format
-        if format == "traj":
-            try:
-                with TrajectoryReader(str(path)) as reader:
-                    self._count = len(reader)
-            except Exception as error:
-                raise self._refused(
-                    f"ASE cannot open it ({error})", "Check that it was written to its end"
-                ) from error
-        _, first = self._first()
-        self._has(len(first), self._of_atoms(first))
-
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        path, at = str(self.path), 0
-        if self.format == "traj":
-            with TrajectoryReader(path) as reader:
-                yield from self._guarded(
-                    numbers, lambda number: reader[number] if number < len(reader) else None
-                )
-            return
-        images = iread(path, index=slice(None), format=self.format, do_not_split_by_at_sign=True)
-
-        def following(number: int) -> Any:
-            nonlocal at
-            skipped, at = number - at, number + 1
-            return next(islice(images, skipped, None), None)
-
-        yield from self._guarded(numbers, following)
-
-    def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
-        if isinstance(error, UnknownFileTypeError) and self.format == str(error):
+        try:
+            get_ioformat(format)
+        except UnknownFileTypeError:
             raise self._refused(
-                f"--format {self.format!r} is known to neither MDAnalysis nor ASE",
+                f"--format {format!r} is known to neither MDAnalysis nor ASE",
                 "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ...",
-            ) from error
-        return super()._unreadable(number, "the file ends in it" if _ENDS in str(error) else error)
+            ) from None
+        if format == "traj":
+            with reading(path, by="ASE"), TrajectoryReader(str(path)) as reader:
+                self._count = len(reader)
+        first = self._first()
+        with self._reading(0):
+            self._has(len(first), self._of_atoms(first))
+
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Any]]:
+        if self.format == "traj":
+            with TrajectoryReader(str(self.path)) as reader:
+                yield lambda number: with_elements(reader[number]) if number < len(reader) else None
+            return
+        images = ase_images(self.path, format=self.format)
+        yield self._in_order(lambda: next(images, None))
 
 
 def format_of(path: Path) -> str:
@@ -129,16 +113,14 @@ def format_of(path: Path) -> str:
     if plain.suffix == ".extxyz":
         return "extxyz"
     try:
-        return filetype(str(path))
+        with reading(path, by="ASE"):
+            return filetype(str(path))
     except UnknownFileTypeError as error:
         raise InputError(
             "neither MDAnalysis nor ASE knows this format",
             remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
             where=str(path),
         ) from error
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        said = str(error).rstrip(".")
-        raise InputError(f"it cannot be read ({said})", remedy=CHECK, where=str(path)) from error
 
 
 def _units(path: Path) -> Units:
@@ -212,17 +194,11 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 class TextTrajectory(Trajectory):
     """A text file of frames. A reader of a format says where a block ends and what is in it."""
 
-    # what lines that are no frame raise
-    _fails = (ValueError, IndexError, KeyError)
-
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        number, block = self._first()
-        try:
-            atoms = len(self._frame(number, block).positions)
-            table = self._described(block)
-        except self._fails as error:
-            raise self._unreadable(0, error) from error
+        block = self._first()
+        with self._reading(0):
+            atoms, table = len(self._frame(0, block).positions), self._described(block)
         self._has(atoms, table)
 
     @abstractmethod
@@ -237,23 +213,12 @@ class TextTrajectory(Trajectory):
     def _described(self, block: list[str]) -> AtomTable:
         """What the first frame says of its atoms."""
 
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, list[str]]]:
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Any]]:
         from ase.io.formats import open_with_compression
 
-        wanted = next(numbers, None)
         with open_with_compression(str(self.path), "r") as lines:
-            number = 0
-            while wanted is not None:
-                try:
-                    block = self._block(lines)
-                except (ValueError, IndexError, OSError, EOFError) as error:
-                    raise self._unreadable(number, error) from error
-                if block is None:
-                    return
-                if number == wanted:
-                    yield number, block
-                    wanted = next(numbers, None)
-                number += 1
+            yield self._in_order(lambda: self._block(lines))
 
 
 def _whole_number(line: str, what: str) -> int:
@@ -277,8 +242,6 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
     """Extended XYZ."""
 
     format = "extxyz"
-    # ASE's readers raise what they like
-    _fails = (Exception,)
 
     def _block(self, lines: Any) -> list[str] | None:
         head = lines.readline()
@@ -294,7 +257,27 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
     def _atoms_of(self, raw: Any) -> Any:
         from ase.io import read
 
-        return read(io.StringIO("".join(raw)), format="extxyz")
+        return with_elements(read(io.StringIO("".join(raw)), format=self.format))
+
+
+class XdatcarTrajectory(ExtxyzTrajectory):
+    """VASP's XDATCAR; the head is repeated where the cell changes. ASE's reader gives all frames or none."""
+
+    format = "vasp-xdatcar"
+    # lines with the cell and the atoms, and how many atoms there are
+    _head: tuple[list[str], int] = ([], 0)
+
+    def _block(self, lines: Any) -> list[str] | None:
+        line = lines.readline()
+        if "configuration=" not in line:
+            # the name in its first line may be blank
+            head = [line, *islice(lines, 6)]
+            if not "".join(head).strip():
+                return None
+            self._head = head, sum(_whole_number(one, "a number of atoms") for one in head[-1].split())
+            line = lines.readline()
+        head, atoms = self._head
+        return [*head, line, *_rows(lines, 0, atoms)]
 
 
 # ---- LAMMPS

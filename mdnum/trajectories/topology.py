@@ -16,8 +16,6 @@ one's, though it is the next one's.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,14 +26,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
+from mdnum.reading import ase_images, reading
 from mdnum.trajectories.frame import Box
 
-#: what readers raise on files that end early or hold something else
-READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
 #: what a reader of results from MDAnalysis's coordinates should know
 NARROWED = "MDAnalysis hands every coordinate over in float32, whatever the file stores."
-#: what to do about a file that nobody can read
-CHECK = "Check that the file is whole and of the kind its name says"
 
 _UNNAMED = "The file says how many atoms there are and nothing else; names and elements need a topology."
 _GUESSED = "Elements are guessed from the names of the atoms."
@@ -122,16 +117,13 @@ class AtomTable:
         """
         try:
             return cls.of(topology_universe(topology).atoms)
-        except InputError:
-            from ase.io import read
-
+        except InputError as refused:
             try:
-                atoms: Any = read(str(topology))
-            except Exception as error:
-                raise InputError(
-                    "neither MDAnalysis nor ASE reads this topology", where=str(topology)
-                ) from error
-            return cls.plain(atoms.get_chemical_symbols())
+                with reading(topology, by="ASE"):
+                    return cls.plain(next(ase_images(topology, -1)).get_chemical_symbols())
+            except InputError:
+                # MDAnalysis knows most of the formats, and says more of them
+                raise refused from None
 
     def give_elements(self, universe: Any) -> None:
         """Adds the elements that were guessed, for selections by element."""
@@ -139,53 +131,17 @@ class AtomTable:
             universe.add_TopologyAttr("elements", self.species)
 
 
-def first_line(error: BaseException) -> str:
-    """The message of an error in a line."""
-    cause: BaseException | None = error
-    while cause is not None and not str(cause).strip():
-        cause = cause.__context__
-    text = str(error if cause is None else cause).strip().splitlines()
-    if text and cause is not error and not text[0].startswith("could not convert"):
-        # how a reader stumbles over an end is its own business, unless a word is no number
-        text = []
-    if not text and isinstance(error, StopIteration | EOFError):
-        return "the file ends in it"
-    return text[0].rstrip(".") if text else type(error).__name__
-
-
 def topology_universe(topology: str | Path) -> Any:
-    """A Universe of a topology, with or without coordinates.
+    """A Universe of a topology, without coordinates: its readers of these may write files beside it.
 
     Raises:
         InputError: MDAnalysis does not read it.
     """
-    import MDAnalysis
+    from MDAnalysis import Universe
+    from MDAnalysis.core._get_readers import get_parser_for
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return opened_by_mdanalysis(Path(topology), lambda: MDAnalysis.Universe(str(topology)), None)
-
-
-def opened_by_mdanalysis(file: Path, act: Callable[[], Any], trajectory: Path | None) -> Any:
-    """What opening a file gives; all that goes wrong in it is an InputError."""
-    hook = sys.unraisablehook
-    # readers that could not open complain once more when they are thrown away
-    sys.unraisablehook = lambda _: None
-    try:
-        return act()
-    except (*READING_FAILS, ImportError) as error:
-        said = first_line(error)
-        if isinstance(error, ImportError) or "install" in str(error):
-            raise InputError(
-                f"reading it needs a package that is not installed ({said})",
-                remedy="Install the package, or convert the file to xtc or extxyz",
-                where=str(file),
-            ) from None
-        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-        remedy = CHECK + hint if file == trajectory else CHECK
-        raise InputError(f"MDAnalysis cannot open it ({said})", remedy=remedy, where=str(file)) from None
-    finally:
-        sys.unraisablehook = hook
+    with reading(topology), get_parser_for(str(topology))(str(topology)) as parser:
+        return Universe(parser.parse())
 
 
 # ---- boxes

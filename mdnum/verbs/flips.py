@@ -221,7 +221,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
-    from mdnum.trajectories.frame import UnreadableFrame
+    from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
         return False
