@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
+from mdnum.audit.causes import cause
 from mdnum.audit.checks import CHECKS
 from mdnum.deadline import Deadline
 from mdnum.errors import MdnumError
@@ -95,8 +96,21 @@ class Observed:
     values: dict[str, Any] = field(default_factory=dict)
 
 
-def finding(code: str, severity: Severity, *variants: str | None, **values: Any) -> Observed:
-    """What was found, with those of its variants that are not None."""
+def finding(
+    code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
+) -> Observed:
+    """What was found, with those of its variants that are not None.
+
+    Args:
+        tests: names in `causes.TESTS` of those that were made and that leave this cause.
+
+    Raises:
+        ValueError: a cause that was not separated from its rivals; give the code of its symptom instead.
+    """
+    if left := [test for test in cause(code).tests if test not in tests]:
+        raise ValueError(
+            f"{code} is named without the test that separates it from {cause(code).rivals}: {left}"
+        )
     return Observed(code, severity, [one for one in variants if one], values)
 
 
@@ -250,42 +264,9 @@ def needed_to(question: str) -> set[str]:
 
 # -- what the checks add up to ---------------------------------------------------------------------
 
-#: Codes that do not bear on a question, whatever their severity: where only the force jumps a run keeps its
-#: energy, and what a run loses to its time step takes nothing from a derivative.
-_APART = {
-    "run": ("FORCE_JUMP", "CURVATURE_JUMP", "CURVATURE_JUMP_AMONG_MANY"),
-    "differentiate": ("DRIFT", "TIMESTEP"),
-}
 #: Of the ways of a check: from here on it counts as asked.
 _NEARLY = 0.9
-
-_IMAGES = (
-    "IMAGES", "LATTICE", "EXTENSIVE", "TRANSLATION", "NARROW_CELL", "FACES", "CELL_ULP", "ROTATION",
-)  # fmt: skip
-_AMONG_MANY = ("JUMP_AMONG_MANY", "CURVATURE_JUMP_AMONG_MANY")
-_RUN = (
-    "FORCES_NOT_GRADIENT", "CURL", "NET_FORCE", "NET_TORQUE", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT",
-)  # fmt: skip
-
-#: What each mistake brings about as well, the deepest first: neighbors that are lost by their place in a list
-#: make every other way of writing a structure down another structure; images that are lost have no forces; a
-#: force that is no gradient does not keep the energy of a run.
-_BRINGS: dict[str, tuple[str, ...]] = {
-    "NOT_REPEATABLE": (
-        "STALE_STATE", "STALE_DYNAMICS", "ORDER", "TOPOLOGY_BY_ORDER", *_IMAGES, "MIRROR", "DUMMY_CELL",
-        *_AMONG_MANY, *_RUN, "ENERGY_STEP", "NOISE_FLOOR", "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL",
-    ),
-    "STALE_STATE": ("STALE_DYNAMICS", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT"),
-    "NEIGHBOR_CAP_BY_ORDER": ("NEIGHBOR_CAP", "ORDER", *_IMAGES, *_AMONG_MANY, *_RUN),
-    "NEIGHBOR_CAP": ("ORDER", *_IMAGES, *_AMONG_MANY, *_RUN),
-    "ORDER": (*_IMAGES, *_AMONG_MANY, *_RUN),
-    **{code: (*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN) for k, code in enumerate(_IMAGES)},
-    "FORCES_NOT_GRADIENT": ("CURL", "NET_FORCE", "NET_TORQUE", "NOT_CONSERVED", "DRIFT"),
-    "CURL": ("NOT_CONSERVED", "DRIFT"),
-    "ENERGY_JUMP": ("FLIPS_CHANGE_ENERGY", "ENERGY_STEP"),
-    "JUMP_AMONG_MANY": ("CURVATURE_JUMP_AMONG_MANY", "HIDDEN_JUMPS"),
-}  # fmt: skip
-_SEVERITIES = ("info", "warning", "error")
+_QUESTIONS = ("run", "differentiate")
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
@@ -294,11 +275,11 @@ def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[st
     Args:
         wanted: checks that were to be made.
     """
-    return {question: _answer(question, results, wanted) for question in _APART}
+    return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 
 def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]) -> Answer:
-    found = [one for result in results for one in result.findings if one.code not in _APART[question]]
+    found = [one for result in results for one in result.findings if cause(one.code).spares != question]
     severities = {one.severity for one in found}
     if "error" in severities:
         return "no"
@@ -319,33 +300,4 @@ def largely_unasked(result: CheckResult) -> bool:
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether a check is left of those that make up an answer; of others, none is to come."""
     left = set(wanted) - {result.name for result in results}
-    return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _APART))
-
-
-def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """For each finding the place of the one that it goes below, its own where it is listed by itself.
-
-    It goes below the deepest mistake found that brings it about and is no less severe, and below the first
-    finding of its own code. That it has the same cause is likely and not known: correct the one above, and
-    ask again.
-
-    Args:
-        findings: code and severity of each, in the order in which they were found.
-    """
-    ranks = [_SEVERITIES.index(severity) for _, severity in findings]
-    first: dict[str, int] = {}
-    for place, (code, _) in enumerate(findings):
-        if code not in first or ranks[place] > ranks[first[code]]:
-            first[code] = place
-    found = []
-    for place, (code, _) in enumerate(findings):
-        above = (
-            first[cause]
-            for cause, brought in _BRINGS.items()
-            if cause in first and code in brought and ranks[first[cause]] >= max(ranks[place], 1)
-        )
-        found.append(next(above, first[code]))
-    # of what goes below one that goes below another, the top
-    for _ in found:
-        found = [found[place] for place in found]
-    return found
+    return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _QUESTIONS))

@@ -148,7 +148,7 @@ def not_repeatable(
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
-        return finding("NOT_REPEATABLE", "error", how, **values)
+        return finding("NOT_REPEATABLE", "error", how, tests=("repeat",), **values)
     return finding("NOT_BIT_IDENTICAL", "warning", how, **values)
 
 

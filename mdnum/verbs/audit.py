@@ -397,7 +397,7 @@ def _says(result: CheckResult) -> str:
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
     """(finding, those that may follow from it) of each that is listed by itself."""
-    from mdnum.audit.base import heads
+    from mdnum.audit.causes import heads
 
     above = heads([(one.code, one.severity) for one in found])
     return [

@@ -20,7 +20,8 @@ from command_line import call
 from other_package import install
 
 import mdnum
-from mdnum.audit.base import CheckResult, answers, finding, heads
+from mdnum.audit.base import CheckResult, answers, finding
+from mdnum.audit.causes import heads
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
 from mdnum.errors import InputError

@@ -140,6 +140,7 @@ class StateCheck(AuditCheck):
                 "STALE_STATE", "error", "refused" if worst.refused else None, step=worst.what,
                 energy=worst.energy, force=worst.force, allowed=worst.allowed, why=worst.why,
                 questions=len(stale), sequences=", ".join(sorted({row.sequence for row in stale})),
+                tests=("repeat", "fresh"),
             )  # fmt: skip
 
     def _failures(self, rows: list[Comparison]) -> Iterator[Observed]:
