@@ -18,7 +18,7 @@ from jaxtyping import Float
 from mdnum.audit.base import CalculatorError, Skipped
 from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
 
 #: Tried in this order, and then every other element: argon where anything goes.
@@ -56,6 +56,7 @@ def read_structure(words: str | Path) -> Atoms:
     Raises:
         InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
     """
+    expect_path(words, "Give ASE's Atoms or the path of a file that ASE reads")
     text = str(words)
     head, separator, index = text.rpartition("@")
     path, which = (Path(head), index) if separator and not Path(text).exists() else (Path(text), "-1")

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.topology import AtomTable, topology_universe
@@ -42,6 +42,11 @@ _LANGUAGE = (
     'Write it as MDAnalysis does: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
 )
 _SHOWN = 8
+#: What to do with frames that are not in a file.
+IN_MEMORY = (
+    "Give the path of a trajectory; arrays (frames, atoms, 3) go into mdnum.trajectories.NeighborFlips("
+    "MDAnalysis.Universe.empty(atoms).load_new(array), r_cut=...)"
+)
 
 
 class Trajectory(ABC):
@@ -258,6 +263,8 @@ def open_trajectory(
     Raises:
         InputError: no such file, nobody reads it, or it does not belong to the topology.
     """
+    for one in (path, "" if topology is None else topology):
+        expect_path(one, IN_MEMORY)
     file, words = split_path(str(path))
     if words and slice:
         raise InputError(f"frames are named twice, by @{words} and by {slice!r}", remedy="Name them once")

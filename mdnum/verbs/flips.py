@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
-from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering
+from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords_checked
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -42,6 +42,7 @@ _BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", 
 _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
 
 
+@keywords_checked
 def flips(
     trajectory: str | Path,
     other: str | Path | None = None,
@@ -206,6 +207,10 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
     """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
+    from mdnum.trajectories.trajectory import IN_MEMORY
+
+    for one in (first, second):
+        expect_path(one, IN_MEMORY)
     names = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
     bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in names]
     if topology is None and not bare[0] and bare[1]:
