@@ -27,7 +27,7 @@ from jaxtyping import Int
 
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
-from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable, topology_universe
 
 #: Frames from which the resolution of a file is read.
@@ -104,6 +104,10 @@ class Trajectory(ABC):
     def species(self) -> np.ndarray:
         """Species of every atom, words, shape (atoms,)."""
         return self.table.species
+
+    def other_box(self, number: int) -> tuple[str, Box] | None:
+        """(code of a finding, another box that a frame may be taken to have); None without one."""
+        return None
 
     @property
     def name(self) -> str:

@@ -6,7 +6,7 @@ import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -126,6 +126,7 @@ def flips(
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
+            "other_box": _with_other_box(opened, sample[0], found, groups),
             "cut_short": _cut_short(found.stopped, opened),
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
@@ -222,6 +223,19 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 
 
 # ---- the ledger, and what is counted from it
+
+
+def _with_other_box(trajectory: Trajectory, frame: Any, found: Pass, groups: Groups) -> dict[str, Any] | None:
+    """The pairs of each rule in a frame with another box that it may be taken to have; None without one."""
+    from mdnum.trajectories.tracker import Tracker
+
+    if (other := trajectory.other_box(frame.index)) is None:
+        return None
+    trackers = [Tracker(one.rule, *groups, list(map(str, trajectory.species))) for one in found.rules]
+    for one in trackers:
+        one.step(replace(frame, box=other[1]))
+    pairs = [one.pairs for one in trackers]
+    return {"code": other[0], "frame": frame.index, "box": other[1].plain(), "pairs": pairs}
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
