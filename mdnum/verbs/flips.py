@@ -55,6 +55,7 @@ def flips(
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
     format: str | None = None,
+    drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
@@ -73,6 +74,8 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
+        drop_repeats: leave out every frame that is an earlier one again, bit for bit; the others keep their
+            numbers. Such frames are reported either way.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
@@ -92,8 +95,10 @@ def flips(
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
+        a.drop_repeats = b.drop_repeats = drop_repeats
         return compare(a, b, asked or _default_rules(a), between, **keep)
     opened = open_trajectory(trajectory, topology, format=format)
+    opened.drop_repeats = drop_repeats
     asked = asked or _default_rules(opened)
     groups = selected(opened, between)
     sample = opened.sample()
@@ -126,7 +131,9 @@ def flips(
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
-            "other_box": _with_other_box(opened, sample[0], found, groups),
+            "alternative_box": _with_other_box(opened, sample[0], found, groups),
+            "repeats": opened.repeats.plain(),
+            "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},

@@ -121,7 +121,7 @@ def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pair
             close += int((apart < 1.4).sum())
         counts.append(close)
     assert counts[0] != counts[1]
-    assert [found["other_box"]["pairs"][0], found["rules"][0]["pairs_first"]] == counts
+    assert [found["alternative_box"]["pairs"][0], found["rules"][0]["pairs_first"]] == counts
     assert f"r < 1.4 Å: {counts[1]:,} pairs with the first, {counts[0]:,} with the other" in said["text"]
     # where both are one, there is nothing to say
     assert water().other_box(0) is None
@@ -317,7 +317,7 @@ def test_where_nothing_tells_the_head_decides_or_both_counts_are_given(tmp_path,
     x = np.array([[1.4, 0.4, 5.0], [2.1, 1.4, 4.0], [0.4, 1.6, 4.2]])
     path = dcd(tmp_path / "a.dcd", [numbers(matrix, "matrix")] * 2, [x, x], version)
     found = mdnum.flips(path, cutoffs=[3.7], out=tmp_path / "f", report=False).summary
-    counts = [found["rules"][0]["pairs_first"], (found["other_box"] or {}).get("pairs")]
+    counts = [found["rules"][0]["pairs_first"], (found["alternative_box"] or {}).get("pairs")]
     cosines = triclinic_vectors(
         np.array([4.11, 4.71, 10.99, *np.degrees(np.arccos([-0.27, 0.28, -0.58]))]), dtype=np.float64
     )
