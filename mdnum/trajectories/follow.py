@@ -36,6 +36,17 @@ _FIRST = 8
 _FLUX_FRAMES = 12
 # displacement for that, as a share of the usual distance of neighbors: small beside the way to a turn
 _FLUX_MOVE = 2e-3
+# share of the spread of displacements that a common shift explains: of one within the resolution of the
+# files, and of one beside another difference
+_SHIFT_ALONE, _SHIFT_MOSTLY = 0.5, 0.99
+# velocities that differ by less than this share of their root mean square may have been rounded otherwise
+_SAME_SPEED = 1e-4
+# atoms that are examined first for whether there is a shift
+_SOME = 200
+# correlation from which on velocities are parallel; standard errors up to which there is none
+_PARALLEL, _UNRELATED = 0.99, 4.0
+# the steepest power law that is told from an exponential; how much smaller squares are of what fits better
+_STEEPEST, _BETTER = 4.0, 2.0
 # times that differ by less than this, relative, are the same
 _SAME_TIME = 1e-6
 
@@ -258,6 +269,7 @@ class Separation:
     # most lattice vectors of one kind between an atom and its nearest image: 0 where none was wrapped in one
     # of the frames only
     periods: int = 0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all atoms alike, taken off before, length
 
 
 def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
@@ -270,9 +282,12 @@ def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
     return _displaced(start, end)[0]
 
 
-def _displaced(start: Frame, end: Frame) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """(displacements, whole lattice vectors taken off)."""
-    moved = end.positions - start.positions
+def _displaced(
+    start: Frame, end: Frame, shift: Float[np.ndarray, "3"] | float = 0.0, atoms: AtomIndices = None
+) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+    """(displacements less a shift, whole lattice vectors taken off)."""
+    x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
+    moved = y - x - shift
     shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
     if not shared.periodic:
         return moved, np.zeros_like(moved)
@@ -297,11 +312,11 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
-def separation(one: Frame, other: Frame, atoms: AtomIndices = None) -> Separation:
-    """The separation of two frames; only of these atoms, where they are given."""
-    moved, whole = _displaced(one, other)
-    if atoms is not None:
-        moved, whole = moved[atoms], whole[atoms]
+def separation(
+    one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
+) -> Separation:
+    """The separation of two frames, less a shift; only of these atoms, where they are given."""
+    moved, whole = _displaced(one, other, 0.0 if shift is None else shift, atoms)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
     return Separation(
@@ -309,7 +324,51 @@ def separation(one: Frame, other: Frame, atoms: AtomIndices = None) -> Separatio
         float(np.sqrt(square.mean())),
         at if atoms is None else int(atoms[at]),
         int(np.abs(whole).max()),
+        (0.0, 0.0, 0.0) if shift is None else (float(shift[0]), float(shift[1]), float(shift[2])),
     )
+
+
+def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
+    """The displacement that most atoms have in common, up to lattice vectors, length."""
+    shift = _displaced(one, other, atoms=atoms)[0][0]
+    for _ in range(2):
+        # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
+        # median they do not
+        shift = shift + np.median(_displaced(one, other, shift, atoms)[0], axis=0)
+    return shift
+
+
+def velocities_differ(
+    a: Frame, b: Frame, atoms: AtomIndices, bound: float, expected: Sequence[bool]
+) -> dict[str, Any] | None:
+    """How velocities of two frames differ; None where either has none, or they agree within the bound.
+
+    Args:
+        bound: how far the difference of two velocities can be off, length per time.
+        expected: whether the file of each has velocities at all.
+
+    Returns:
+        the kind: "zero" (none in one, or not written yet), "common" (one vector for all atoms), "scaled",
+        "drawn" (uncorrelated) or "other"; which side has none; the factor from A to B and the correlation.
+    """
+    rows = slice(None) if atoms is None else atoms
+    u, v = (None if one.velocities is None else one.velocities[rows] for one in (a, b))
+    still = [one is None or not one.any() for one in (u, v)]
+    if all(still) or not all(expected):
+        return None
+    if any(still) or u is None or v is None:
+        return {"kind": "zero", "side": "AB"[still.index(True)]}
+    apart = v - u
+    bound = bound + _SAME_SPEED * float(np.sqrt((u**2).sum(axis=1).mean()))
+    if np.sqrt((apart**2).sum(axis=1)).max() <= bound:
+        return None
+    factor = float(np.vdot(u, v) / np.vdot(u, u))
+    alike = float(np.vdot(u, v) / np.sqrt(np.vdot(u, u) * np.vdot(v, v)))
+    rest = np.sqrt(((apart - np.median(apart, axis=0)) ** 2).sum(axis=1))
+    kind = "scaled" if abs(alike) > _PARALLEL and abs(factor - 1) > 1 - _PARALLEL else "other"
+    kind = "drawn" if abs(alike) * np.sqrt(u.size) < _UNRELATED else kind
+    kind = "common" if len(u) > 2 and rest.max() <= 2 * bound else kind
+    return {"kind": kind, "factor": factor, "correlation": alike}
 
 
 @dataclass
@@ -358,24 +417,57 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
 
 
-def growth(
-    time: Float[np.ndarray, "frames"], length: Float[np.ndarray, "frames"], limit: float
-) -> tuple[float, float, int] | None:
-    """Rate at which a separation grows, from a straight line through its logarithm.
+@dataclass(frozen=True)
+class Growth:
+    """How a separation grows: lines through its logarithm over time, and over the logarithm of time."""
 
-    Lengths of 0, and those above the limit, which are no small differences any more, are left out.
+    frames: int  # used
+    rate: float  # of an exponential, per time
+    r2: float  # of its line
+    exponent: (
+        float | None
+    )  # of the power law that fits best, from its beginning; None where none is slow enough
+    power_r2: float
+    law: str  # "exponential" or "power", whichever leaves much less of the spread; else "either"
+
+
+def growth(
+    time: Float[np.ndarray, "frames"],
+    length: Float[np.ndarray, "frames"],
+    limit: float,
+    began: tuple[float, float],
+) -> Growth | None:
+    """The law by which a separation grows.
+
+    A force or a velocity that is wrong by a constant separates two runs as a low power of the time since
+    then; chaos does exponentially. Lengths of 0, and those above the limit, which are no small differences
+    any more, are left out.
+
+    Args:
+        began: times between which the two began to separate, where a power law begins.
 
     Returns:
-        (rate per time, r² of the line, frames used); None with fewer than five.
+        None with fewer than five frames.
     """
     use = (length > 0) & (length < limit) & np.isfinite(length)
     if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
         return None
     x, y = time[use], np.log(length[use])
-    slope, offset = np.polyfit(x, y, 1)
-    spread = float(np.sum((y - y.mean()) ** 2))
-    left = float(np.sum((y - slope * x - offset) ** 2))
-    return float(slope), 1.0 - left / spread if spread > 0 else 1.0, int(np.count_nonzero(use))
+    spread = max(float(np.sum((y - y.mean()) ** 2)), np.finfo(float).tiny)
+
+    def line(x: np.ndarray) -> tuple[float, float]:
+        slope, offset = np.polyfit(x, y, 1)
+        return float(np.sum((y - slope * x - offset) ** 2)) / spread, float(slope)
+
+    left, rate = line(x)
+    # where a power law begins is not seen if a file has rounded it away
+    longest = max(x[0] - began[0], np.finfo(float).tiny)
+    ahead = longest * np.geomspace(min(max((x[0] - began[1]) / longest, 1e-3), 1.0), 1.0, 40)
+    laws = [line(np.log(x - x[0] + one)) for one in ahead if x.min() == x[0] > began[0]]
+    slow, exponent = min((one for one in laws if 0 < one[1] <= _STEEPEST), default=(1.0, None))
+    law = "power" if slow * _BETTER < left else "either"
+    law = "exponential" if exponent is None or left * _BETTER < slow else law
+    return Growth(len(x), rate, 1.0 - left, exponent, 1.0 - slow, law)
 
 
 @dataclass
@@ -385,6 +477,7 @@ class ComparedSide:
     trajectory: Trajectory
     tracker: Tracker
     resolution: Resolution
+    speeds: Resolution | None = None  # of velocities, where the file has them in a unit that both have
     distance_bound: float = 0.0  # how far a distance can be off at the last frame, length
     box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
     bound: float = 0.0  # how far a margin can be off
@@ -401,6 +494,18 @@ class ComparedSide:
         """How far one atom, seen through so many periods of the box, can be off at the last frame, length."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
+
+    def speed_bound(self, frame: Frame) -> float:
+        """How far the velocity of an atom can be off, length per time."""
+        if self.speeds is None or frame.velocities is None:
+            return 0.0
+        return self.speeds.bound(velocities_of(frame)) / 2
+
+
+def velocities_of(frame: Frame) -> Frame:
+    """A frame whose positions are the velocities of another, which has them."""
+    assert frame.velocities is not None
+    return Frame(frame.index, frame.time, frame.velocities, Box())
 
 
 def differing_rows(
@@ -465,6 +570,13 @@ class Compared:
     beyond: int | None = None  # first frame with an atom further apart than the resolution of both explains
     other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
     times_differ: int = 0
+    # the first frame at which all atoms are shifted alike
+    shift: int | None = None
+    other: bool = False  # whether atoms were apart before then beyond what any shift explains
+    # how velocities differ at the first frame at which they do while positions agree, and the last frame
+    # at which both agree
+    velocities: dict[str, Any] | None = None
+    velocities_same: int | None = None
     last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))  # at the last frame
     stopped: InputError | None = None
 
@@ -481,12 +593,19 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 
     files, rules = [side.trajectory for side in sides], [one.rule for one in sets]
     for (a, b), flips in _usable(files, atoms, rules, step, found):
-        at, before, now = found.frames, found.last, separation(a, b, atoms)
+        at, before = found.frames, found.last
+        now, allowed = _apart(found, a, b, atoms, sides)
         if found.seed is None and now.furthest > 0:
             found.seed = at
-        allowed = sum(side.position_bound(now.periods) for side in sides)
         if found.beyond is None and now.furthest > allowed:
             found.beyond = at
+        if found.beyond is None and found.velocities is None:
+            expected = [side.speeds is not None for side in sides]
+            kind = velocities_differ(a, b, atoms, sum(map(ComparedSide.speed_bound, sides, (a, b))), expected)
+            if kind is not None:
+                found.velocities = {"frame": at, **kind}
+            elif all(expected):
+                found.velocities_same = at
         # formats that round positions may round the box as much
         tolerance = sum(side.distance_bound for side in sides)
         if found.other_box is None and not same_lattice(a.box, b.box, tolerance):
@@ -504,6 +623,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
         row = {
             "frame": at, "number_a": a.index, "number_b": b.index, "time": a.time, "time_b": b.time,
             "furthest": now.furthest, "bound": allowed, "typical": now.typical, "atom": now.atom,
+            **dict(zip(("shift_x", "shift_y", "shift_z"), now.shift, strict=True)),
             "pairs_a": tracked[0], "pairs_b": tracked[1],
             "only_a": len(only.only_a), "only_b": len(only.only_b),
         }  # fmt: skip
@@ -511,6 +631,42 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
         found.last = now
         found.frames += 1
         yield found
+
+
+def _apart(
+    found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
+) -> tuple[Separation, float]:
+    """(separation, how much of it the resolution of both files explains), less a shift of all atoms alike.
+
+    There is one where it explains nearly all: files of one run have other origins, or the motion of the
+    center of mass was removed in one of them.
+    """
+    now = separation(a, b, atoms)
+    allowed = sum(side.position_bound(now.periods) for side in sides)
+    chosen = np.arange(len(a.positions)) if atoms is None else atoms
+    if now.furthest <= allowed or len(chosen) < 4:
+        return now, allowed
+    some = chosen[:: max(len(chosen) // _SOME, 1)]
+    if found.shift is None:
+        explained, rest = _explained(a, b, some)
+        found.other |= rest.furthest > 2 * allowed
+        if explained < _SHIFT_ALONE:
+            return now, allowed
+    explained, rest = _explained(a, b, chosen)
+    # the shift is off by as much as a position
+    allowed_rest = 2 * sum(side.position_bound(rest.periods) for side in sides)
+    if found.shift is None:
+        if explained < (_SHIFT_ALONE if rest.furthest <= allowed_rest else _SHIFT_MOSTLY):
+            return now, allowed
+        # before, rounding may have hidden that it is one
+        found.shift, found.beyond = found.frames, found.beyond if found.other else None
+    return rest, allowed_rest
+
+
+def _explained(a: Frame, b: Frame, atoms: AtomIndices) -> tuple[float, Separation]:
+    """(share of the squares of displacements that a common shift explains, separation without it)."""
+    rest = separation(a, b, atoms, common_shift(a, b, atoms))
+    return 1.0 - (rest.typical / max(separation(a, b, atoms).typical, np.finfo(float).tiny)) ** 2, rest
 
 
 def _sets_at(
@@ -556,8 +712,12 @@ def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -
     cut = frames if one.first is None else one.first["frame"]
     # up to its bound a separation may be made of rounding
     length = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
+    time = table["time"]
+    seed = int(np.flatnonzero(length > 0)[0]) if length.any() else 0
+    # what differs in the first frame began to before the file did
+    began = float(time[0] if seed else 2 * time[0] - time[-1]), float(time[seed])
     parts = {}
     for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
-        line = growth(table["time"][part], length[part], limit)
-        parts[name] = None if line is None else dict(zip(("rate", "r2", "frames"), line, strict=True))
+        law = growth(time[part], length[part], limit, began)
+        parts[name] = None if law is None else vars(law)
     return parts
