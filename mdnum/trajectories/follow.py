@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +36,11 @@ _FIRST = 8
 _FLUX_FRAMES = 12
 # displacement for that, as a share of the usual distance of neighbors: small beside the way to a turn
 _FLUX_MOVE = 2e-3
+# frames whose displacements are compared with velocities; displacements over what those say above which they
+# contradict; correlations above which they keep their directions from frame to frame, and lie along them
+_FLIGHTS, _TOO_FAR, _KEPT, _ALONG = 12, 1.1, 0.8, 0.9
+# last digits that a displacement has to have for its size to say something
+_STEPS = 3.0
 # share of the spread of displacements that a common shift explains: of one within the resolution of the
 # files, and of one beside another difference
 _SHIFT_ALONE, _SHIFT_MOSTLY = 0.5, 0.99
@@ -148,7 +153,7 @@ class Pass:
     rules: list[Followed]
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
-    moved: float = float("nan")  # root mean square displacement over what velocities say; nan without
+    flights: list[Flight] = field(default_factory=list)  # from one to the next of the first frames
     # (number of the frame, atom, how far) of what no atom does between two frames
     leaps: list[tuple[int, int, float]] = field(default_factory=list)
 
@@ -180,7 +185,11 @@ def follow(
 
     for (frame,), stepped in _usable([trajectory], atoms, rules, step, found):
         if last is not None:
-            found.moved = _moved(last, frame) if found.frames == 1 else found.moved
+            if (
+                found.frames < _FLIGHTS
+                and (flight := flight_of(last, frame, resolution.usual_step(frame))) is not None
+            ):
+                found.flights.append(flight)
             if (far := leap(last, frame, atoms)) is not None:
                 found.leaps.append((frame.index, *far))
         last = frame
@@ -243,17 +252,56 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
         one.flux.append(found)
 
 
-def _moved(start: Frame, end: Frame) -> float:
-    """Root mean square displacement over what the velocities of the first frame say; nan without them.
+class Flight(NamedTuple):
+    """Displacements between two frames next to what velocities say."""
 
-    Near 1 where frames are so close that atoms fly straight, below it where they turn around in between.
-    Above it the velocities do not belong to the positions, or are in another unit.
+    moved: float  # root mean square displacement over that of velocities times time
+    factor: float  # displacements over the mean of both velocities times time, by least squares
+    parallel: float  # correlation of the two
+    kept: float  # correlation of the velocities with those of the frame before
+
+
+def flight_of(start: Frame, end: Frame, step: float = 0.0) -> Flight | None:
+    """How displacements between two frames compare with velocities; None without either, or without motion.
+
+    `moved` is near 1 where atoms fly straight and below it where they turn around in between: never far
+    above. `factor` is near 1 as long as velocities keep their direction, whichever units they have.
     """
-    if start.velocities is None or not end.time > start.time:
-        return float("nan")
-    expected = float(np.sqrt(np.mean(start.velocities**2))) * (end.time - start.time)
-    moved = float(np.sqrt(np.mean(displacements(start, end) ** 2)))
-    return moved / expected if expected > 0 else float("nan")
+    if start.velocities is None or end.velocities is None or not end.time > start.time:
+        return None
+    u, v, moved = start.velocities, end.velocities, displacements(start, end)
+    mean = (u + v) / 2 * (end.time - start.time)
+    if len(u) > 3:
+        # a file may have been centered since
+        mean, moved = mean - np.median(mean, axis=0), moved - np.median(moved, axis=0)
+    expected, size, uu, vv = (float(np.vdot(one, one)) for one in (mean, moved, u, v))
+    if not min(expected, size, uu, vv) > 0:
+        return None
+    resolved = size > moved.size * (_STEPS * step) ** 2
+    return Flight(
+        resolved * float(np.sqrt(size / uu)) / (end.time - start.time),
+        float(np.vdot(mean, moved)) / expected,
+        float(np.vdot(mean, moved)) / float(np.sqrt(expected * size)),
+        float(np.vdot(u, v)) / float(np.sqrt(uu * vv)),
+    )
+
+
+def odd_flight(flights: Sequence[Flight]) -> dict[str, Any] | None:
+    """Whether displacements contradict velocities and times, from their medians over some frames.
+
+    That atoms move less than their velocities say is no contradiction where they turn around between two
+    frames: it is one only where velocities have kept their directions, and displacements lie along them.
+
+    Returns:
+        the factor by which they are too large (or small, below 1), and whether it is a lower bound of it;
+        None where there is no contradiction.
+    """
+    if not flights:
+        return None
+    moved, factor, parallel, kept = np.median(np.array(flights), axis=0).tolist()
+    if kept > _KEPT and parallel > _ALONG:
+        return None if 1 / _TOO_FAR < factor < _TOO_FAR else {"factor": factor, "at_least": False}
+    return {"factor": moved, "at_least": True} if moved > _TOO_FAR else None
 
 
 # ---- two trajectories

@@ -30,13 +30,15 @@ from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, reading, with_elements
+from mdnum.reading import ase_images, ignored_velocities, reading, with_elements
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
+_NOT_READ = "Columns {} are not read as velocities, which are taken from {} alone."
+_MOMENTA = "a column momenta in ASE's units"
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -57,6 +59,9 @@ class AseFrames(Trajectory):
         self._per_time = units.time_factor
         order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
         return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
+        if names := ignored_velocities(first.arrays):
+            self.notes += (_NOT_READ.format(", ".join(f"“{name}”" for name in names), _MOMENTA),)
+        return AtomTable.plain(first.get_chemical_symbols())
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
@@ -321,6 +326,8 @@ class LammpsDump(TextTrajectory):
         self.time = time if "TIME" in items else "step"
         if units is None:
             self.notes = ("The dump does not say its units (LAMMPS's dump_modify units yes writes them).",)
+        if set(_VELOCITIES) <= set(columns) and "TIME" not in items:
+            self.notes += (_NOT_READ.format(", ".join(_VELOCITIES), "dumps with dump_modify time yes"),)
         labels = _labels(columns, rows[self._order(0, columns, rows)])
         return AtomTable.plain(["X"] * len(rows) if labels is None else labels.tolist(), labels is not None)
 

@@ -12,6 +12,7 @@ from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, many, number, percent, plain
+from mdnum.units import odd_units
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
@@ -199,17 +200,24 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         others = leaps["frames"] - 1
         values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": view.length(leaps["distance"])}
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
+    if (flight := summary["flight"]) is not None:
+        units = " or ".join(() if flight["at_least"] else odd_units(flight["factor"]))
+        code = "at_least" if flight["at_least"] else "large" if flight["factor"] > 1 else "small"
+        values = {"factor": flight["factor"], "inverse": 1 / flight["factor"], "units": units}
+        yield TEXTS.finding("VELOCITIES_ODD", code, *(["known"] if units else []), **values)
     if summary["frames"] > 1:
         if not summary["has_times"]:
             yield TEXTS.finding("NO_TIMES")
+        elif summary["absurd"]:
+            swapped = summary["swapped"]
+            values = {"interval": view.time(number(summary["interval"])), "swapped": swapped}
+            yield TEXTS.finding("TIMES_ODD", *(["swapped"] if swapped else []), **values)
         elif summary["backward"]:
             yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
         elif not summary["even"]:
             yield TEXTS.finding("UNEVEN_FRAMES", interval=view.duration(1))
     axes = repeating(summary["box"])
-    more = (
-        ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes) + ["velocities"] * summary["velocities_odd"]
-    )
+    more = ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes)
     if summary["notes"] or more:
         yield TEXTS.finding("READING", *more, notes=" ".join(summary["notes"]), axes=", ".join(axes))
     if any(one["min_margin"] == 0 for one in summary["rules"]):
