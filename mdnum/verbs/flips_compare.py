@@ -56,8 +56,7 @@ def compare(
     clocks = {"ps" if one.time == "frame" else one.time for one in (a, b)}
     comparable = a.length == b.length and len(clocks) == 1
     speeds = [
-        infer(some, one.bits) if some and comparable else None
-        for some, one in zip(moving, (a, b), strict=True)
+        infer(moving[k], one.bits) if moving[k] and comparable else None for k, one in enumerate((a, b))
     ]
     sets = [
         NeighborSets(rule, [
@@ -296,15 +295,9 @@ def _rates(view: ComparisonView, grown: Mapping[str, Any]) -> Iterator[str]:
     for name, law in grown.items():
         if law is None or law["rate"] <= 0 or max(law["r2"], law["power_r2"]) < _FITS:
             continue
-        text = number(1 / law["rate"])
+        text, part = number(1 / law["rate"]), TEXTS(f"part_{name}")
         length = view.time(text) if view.summary["timed"] else f"{text} frames"
-        values = {
-            "time": length,
-            "frames": law["frames"],
-            "exponent": law["exponent"],
-            "part": TEXTS(f"part_{name}"),
-        }
-        yield TEXTS(f"growth_{law['law']}", **values)
+        yield TEXTS(f"growth_{law['law']}", part=part, time=length, **law)
         if law["law"] == "exponential":
             rates[name] = law["rate"]
     if len(rates) == 2:
@@ -323,7 +316,7 @@ def _findings(view: ComparisonView) -> Iterator[Finding]:
         yield from view.repeated(repeats, name)
     if summary["shift"] is not None:
         shift = view.shift
-        yield TEXTS.finding("SHIFT", *([] if shift["same"] else ["varies"]), **shift)
+        yield TEXTS.finding("SHIFT", *["varies"] * (not shift["same"]), **shift)
     if (how := summary["velocities"]) is not None and how["frame"] != summary["beyond"]:
         yield TEXTS.finding("VELOCITIES", how["kind"], **{**how, "frame": view.frame(how["frame"])})
     unsure = [one for one in summary["rules"] if one["first"] and one["certain"] != one["first"]["frame"]]

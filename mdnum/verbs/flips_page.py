@@ -12,7 +12,6 @@ from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, many, number, percent, plain
-from mdnum.units import odd_units
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
@@ -201,17 +200,22 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": view.length(leaps["distance"])}
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
     if (flight := summary["flight"]) is not None:
-        units = " or ".join(() if flight["at_least"] else odd_units(flight["factor"]))
-        code = "at_least" if flight["at_least"] else "large" if flight["factor"] > 1 else "small"
-        values = {"factor": flight["factor"], "inverse": 1 / flight["factor"], "units": units}
-        yield TEXTS.finding("VELOCITIES_ODD", code, *(["known"] if units else []), **values)
+        factor, lower = flight["factor"], flight["at_least"]
+        known = (
+            []
+            if lower
+            else [word for word, one in TEXTS.entries["odd_units"].items() if abs(factor / one - 1) < 0.05]
+        )
+        code = "at_least" if lower else "large" if factor > 1 else "small"
+        values = {"factor": factor, "inverse": 1 / factor, "units": " or ".join(known)}
+        yield TEXTS.finding("VELOCITIES_ODD", code, *["known"] * bool(known), **values)
     if summary["frames"] > 1:
         if not summary["has_times"]:
             yield TEXTS.finding("NO_TIMES")
         elif summary["absurd"]:
             swapped = summary["swapped"]
             values = {"interval": view.time(number(summary["interval"])), "swapped": swapped}
-            yield TEXTS.finding("TIMES_ODD", *(["swapped"] if swapped else []), **values)
+            yield TEXTS.finding("TIMES_ODD", *["swapped"] * bool(swapped), **values)
         elif summary["backward"]:
             yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
         elif not summary["even"]:
