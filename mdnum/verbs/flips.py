@@ -85,7 +85,7 @@ def flips(
             exception: what came before is kept, and the summary names the frame.
         FolderError: the folder cannot be used.
     """
-    from mdnum.trajectories.follow import follow, odd_flight
+    from mdnum.trajectories.follow import follow
     from mdnum.trajectories.resolution import infer
     from mdnum.trajectories.trajectory import open_trajectory
 
@@ -129,7 +129,7 @@ def flips(
             "window": window,
             "resolution": resolution,
             "rules": told,
-            "flight": odd_flight(found.flights),
+            "flight": found.odd,
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
@@ -450,10 +450,8 @@ def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups)
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
     """Crossings by the velocities, which a run would show that looked at every instant, against the flips."""
-    from mdnum.trajectories.follow import odd_flight
-
     duration = steps["last_time"] - steps["first_time"]
-    if not one.flux or not steps["timed"] or not duration > 0 or odd_flight(found.flights) is not None:
+    if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None
     crossed, moments = sum(flips for flips, _ in one.flux), sum(moment for _, moment in one.flux)
     rate, seen = crossed / moments, flips / duration

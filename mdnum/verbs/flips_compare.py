@@ -13,8 +13,9 @@ from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
-from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of, velocities_of
+from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
+from mdnum.trajectories.separation import velocities_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
 from mdnum.verbs.frame import Keep, Outcome, Verb, answering

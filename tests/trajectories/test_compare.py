@@ -8,16 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.follow import (
-    SetDifference,
-    displacements,
-    distances,
-    growth,
-    same_lattice,
-    separation,
-)
+from mdnum.trajectories.follow import SetDifference, distances
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.ledger import Members
+from mdnum.trajectories.separation import displacements, growth, same_lattice, separation
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30))

@@ -17,8 +17,8 @@ from ase.md.verlet import VelocityVerlet
 
 import mdnum
 from mdnum.store import RunFolder
-from mdnum.trajectories.follow import common_shift, displacements, growth
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.separation import common_shift, displacements, growth
 from mdnum.trajectories.trajectory import open_trajectory
 from mdnum.verbs.frame import Outcome
 
@@ -296,9 +296,10 @@ def test_a_restart_with_other_velocities_is_named(
         assert told["factor"] == pytest.approx(float(change(np.ones(1), None)[0]))
     if kind == "zero":
         assert told["side"] == "B"
-        # and where nothing was written before the first step
+        # and where nothing was written before the first step; what is written less often is not missing
         del b[at * joined].arrays["momenta"]
-        assert compared(tmp_path, b, a).summary["velocities"]["side"] == "A"
+        told = compared(tmp_path, b, a).summary["velocities"]
+        assert (told or {}).get("side") == (None if joined else "A")
 
 
 def test_velocities_of_one_run_agree_to_the_digits_of_the_files(tmp_path: Path) -> None:
