@@ -57,11 +57,10 @@ class AseFrames(Trajectory):
         units = _units(self.path)
         self.length, self.time = units.length, units.time if self._timed else "frame"
         self._per_time = units.time_factor
-        order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
-        return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
         if names := ignored_velocities(first.arrays):
             self.notes += (_NOT_READ.format(", ".join(f"“{name}”" for name in names), _MOMENTA),)
-        return AtomTable.plain(first.get_chemical_symbols())
+        order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
+        return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)

@@ -10,8 +10,6 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.report.finding import Finding, Texts
-from mdnum.report.words import listed, number, plain
-from mdnum.report.finding import Texts
 from mdnum.report.words import count, listed, number, plain
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Progress, View, asked_to_stop
