@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,6 +18,7 @@ import planted_lists
 import pytest
 from command_line import call, printed
 
+from mdnum.deadline import Deadline
 from mdnum.references.conformance.case import once
 from mdnum.references.conformance.judge import Report
 from mdnum.references.conformance.lists import from_object
@@ -203,16 +207,16 @@ def test_what_fails_only_after_another_goes_below_it():
 def test_time_that_is_up_is_reported():
     """How many of how many were asked; and what was not asked is not called right."""
 
-    class TwoQuestions:
-        left = 3
+    class TwoQuestions(Deadline):
+        more = 3
 
         @property
         def passed(self) -> bool:
-            self.left -= 1
-            return self.left <= 0
+            self.more -= 1
+            return self.more <= 0
 
     cases = [once(f"{n}", "few", _PLACES) for n in range(5)]
-    found = examine(from_object(_leaves, "it"), asked=cases, deadline=cast(Any, TwoQuestions()))
+    found = examine(from_object(_leaves, "it"), asked=cases, deadline=TwoQuestions())
     assert (found.asked, found.left, found.questions) == (2, 3, 5)
     assert "2 of 5 cases" in _verdict(found).headline
 
@@ -355,6 +359,153 @@ def test_an_examination_that_is_killed_is_resumed(mine: Path, capsys: pytest.Cap
     # nothing is asked again of one that is whole
     assert call("conform", "--resume", "killed", "--no-report", "--time", "1e-6") == 1
     assert RunFolder.open("killed").summary["asked"] == whole["asked"]
+
+
+_HANGS = """
+import ctypes, os, signal, time
+from pathlib import Path
+
+from mine import nearest_image
+
+calls = dense = 0
+
+def hangs(positions, cell, pbc, r_cut):
+    if len(positions) == 24:
+        Path("hangs").write_text(str(os.getpid()))
+        while Path("python").exists():
+            pass
+        ctypes.PyDLL(None).sleep(1000)  # no other thread of Python runs meanwhile
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def slow(positions, cell, pbc, r_cut):
+    time.sleep(0.02)
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_at_the_12th(positions, cell, pbc, r_cut):
+    global calls
+    calls += 1
+    if calls == 12:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_after_a_crowd(positions, cell, pbc, r_cut):
+    global dense
+    dense, after = len(positions) > 40, dense
+    if after:
+        os.abort()
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_by_chance(positions, cell, pbc, r_cut):
+    global calls
+    calls += 1
+    if calls == 9 and Path("armed").exists():
+        Path("armed").unlink()
+        os.abort()
+    return nearest_image(positions, cell, pbc, r_cut)
+
+class EndsAtAnUpdate:
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        self.rest, self.updates = (pbc, r_cut), 0
+        return self.update(positions, cell)
+
+    def update(self, positions, cell):
+        self.updates += 1
+        if self.updates == 5:
+            os.abort()
+        return nearest_image(positions, cell, *self.rest)
+"""
+_LIMITED = ["--no-large", "--limits", "minimum-image,orthorhombic,all-axes"]
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("how", ["python", "foreign"])
+@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.Signals, how: str):
+    """And what it answered until then has a page, which can be written afterward where nothing else can."""
+    (mine / "hangs.py").write_text(_HANGS)
+    (mine / how).touch()
+    command = [sys.executable, "-m", "mdnum", "conform", "hangs.py:hangs", *_LIMITED, "-o", "out"]
+    asking = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        _wait_for(lambda: (mine / "hangs").exists() and (mine / "hangs").read_text())
+        child = int((mine / "hangs").read_text())
+        assert _is_alive(child)
+        asking.send_signal(by)
+        out, err = asking.communicate(timeout=60)
+    finally:
+        asking.kill()
+    _wait_for(lambda: not _is_alive(child))
+    assert asking.returncode == (-9 if by == signal.SIGKILL else 130), err
+    page = mine / "out" / "report.html"
+    assert page.exists() == (by != signal.SIGKILL)
+    assert call("report", "out") == 0 and "Right" in page.read_text()
+    summary = RunFolder.open("out").summary
+    assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
+    if by != signal.SIGKILL:
+        assert summary["asked"] >= 5 and "resumes it" in summary["verdict"] and "right pairs" in out
+
+
+def _wait_for(condition: Callable[[], Any]) -> None:
+    began = monotonic()
+    while not condition():
+        assert monotonic() < began + 60
+        sleep(0.05)
+
+
+@pytest.mark.parametrize(("name", "code", "status"), [("hangs", 3, "undecided"), ("slow", 0, "partial")])
+def test_time_that_is_up_ends_it(mine: Path, name: str, code: int, status: str):
+    """A call in progress, too; few questions about each area come first and are a verdict."""
+    (mine / "hangs.py").write_text(_HANGS)
+    asked = ("conform", f"hangs.py:{name}", *_LIMITED, "--cases", "4000", "--time", "0.15", "-o", "out")
+    began = monotonic()
+    assert call(*asked) == code
+    # nine seconds, the page, and what a busy machine adds; a call alone may take 45 s
+    assert monotonic() - began < 40
+    summary = RunFolder.open("out").summary
+    assert summary["status"] == status and summary["left"] > 500
+    assert ("no verdict yet" in summary["headline"]) == (status == "undecided")
+    assert (mine / "out" / "report.html").exists()
+    areas = {row["area"]: row["asked"] + row["skipped"] for row in summary["areas"]}
+    if status == "partial":
+        assert {"few", "boxes", "axes", "images", "outside", "ties", "coincident", "crowded", "reuse"} <= set(
+            areas
+        )
+        assert min(areas.values()) >= 5
+
+
+@pytest.mark.parametrize(
+    ("name", "calls", "reproduced"),
+    [
+        ("ends_at_the_12th", 11, True),
+        ("ends_after_a_crowd", 1, True),
+        ("EndsAtAnUpdate", 0, True),
+        ("ends_by_chance", 0, False),
+    ],
+)
+def test_a_script_is_run_before_it_is_named(mine: Path, name: str, calls: int, reproduced: bool):
+    """It makes the earlier calls that it needs; what shows nothing is said to show nothing."""
+    (mine / "hangs.py").write_text(_HANGS)
+    (mine / "armed").touch()
+    assert call("conform", f"hangs.py:{name}", *_LIMITED, "--cases", "0", "-o", "out") == 1
+    summary = RunFolder.open("out").summary
+    (failure,) = summary["failures"]
+    assert (failure["code"], failure["earlier"], failure["reproduced"]) == ("CRASHED", calls, reproduced)
+    (finding,) = (one for one in summary["findings"] if one["code"] == "CRASHED")
+    assert (f"Reproduced by {failure['script']}" in finding["text"]) == reproduced
+    assert ("could not be reproduced" in finding["text"]) == (not reproduced)
+    script = mine / "out" / failure["script"]
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert (done.returncode < 0) == reproduced and ("the list is right" in done.stdout) == (not reproduced)
+    if name == "EndsAtAnUpdate":
+        assert failure["steps"] == 5
 
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"word": 1, "tested": 2, "options": 3}', "\0{"])

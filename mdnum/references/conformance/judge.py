@@ -356,6 +356,8 @@ class Failed:
     failures: tuple[Failure, ...]  # what was wrong at that step
     # it fails when it is the first that a new process is asked; else what was asked before matters
     alone: bool = True
+    earlier: tuple[Case, ...] = ()  # questions that a new process must be asked before it fails
+    reproduced: bool | None = None  # whether its script showed it when it was run; None where it was not run
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
@@ -463,6 +465,7 @@ class Report:
     seconds: float = 0.0  # in all
     large: tuple[int, float] | None = None  # (atoms, seconds) of its largest question
     questions: int = 0  # cases that there are, those that it does not claim to do included
+    breadth: int = 0  # of them, those at the beginning without which there is no verdict
     motions: int = 0  # against its rebuild rule, that it was asked; and calls: of it in those
     calls: int = 0
     whole: bool = True  # all failures were shrunk as far as they are

@@ -5,15 +5,23 @@ from __future__ import annotations
 import base64
 import inspect
 import io
+import os
+import subprocess
+import tempfile
 import textwrap
 import zlib
+from collections.abc import Iterator
+from pathlib import Path
 from pprint import pformat
 
 import numpy as np
 
+from mdnum.deadline import Deadline
 from mdnum.references.conformance import answer
-from mdnum.references.conformance.judge import Conventions, Failed
+from mdnum.references.conformance.case import Case, Still
+from mdnum.references.conformance.judge import Conventions, Failed, Report
 from mdnum.references.conformance.lists import PairList
+from mdnum.safe_path import environment, python
 
 _PRINTED = 60  # atoms whose coordinates are written out
 
@@ -98,7 +106,7 @@ def check(step, x, cell, given):
 
 #: A list is asked at each step; a line of what follows is how, for one made anew and for one that is kept.
 _STEPS = """
-fine = True{begin}
+fine = True{begin}{earlier}
 for step, (x, cell, fresh, *skin) in enumerate(STEPS):
     before = x.copy(), cell.copy()
     {given}
@@ -114,6 +122,16 @@ _KEPT = """if not fresh and held is not None and held[0].shape == x.shape:
     held = x, cell
     anew = fresh and (PBC, R_CUT, *(skin or [SKIN]))
     given = asked(kept.allocate, x, cell, *anew) if fresh else asked(kept.update, x, cell)"""
+
+#: Calls that come first, whatever they return.
+_EARLIER = """
+for x, cell, *anew in EARLIER:
+    try:
+        {given}
+    except Exception as error:
+        print(f"an earlier call raised {{type(error).__name__}}")"""
+_EARLIER_ONCE = "{call}(x, cell, *anew[:2])"
+_EARLIER_KEPT = "kept.allocate(x, cell, *anew) if anew else kept.update(x, cell)"
 
 _WAITS = 'print("it waits for an answer; Control-C ends it", flush=True)'
 
@@ -149,6 +167,8 @@ def script(
     # an exception may quote code, whose strings must not end this one
     title = title.replace("\\", "/").replace('"""', "'''")
     begin = f"\nkept, held = {tested.call}(), None" if tested.kept else ""
+    before = _EARLIER_KEPT if tested.kept else _EARLIER_ONCE.format(call=tested.call)
+    earlier = _EARLIER.format(given=before) if failed.earlier else ""
     text = inspect.getsource(answer)
     parts = [
         '"""' + "\n".join(textwrap.wrap(title, 100)) + f'\n\n{case_words}\n"""',
@@ -159,7 +179,9 @@ def script(
         _ASKED.strip(),
         _BRUTE_FORCE.strip(),
         *([_WAITS] if worst.code == "NO_ANSWER" else []),
-        _STEPS.strip().format(begin=begin, given=_KEPT if tested.kept else _ONCE.format(call=tested.call)),
+        _STEPS.strip().format(
+            begin=begin, earlier=earlier, given=_KEPT if tested.kept else _ONCE.format(call=tested.call)
+        ),
         'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
     ]
     return "\n\n\n".join(parts) + "\n"
@@ -167,16 +189,11 @@ def script(
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
     """The case as constants."""
-    case = failed.case
-    stills, atoms = [], None
-    for still in case.stills:
-        count = len(still.positions)
-        fresh = atoms is None or still.fresh or count != atoms
-        atoms = count
-        place = _array(still.positions)
-        skin = case.skin if still.skin is None else still.skin
-        anew = f", {skin!r}" if fresh and any(other.skin is not None for other in case.stills) else ""
-        stills.append(f"    ({place},\n     {_array(still.cell)}, {fresh}{anew}),")
+    case, stills = failed.case, []
+    several = any(other.skin is not None for other in case.stills)
+    for still, fresh, skin in _calls(case):
+        anew = f", {skin!r}" if fresh and several else ""
+        stills.append(f"    ({_array(still.positions)},\n     {_array(still.cell)}, {fresh}{anew}),")
     lines = [
         f"R_CUT, SKIN, REACH = {case.r_cut!r}, {case.skin!r}, {reach!r}",
         f"PBC = np.array({list(case.pbc)})",
@@ -188,9 +205,64 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         *stills,
         "]",
     ]
-    if any(len(still.positions) > _PRINTED for still in case.stills):
+    if failed.earlier:
+        lines.append("EARLIER = [  # positions, cell and, of a list that starts anew, pbc, r_cut, skin")
+    for other in failed.earlier:
+        for still, fresh, skin in _calls(other):
+            anew = f",\n     np.array({list(other.pbc)}), {other.r_cut!r}, {skin!r}" if fresh else ""
+            lines.append(f"    ({_array(still.positions)},\n     {_array(still.cell)}{anew}),")
+    lines += ["]"] if failed.earlier else []
+    cases = (case, *failed.earlier)
+    if any(len(still.positions) > _PRINTED for other in cases for still in other.stills):
         lines.insert(0, "import base64\nimport io\nimport zlib\n\n" + _UNPACK)
     return "\n".join(lines)
+
+
+def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
+    """(still, whether the list starts anew there, its skin) at every step."""
+    atoms = None
+    for still in case.stills:
+        count = len(still.positions)
+        fresh = atoms is None or still.fresh or count != atoms
+        yield still, fresh, case.skin if still.skin is None else still.skin
+        atoms = count
+
+
+#: What a script is run by: it ends with this process, and has as much memory as when the list was asked.
+_RUN = (
+    "import runpy, sys; from mdnum.safe_path import guard; guard(int(sys.argv[2])); "
+    "runpy.run_path(sys.argv[1], run_name='__main__')"
+)
+#: Seconds that a script may take.
+_SECONDS = 60.0
+
+
+def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
+    """Whether the script of a failure shows it when it is run; None where it cannot be run in time."""
+    tested, code, text = report.tested, failed.code, failed.worst.text
+    if not tested.source.strip() or deadline.passed:
+        return None
+    seconds = min(_SECONDS, deadline.left)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "reproduce.py"
+        path.write_text(
+            script(tested, failed, report.how, report.superset, report.reach(failed.case)), encoding="utf-8"
+        )
+        command = python("-c", _RUN, str(path), str(os.getpid()))
+        try:
+            done = subprocess.run(
+                command, env=environment(), stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds,
+                check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return code == "NO_ANSWER" if seconds == _SECONDS else None
+    said, errors = done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
+    if code == "RAISED":
+        return done.returncode == 1 and text.partition(":")[0] in errors
+    if code == "CRASHED":
+        left = "SystemExit" in text and "it ends the process" in said
+        return left or done.returncode < 0 or f"exit code {done.returncode}:" in f"{text}:"
+    return done.returncode == 1 and said.rstrip().endswith("the list is wrong")
 
 
 _UNPACK = '''
