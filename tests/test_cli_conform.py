@@ -361,6 +361,76 @@ def test_an_examination_that_is_killed_is_resumed(mine: Path, capsys: pytest.Cap
     assert RunFolder.open("killed").summary["asked"] == whole["asked"]
 
 
+_ROUNDS = """
+import numpy as np
+from planted_lists import Kept, search
+
+def rounds(positions, cell, pbc, r_cut, parts=("i", "j", "shift"), rounded=np.float32):
+    rows = search(positions.astype(rounded).astype(float), cell, pbc, r_cut)
+    return {name: rows[name] for name in parts}
+
+def rounds_and_measures(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance", "vector"))
+
+def rounds_half(positions, cell, pbc, r_cut):
+    rows = rounds(positions, cell, pbc, r_cut)
+    once = rows["i"] < rows["j"]
+    return rows["i"][once], rows["j"][once]
+
+def declared(positions, cell, pbc, r_cut):
+    return rounds_and_measures(positions, cell, pbc, r_cut)
+
+declared.unit = 2.0**-24
+
+def rounds_nothing(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance"), float)
+
+def rounds_too_much(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance"), np.float16)
+
+class KeptRounds(Kept):
+    def allocate(self, positions, *rest):
+        return super().allocate(positions.astype(np.float32).astype(float), *rest)
+
+    def update(self, positions, cell):
+        return super().update(positions.astype(np.float32).astype(float), cell)
+
+    def _pairs(self, positions, cell):
+        rows = super()._pairs(positions, cell)
+        i, j, shift = rows["i"], rows["j"], rows["shift"]
+        box = np.where(self.pbc[:, None], cell, 0.0)
+        return i, j, shift, np.linalg.norm(positions[j] - positions[i] + shift @ box, axis=1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "code"),
+    [
+        ("rounds", "", "warning"),
+        ("rounds_and_measures", "", "warning"),
+        ("rounds_half", "minimum-image", "warning"),
+        ("KeptRounds", "all-axes,orthorhombic", "warning"),
+        # it says so; nothing is rounded; half precision is no single one
+        ("declared", "", None),
+        ("rounds_nothing", "", None),
+        ("rounds_too_much", "", "error"),
+    ],
+)
+def test_a_list_that_rounds_positions_to_float32_is_a_warning(mine: Path, name: str, limits: str, code):
+    home = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+    (mine / "rounds.py").write_text(home + _ROUNDS)
+    asked = ["conform", f"rounds.py:{name}", "--cases", "6", "--no-large", "--no-report", "-o", "out"]
+    # the random cases make no difference, and failures need not be small
+    exit_code = call(*asked, *(["--limits", limits] if limits else []), "--time", "3")
+    assert exit_code == (code is not None)
+    found = {one["code"]: one for one in RunFolder.open("out").summary["findings"]}
+    assert {one["severity"] for one in found.values()} == ({code} if code else set()), found
+    if code == "warning":
+        (finding,) = found.values()
+        assert finding["code"] == "SINGLE_PRECISION"
+        assert 1e-9 < finding["values"]["length"] < 2e-6 and 2**16 < finding["values"]["times"] <= 2**29
+
+
 _HANGS = """
 import ctypes, os, signal, time
 from pathlib import Path

@@ -35,6 +35,8 @@ TEXTS = Texts(__file__)
 PRECISIONS = {"float64": DOUBLE, "float32": SINGLE}
 #: Random cases that can be asked for.
 MOST_CASES = 100_000
+#: Times the rounding of float64 below which an error is no sign of float32.
+_SLIGHT = 2.0**16
 #: Areas of a list that is kept and brought up to date.
 _IN_USE = ("motion", "wrapping", "strain", "rule")
 _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
@@ -255,6 +257,7 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
         "shift_sign": found.how.sign,
         "precision": "float64" if found.how.unit == DOUBLE else "float32",
         "single": found.single and found.single.name,
+        "error": dict(zip(("length", "times"), found.error, strict=True)),
         "ties": dict(zip(("counted", "not_counted"), found.ties, strict=True)),
         "refusals": [
             {
@@ -390,7 +393,8 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)
     if "float32" in summary["found_out"]:
-        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"])
+        slight = ["slight"] * (summary["error"]["times"] < _SLIGHT)
+        yield TEXTS.finding("SINGLE_PRECISION", *slight, case=summary["single"], **summary["error"])
     if summary["keeps_order"] is False:
         yield TEXTS.finding("ORDER")
     if summary["aliased"] is not None:

@@ -28,6 +28,7 @@ from mdnum.references.conformance.judge import (
     Truth,
     judge,
     measures_well,
+    shown_error,
     truth,
     without_numbers,
 )
@@ -170,9 +171,10 @@ class Examiner:
                 return replace(result, refused=(step, outcome.refused))
             found = [outcome.failure] if outcome.failure is not None else []
             if outcome.answer is not None:
-                found, how, ties = self._judge(case, step, outcome.answer, how)
+                found, single, ties = self._judge(case, step, outcome.answer, how)
+                how = replace(how, unit=SINGLE) if single else how
                 ties = ties if step == 0 else result.ties
-                result = replace(result, ties=ties, single=result.single or how.unit != self.report.how.unit)
+                result = replace(result, ties=ties, single=single or result.single)
                 if outcome.changed:
                     found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
             if found:
@@ -191,26 +193,29 @@ class Examiner:
 
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
-    ) -> tuple[list[Failure], Conventions, tuple[int, int]]:
-        """(failures, conventions that the answer was judged by, ties counted and not)."""
+    ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
+        """(failures, the error of one that is right in single precision alone, ties counted and not)."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
         if found and step and reach is not None and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
-            found = judge(answer, _with_earlier(case, step, right, reach), how)
+            right = _with_earlier(case, step, right, reach)
+            found = judge(answer, right, how)
         # a list that is stale by a hair is not one in single precision, nor one that is wrong anyway; and
         # whoever measures in double and decides in single loses pairs that it knows to be inside
+        measures = {failure.code for failure in found} <= {"DISTANCES", "VECTORS"}
         if (
-            found and step == 0 and not case.known and len(answer) > 0
+            found and (step == 0 or measures) and not case.known and len(answer) > 0
             and self.report.wrong <= _MISTAKES * (self.report.asked + 1)
             and self.tested.unit is None and how.unit == DOUBLE and not measures_well(answer, right, how)
         ):  # fmt: skip
-            coarse, single = truth(case, step, reach=reach, unit=SINGLE), replace(how, unit=SINGLE)
-            if not judge(answer, coarse, single):
-                return [], single, (0, 0)
+            coarse = right if step else truth(case, step, reach=reach, unit=SINGLE)
+            error = shown_error(answer, coarse, how)
+            if error is not None:
+                return [], error, (0, 0)
         counts = not found and step == 0 and how.unit == DOUBLE and not self.report.superset
-        return found, how, _ties(answer, right) if counts else (0, 0)
+        return found, None, _ties(answer, right) if counts else (0, 0)
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
