@@ -53,6 +53,9 @@ def returns_nothing(positions, cell, pbc, r_cut):
 def raises(positions, cell, pbc, r_cut):
     return positions.numpy()
 
+def needs_a_package(positions, cell, pbc, r_cut):
+    import nowhere_to_be_found.deeper
+
 class Half:
     def allocate(self, positions, cell, pbc, r_cut, skin):
         return [], []
@@ -93,7 +96,9 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
     assert {"vesin", "numpy", "jax-md-kept"} <= {line.split()[0] for line in printed(capsys) if line}
     assert call("conform", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["lists"]
-    assert {"list", "version", "kept", "what"} == set(rows[0])
+    assert {"list", "version", "lacks", "kept", "what"} == set(rows[0])
+    for row in rows:
+        assert (row["version"] is None) == (row["list"] in {one["list"] for one in rows if one["lacks"]})
 
 
 @pytest.mark.parametrize(
@@ -114,6 +119,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
         (("mine.py:Short",), ".update(positions) cannot be called with (positions, cell)"),
         (("mine.py:mask",), "ndarray of shape (3, 3), not (i, j)"),
         (("mine.py:returns_nothing",), "it returned None"),
+        (("mine.py:needs_a_package",), "Run python3 -m pip install nowhere_to_be_found"),
         (("mine.py:raises",), "AttributeError: 'numpy.ndarray' object has no attribute 'numpy'"),
         (("mine.py:nearest_image", "--limits", "tilted"), "no limit is called 'tilted'"),
         (("mine.py:nearest_image", "--precision", "double"), "float64, float32"),

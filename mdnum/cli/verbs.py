@@ -347,12 +347,18 @@ def _lists(as_json: bool) -> int:
     from mdnum.references.conformance.peers import known
 
     rows = [
-        {"list": one.name, "version": one.version, "kept": one.kept, "what": one.description}
+        {
+            "list": one.name, "version": one.version, "lacks": one.lacks, "kept": one.kept,
+            "what": one.description,
+        }
         for one in known()
-    ]
+    ]  # fmt: skip
     if as_json:
         return output.print_json({"lists": rows})
-    lines = [(row["list"], row["version"] or "not installed", row["what"]) for row in rows]
+    lines = [
+        (row["list"], f"install {' '.join(row['lacks'])}" if row["lacks"] else row["version"], row["what"])
+        for row in rows
+    ]
     output.print_table("neighbor lists that have a name here", ("list", "version", "what"), lines)
     output.say("\nYour own: mdnum conform package.module:function, or file.py:function.")
     output.say("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")

@@ -162,7 +162,9 @@ def conform(
             calls = "Let allocate and update return" if tested.kept else (
                 "Give a function of (positions, cell, pbc, r_cut) that returns"
             )  # fmt: skip
-            raise InputError(why, where=tested.name, remedy=f"{calls} {_RETURNS}")
+            lacks = re.search(r"No module named '(\w+)", why)
+            install = f"Run python3 -m pip install {lacks[1]}, or what else provides it" if lacks else ""
+            raise InputError(why, where=tested.name, remedy=install or f"{calls} {_RETURNS}")
         if folder is None:
             slug = f"conform-{tested.name.replace(':', '-')}"
             folder = stack.enter_context(frame.new_folder("conform", slug, out))
