@@ -486,7 +486,7 @@ class EndsAtAnUpdate:
 
     def update(self, positions, cell):
         self.updates += 1
-        if self.updates == 5:
+        if self.updates == 5 and len(positions) == 2:
             os.abort()
         return nearest_image(positions, cell, *self.rest)
 """

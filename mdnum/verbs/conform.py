@@ -138,7 +138,8 @@ def conform(
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     deadline = Deadline(time)
-    with frame.terminable(), ExitStack() as stack:
+    with ExitStack() as stack:
+        frame.end_on_sigterm(stack)
         folder = state = None
         if resume is not None:
             folder = answers.take(resume, "conform")

@@ -28,8 +28,9 @@ _RUNGS = np.geomspace(0.25, 3.0, 20)
 _BEYOND = int((_RUNGS >= 1).sum())  # of a list that has the padding it is taken to have
 #: What the atom of a pair that is named first does of the motion.
 _SHARES = (0.5, 1.0, 0.0, 0.3, 0.7)
-#: Proportions for a pair among many, and how far the others move meanwhile, in paddings.
-_SPLITS, _LITTLE = np.linspace(0.5, 1.0, 13), (0.0, 0.01, 0.04)
+#: A pair among how many, and how far the others move meanwhile, in paddings.
+_AMONG = ((42, 0.0), (300, 0.0), (300, 0.01), (300, 0.04), (1_200, 0.01))
+_GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 
 def movers() -> Iterator[Case]:
@@ -236,15 +237,12 @@ def motions(padding: float | None = None) -> Iterator[Case]:
     back = (0.0, 0.45, -0.45, 0.9, -0.9, 1.0)
     paths = (_walk(room, way, 0.5, edge, n, back) for n, way in some)
     yield _sequence("pairs that go back and forth, then together", paths, edge)
-    for share in (0.5, 1.0):
-        words = f"a pair among 40 atoms at rest, {share:.0%} by its first atom"
-        yield _sequence(words, (_among(room, way, share, edge, n) for n, way in numbered), edge)
-    wide = max(12.0, edge)
-    for k, word in enumerate(("at rest", "that move very little", "that move little")):
-        paths = (_uneven(room, way, wide, len(_LITTLE) * n + k, 300) for n, way in numbered)
-        yield _sequence(f"a pair that shares the motion unevenly among 300 atoms {word}", paths, wide)
-    paths = [_uneven(room, ways[9], 1.5 * wide, n, 1_200) for n in (4, 8)]
-    yield _sequence("a pair that shares the motion unevenly among 1,200 atoms", paths, 1.5 * wide)
+    for k, (count, little) in enumerate(_AMONG):
+        wide = edge * max(1.0, (count / 42) ** (1 / 3))
+        which = numbered if count < 1_000 else numbered[4:12:4]
+        paths = (_among(room, way, wide, len(ways) * k + n, count, little) for n, way in which)
+        how = f"that move by {little} paddings" if little else "at rest"
+        yield _sequence(f"a pair shares the motion in all proportions, {count} atoms {how}", paths, wide)
     paths = (_adrift(room, way, edge, n) for n, way in numbered)
     yield _sequence("a pair comes together while all atoms drift", paths, edge)
     for share in (0.5, 0.3):
@@ -297,28 +295,20 @@ def _walk(
     return [start + part * moves for part in closed]
 
 
-def _among(room: float, way: ndarray, share: float, edge: float, n: int) -> list[ndarray]:
-    """Two atoms that come together, wherever they are in the file, and 40 at rest."""
-    first, second = (n * 11) % 42, (n * 17 + 23) % 42
-    second = (second + 1) % 42 if second == first else second
-    return _with(gas(42, edge, 160 + n), [first, second], _walk(room, way, share, edge, n))
-
-
-def _uneven(room: float, way: ndarray, edge: float, n: int, count: int) -> list[ndarray]:
-    """Two atoms of many share the motion in one of `_SPLITS`, and the others move little.
+def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
+    """Two atoms of many come together, and the others rest or move little; each time they share it otherwise.
 
     Places in the file of what moves most are spread evenly over it, those of its partner at random.
     """
     rng = np.random.default_rng(170 + n)
-    most = int(count * (1.0 - (n + 1) * 0.6180339887498949 % 1.0))
+    most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
     other = (most + int(rng.integers(1, count))) % count
-    # every share meets every way and every size of the others' motion
-    share = float(_SPLITS[5 * n % len(_SPLITS)])
+    share = min(1.0, 0.5 + 0.52 * (n * _GOLDEN % 1.0))  # now and then one atom does it all
     start, end = _with(gas(count, edge, 190 + n), [most, other], _walk(room, way, share, edge, n))
-    little = rng.normal(size=start.shape)
-    little *= _LITTLE[n % len(_LITTLE)] * room / np.linalg.norm(little, axis=1)[:, None]
-    little[[most, other]] = 0.0
-    return [start, end + little]
+    others = rng.normal(size=start.shape)
+    others *= little * room / np.linalg.norm(others, axis=1)[:, None]
+    others[[most, other]] = 0.0
+    return [start, end + others]
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:

@@ -235,21 +235,18 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     affords=0.3,
     limits=ListLimits(whole_cell=True),
 )
-def nvalchemi_pairs(positions, cell, pbc, r_cut):
+def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
     """nvalchemi-ops' cell_list."""
 
     import torch  # type: ignore
     from nvalchemiops.torch.neighbors import NeighborOverflowError, cell_list  # type: ignore
 
     asked = torch.as_tensor(positions), float(r_cut), torch.as_tensor(cell)[None], torch.as_tensor(pbc)[None]
-    # its own estimate is for a unit of length (0.2 atoms in a cubic Angstrom); it says what it would need
-    room = 64
-    while True:
-        try:
-            pairs, _, shift = cell_list(*asked, max_neighbors=room, return_neighbor_list=True)
-            break
-        except NeighborOverflowError as error:
-            room = max(2 * room, error.num_neighbors)
+    try:
+        # its own estimate is for a unit of length (0.2 atoms in a cubic Angstrom)
+        pairs, _, shift = cell_list(*asked, max_neighbors=room, return_neighbor_list=True)
+    except NeighborOverflowError as error:
+        return nvalchemi_pairs(positions, cell, pbc, r_cut, max(2 * room, error.num_neighbors))
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 

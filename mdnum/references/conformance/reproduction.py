@@ -9,6 +9,7 @@ import os
 import subprocess
 import tempfile
 import textwrap
+import tomllib
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,126 +25,8 @@ from mdnum.references.conformance.lists import PairList
 from mdnum.safe_path import environment, python
 
 _PRINTED = 60  # atoms whose coordinates are written out
-
-_BRUTE_FORCE = '''
-def right_pairs(x, cell, reach):
-    """Every pair within reach, each once: {(i, j, shift): distance}, x[j] - x[i] + shift @ cell."""
-    box = np.where(PBC[:, None], cell, 0.0)
-    if PBC.any():
-        # fractions along the axes that repeat; normals stand in for the others
-        full = np.array(box)
-        if not PBC.all():
-            full[~PBC] = np.linalg.svd(np.vstack([box[PBC], np.zeros((1, 3))]))[2][PBC.sum():]
-        home = np.where(PBC, -np.floor(np.linalg.solve(full.T, x.T).T), 0).astype(int)
-        width = 1 / np.linalg.norm(np.linalg.inv(full), axis=0)
-        most = np.where(PBC, (reach / width).astype(int) + 1, 0)
-    else:
-        home, most = np.zeros(x.shape, int), np.zeros(3, int)
-    found = {}
-    for vector in itertools.product(*(range(-m, m + 1) for m in most)):
-        for i in range(len(x)):
-            shift = np.array(vector) + home[i:] - home[i]
-            apart = np.sqrt(((x[i:] - x[i] + shift @ box) ** 2).sum(axis=1))
-            for k in np.flatnonzero(apart <= reach):
-                if k or vector > (0, 0, 0):
-                    found[i, i + int(k), tuple(int(s) for s in shift[k])] = float(apart[k])
-    return found
-
-
-def check(step, x, cell, given):
-    """Compares what the list gave with brute force; returns whether it is right."""
-    try:
-        answer = read(given)
-    except Malformed as error:
-        print(f"step {step}: {error}")
-        return False
-    scale = np.abs(x).max(initial=0.0) + np.abs(np.where(PBC[:, None], cell, 0.0)).sum() + R_CUT
-    close = TOLERANCE * scale
-    right = right_pairs(x, cell, REACH + close)
-    box = np.where(PBC[:, None], cell, 0.0)
-    i, j = answer.i, answer.j
-    bad = [f"row {n}: ({a}, {b}) with {len(x)} atoms" for n, (a, b) in enumerate(zip(i, j))
-           if not (0 <= a < len(x) and 0 <= b < len(x))]
-    shift, told, vector = answer.shift, answer.distance, answer.vector
-    if told is None and shift is None and vector is not None:
-        told = np.linalg.norm(vector, axis=1)
-    lengths = collections.defaultdict(list)
-    for (a, b, _), apart in right.items():
-        lengths[a, b].append(apart)
-    listed = collections.Counter()
-    for n, (a, b) in enumerate(zip(i.tolist(), j.tolist()) if not bad else ()):
-        s = (0, 0, 0) if shift is None else tuple(int(v) for v in SIGN * shift[n])
-        turned = a > b or (a == b and s < (0, 0, 0))
-        key = (b, a, tuple(-v for v in s)) if turned else (a, b, s)
-        listed[key if shift is not None else key[:2]] += 1
-        near = [right[key]] if key in right else [] if shift is not None else lengths[key[:2]]
-        if told is not None and near:
-            off = min(abs(float(told[n]) - apart) for apart in near)
-            if not off <= 2 * close:
-                bad.append(f"{a}-{b}: distance off by {off:.3g}")
-        if vector is not None and shift is not None:
-            off = np.abs(TOWARD * vector[n] - (x[b] - x[a] + np.array(s) @ box)).max()
-            if not off <= 2 * close:
-                bad.append(f"{a}-{b}: vector off by {off:.3g}")
-    times = 2 if FULL else 1
-    needed, allowed = collections.Counter(), collections.Counter()
-    for key, apart in right.items():
-        name = key if shift is not None else key[:2]
-        allowed[name] += times
-        needed[name] += times if apart < R_CUT - close else 0
-    for key in sorted(set(listed) | set(needed)):
-        if listed[key] < needed[key]:
-            nearest = min(d for k, d in right.items() if k[:len(key)] == key)
-            bad.append(f"pair {key}: listed {listed[key]} times, should be {needed[key]}; at {nearest:.9g}")
-        elif listed[key] > allowed[key]:
-            bad.append(f"pair {key}: listed {listed[key]} times, should be at most {allowed[key]}")
-        elif FULL and listed[key] % 2:
-            bad.append(f"pair {key}: listed from one of its atoms only")
-    for line in bad[:10]:
-        print(f"step {step}: {line}")
-    return not bad
-'''
-
-#: A list is asked at each step; a line of what follows is how, for one made anew and for one that is kept.
-_STEPS = """
-fine = True{begin}{earlier}
-for step, (x, cell, fresh, *skin) in enumerate(STEPS):
-    before = x.copy(), cell.copy()
-    {given}
-    if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
-        print(f"step {{step}}: the call wrote to its input")
-        fine = False
-    fine = check(step, *before, given) and fine
-"""
-_ONCE = "given = asked({call}, x, cell, PBC, R_CUT)"
-_KEPT = """if not fresh and held is not None and held[0].shape == x.shape:
-        held[0][...], held[1][...] = x, cell  # atoms are moved where they are, as a program does it
-        x, cell = held
-    held = x, cell
-    anew = fresh and (PBC, R_CUT, *(skin or [SKIN]))
-    given = asked(kept.allocate, x, cell, *anew) if fresh else asked(kept.update, x, cell)"""
-
-#: Calls that come first, whatever they return.
-_EARLIER = """
-for x, cell, *anew in EARLIER:
-    try:
-        {given}
-    except Exception as error:
-        print(f"an earlier call raised {{type(error).__name__}}")"""
-_EARLIER_ONCE = "{call}(x, cell, *anew[:2])"
-_EARLIER_KEPT = "kept.allocate(x, cell, *anew) if anew else kept.update(x, cell)"
-
-_WAITS = 'print("it waits for an answer; Control-C ends it", flush=True)'
-
-_ASKED = '''
-def asked(function, *arguments):
-    """What the list returns."""
-    try:
-        return function(*arguments)
-    except SystemExit as error:
-        print(f"it ends the process: SystemExit: {error}")
-        raise SystemExit("the list is wrong")
-'''
+#: Parts of a script.
+_LINES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def script(
@@ -167,8 +50,9 @@ def script(
     # an exception may quote code, whose strings must not end this one
     title = title.replace("\\", "/").replace('"""', "'''")
     begin = f"\nkept, held = {tested.call}(), None" if tested.kept else ""
-    before = _EARLIER_KEPT if tested.kept else _EARLIER_ONCE.format(call=tested.call)
-    earlier = _EARLIER.format(given=before) if failed.earlier else ""
+    kind = "kept" if tested.kept else "once"
+    before, given = (_LINES[name].format(call=tested.call) for name in (f"earlier_{kind}", kind))
+    earlier = "\n" + _LINES["earlier"].format(given=before) if failed.earlier else ""
     text = inspect.getsource(answer)
     parts = [
         '"""' + "\n".join(textwrap.wrap(title, 100)) + f'\n\n{case_words}\n"""',
@@ -176,12 +60,10 @@ def script(
         tested.source.strip() or f"# import {tested.call} here: its lines could not be found",
         _numbers(failed, how, reach),
         text[text.index("from collections.abc") :].strip(),
-        _ASKED.strip(),
-        _BRUTE_FORCE.strip(),
-        *([_WAITS] if worst.code == "NO_ANSWER" else []),
-        _STEPS.strip().format(
-            begin=begin, earlier=earlier, given=_KEPT if tested.kept else _ONCE.format(call=tested.call)
-        ),
+        _LINES["asked"].strip(),
+        _LINES["brute_force"].strip(),
+        *([_LINES["waits"]] if worst.code == "NO_ANSWER" else []),
+        _LINES["steps"].strip().format(begin=begin, earlier=earlier, given=given),
         'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
     ]
     return "\n\n\n".join(parts) + "\n"
@@ -214,7 +96,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
     lines += ["]"] if failed.earlier else []
     cases = (case, *failed.earlier)
     if any(len(still.positions) > _PRINTED for other in cases for still in other.stills):
-        lines.insert(0, "import base64\nimport io\nimport zlib\n\n" + _UNPACK)
+        lines.insert(0, "import base64\nimport io\nimport zlib\n\n" + _LINES["unpack"] + "\n")
     return "\n".join(lines)
 
 
@@ -263,14 +145,6 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
         left = "SystemExit" in text and "it ends the process" in said
         return left or done.returncode < 0 or f"exit code {done.returncode}:" in f"{text}:"
     return done.returncode == 1 and said.rstrip().endswith("the list is wrong")
-
-
-_UNPACK = '''
-def unpacked(text):
-    """An array that would fill pages."""
-    return np.load(io.BytesIO(zlib.decompress(base64.b85decode(text))))
-
-'''.lstrip()
 
 
 def _array(values: np.ndarray) -> str:

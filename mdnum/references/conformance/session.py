@@ -251,7 +251,10 @@ class RemoteSession:
 
     Attributes:
         starts: how many were started.
+        most: seconds that an answer may take, where that is less than usual.
     """
+
+    most = np.inf
 
     def __init__(self, tested: PairList, reuse: bool = False, deadline: Deadline | None = None):
         self.tested, self.reuse, self.starts = tested, reuse, 0
@@ -275,7 +278,8 @@ class RemoteSession:
             except OSError as error:
                 raise _Ended(self._how_it_ended(process)) from error
             # each step has its own time, which ends with its outcome
-            while (outcome := self._receive(process, CALL if case.atoms <= FEW else LONG)) is not None:
+            seconds = min(CALL if case.atoms <= FEW else LONG, self.most)
+            while (outcome := self._receive(process, seconds)) is not None:
                 outcomes.append(outcome)
             return outcomes
         except _Ended as ended:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 TRIES, SECONDS = 600, 8.0
 LEAST_TRIES, PATIENCE = 80, 60.0
 _MOST_IMAGES = 3000
+#: Seconds for a question on the way to a smaller one.
+_TRY = 5.0
 #: How much of the smallest motion a lost pair is followed for.
 _FURTHEST = 2.5
 
@@ -159,24 +161,22 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
             return examiner.failures(case)
         return ()
 
-    session = examiner.session
+    session, report = examiner.session, examiner.report
     # a new process: what the list kept from other questions must not be part of it
     session.close()
-    smaller = deepest(failures, shrunk(failures, failed, deadline))
     if not isinstance(session, RemoteSession):
-        return smaller
-
-    def candidates() -> Iterator[Failed]:
-        if smaller.alone:
-            yield from (smaller, failed)
-        if (needing := _needing(examiner, failed, before, deadline)) is not None:
-            yield needing
-
-    for candidate in candidates():
-        shown = reproduces(examiner.report, candidate, deadline)
-        if shown is not False:
-            return replace(candidate, reproduced=shown)
-    return replace(failed, alone=False, reproduced=False)
+        return deepest(failures, shrunk(failures, failed, deadline))
+    if (shown := reproduces(report, failed, deadline)) is False:
+        needing = _needing(examiner, failed, before, deadline)
+        failed = needing or replace(failed, alone=False)
+        return replace(failed, reproduced=needing is not None and reproduces(report, needing, deadline))
+    failed = replace(failed, reproduced=shown)
+    session.most = _TRY if failed.code != "NO_ANSWER" else np.inf
+    smaller = deepest(failures, shrunk(failures, failed, deadline))
+    session.most = np.inf
+    # where its state made a smaller one fail, the one that was met is shown
+    again = reproduces(report, smaller, deadline) if smaller.alone and smaller is not failed else None
+    return replace(smaller, reproduced=again) if again or not shown else failed
 
 
 def _needing(

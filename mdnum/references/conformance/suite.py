@@ -302,12 +302,13 @@ def examine(
     report.questions, report.breadth = sum(count for count, _ in parts), parts[0][0]
     saved(True)  # a page can be made of the folder from here on
     # where there are failures, some of the time is for them
-    asking, last = deadline.part(_ASKING), max(map(int, answers.cases), default=-1)
+    reserve, last = (1 - _ASKING) * deadline.left, max(map(int, answers.cases), default=-1)
     # what the process was asked so far, and had been before each failure
     history, starts, stopped = [case for case, _ in examiner.opening], session.starts, False
     earlier: dict[tuple[str, str], tuple[Case, ...]] = {}
     for number, case in enumerate(chain.from_iterable(part for _, part in parts)):
-        if number > last and (stopped or deadline.passed or (report.failed and asking.passed)):
+        late = deadline.passed or (report.failed and deadline.left < reserve)
+        if number > last and (stopped or late):
             break
         progress(number, report.questions, {"phase": "asking", "unit": "cases"})
         known = result = answers.of(number, case)
