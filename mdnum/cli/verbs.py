@@ -314,7 +314,7 @@ def conform(
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
     time: float | None = typer.Option(
         None, metavar="MINUTES",
-        help="End by then; what was not asked is reported. Exit code 3: before there was a verdict.",
+        help="Ask nothing more after that; what was not asked is reported. Exit code 3: before a verdict.",
     ),
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Resume the examination in this folder, with its options."
