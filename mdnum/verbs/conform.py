@@ -157,7 +157,10 @@ def conform(
             was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
             remedy = "Begin in a new folder"
             raise InputError(f"was begun with {was}, not {now}", where=str(resume), remedy=remedy)
-        examiner = Examiner(tested, reuse=True, apart=True, deadline=deadline)
+        # scripts of what is known already need its conventions
+        opening = deadline if state is None else Deadline(time and max(time, 0.2))
+        examiner = Examiner(tested, reuse=True, apart=True, deadline=opening)
+        examiner.session.deadline = deadline
         stack.callback(examiner.session.close)
         if (why := examiner.unusable()) is not None:
             calls = "Let allocate and update return" if tested.kept else (

@@ -61,7 +61,7 @@ class CallOutcome:
 class Session:
     """Calls of one list, a kept one through its life; with `reuse` one object is asked in all cases."""
 
-    starts = 0  # of a process
+    starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
