@@ -40,6 +40,12 @@ class Deadline:
         """Seconds that are left; infinite without a limit, never negative."""
         return max(0.0, self._end - time.monotonic())
 
+    def part(self, share: float) -> Deadline:
+        """The moment at which this share of the time that is left is used up."""
+        sooner = Deadline()
+        sooner._end = time.monotonic() + share * self.left
+        return sooner
+
     @property
     def passed(self) -> bool:
         """Whether the time is up."""

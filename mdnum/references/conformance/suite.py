@@ -302,13 +302,13 @@ def examine(
     report.questions, report.breadth = sum(count for count, _ in parts), parts[0][0]
     saved(True)  # a page can be made of the folder from here on
     # where there are failures, some of the time is for them
-    reserve, last = (1 - _ASKING) * deadline.left, max(map(int, answers.cases), default=-1)
+    asking, last = deadline.part(_ASKING), max(map(int, answers.cases), default=-1)
     # what the process was asked so far, and had been before each failure
     history, starts, stopped = [case for case, _ in examiner.opening], session.starts, False
     earlier: dict[tuple[str, str], tuple[Case, ...]] = {}
     for number, case in enumerate(chain.from_iterable(part for _, part in parts)):
-        late = deadline.passed or (report.failed and deadline.left < reserve)
-        if number > last and (stopped or late):
+        session.deadline = asking if report.failed else deadline
+        if number > last and (stopped or session.deadline.passed):
             break
         progress(number, report.questions, {"phase": "asking", "unit": "cases"})
         known = result = answers.of(number, case)
@@ -332,6 +332,7 @@ def examine(
         if not known:
             history.append(case)
         stopped = stop and bool(result.failures)
+    session.deadline = deadline
     with suppress(TimeUp):
         if report.questions and not stopped and not deadline.passed:
             report.keeps_order = _keeps_order(examiner)
