@@ -12,6 +12,10 @@ from mdnum.errors import InputError
 T = TypeVar("T")
 
 
+class TimeUp(Exception):
+    """The deadline passed while something was in progress, which has no result."""
+
+
 class Deadline:
     """The moment at which no more work is begun.
 
@@ -35,6 +39,12 @@ class Deadline:
     def left(self) -> float:
         """Seconds that are left; infinite without a limit, never negative."""
         return max(0.0, self._end - time.monotonic())
+
+    def part(self, share: float) -> Deadline:
+        """The moment at which this share of the time that is left is used up."""
+        sooner = Deadline()
+        sooner._end = time.monotonic() + share * self.left
+        return sooner
 
     @property
     def passed(self) -> bool:

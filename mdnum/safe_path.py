@@ -7,9 +7,14 @@ the processes of Python's multiprocessing inherit from it.
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
+import signal
 import sys
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -30,6 +35,33 @@ def environment(**changes: str) -> dict[str, str]:
     # a checkout may be found by nothing but the folder that this process was started in
     path = os.pathsep.join(filter(None, [str(home), os.environ.get("PYTHONPATH", "")]))
     return {**os.environ, "PYTHONPATH": path, **changes}
+
+
+def guard(parent: int) -> None:
+    """Ends this process with the one that started it, however that ends; it may use half of the memory.
+
+    Where a foreign function loops and the system is not Linux, it ends when that function returns.
+
+    Args:
+        parent: process number of the one that started it.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    threading.Thread(target=watch, daemon=True).start()
+    # control-C at a terminal reaches both, and who started it decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        # a grid of cells over a huge box is a MemoryError, not a machine that swaps
+        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        resource.setrlimit(resource.RLIMIT_DATA, (have // 2, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:

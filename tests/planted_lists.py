@@ -482,6 +482,130 @@ RULE_DEFECTS = {
     "two percent late": lambda moved, room: _length(moved).max() > 1.02 * room,
 }  # fmt: skip
 
+
+def _largest(moved, place):
+    """The length of the displacement at a place among the largest, from 1."""
+    return np.sort(_length(moved))[-min(place, len(moved))]
+
+
+def _in_halves(moved, halves):
+    return sum(_length(half).max(initial=0.0) for half in halves(moved))
+
+
+#: Rebuild tests that are right for few atoms, for two that move alike and for one that moves alone, and let a
+#: pair through that shares the motion in another way among hundreds of atoms, or lies in a place of its own.
+CROWD_RULE_DEFECTS = {
+    # how two share it
+    "one by two thirds of the skin, or two by a third": lambda moved, room: (
+        _largest(moved, 1) > 1.4 * room or (len(moved) > 1 and _largest(moved, 2) > 0.7 * room)
+    ),
+    "one by nine tenths of the skin, or two by half": lambda moved, room: (
+        _largest(moved, 1) > 1.8 * room or (len(moved) > 1 and _largest(moved, 2) > 0.95 * room)
+    ),
+    "the furthest and the mean of the others": lambda moved, room: (
+        _largest(moved, 1) + np.sort(_length(moved))[:-1].mean() if len(moved) > 2 else _length(moved).sum()
+    ) > 2 * room,
+    "the furthest even atom and the furthest odd one": lambda moved, room: _in_halves(
+        moved, lambda moved: (moved[::2], moved[1::2])
+    ) > 2 * room,
+    "the furthest of each half": lambda moved, room: _in_halves(
+        moved, lambda moved: np.array_split(moved, 2)
+    ) > 2 * room,
+    # a share of the atoms ignored
+    "one in a hundred may go further": lambda moved, room: _largest(moved, 1 + len(moved) // 100) > room,
+    "two of hundreds may go further": lambda moved, room: _largest(moved, 3 if len(moved) > 99 else 1) > room,
+    "one in five hundred may go further": lambda moved, room: (
+        _largest(moved, 1 + len(moved) // 500) > room / 1.01 or _largest(moved, 1) > 2 * room
+    ),
+    "the 99th percentile": lambda moved, room: np.percentile(_length(moved), 99) > room,
+    "the 99.9th percentile": lambda moved, room: np.percentile(_length(moved), 99.9) > room,
+    "the median": lambda moved, room: (
+        2 * np.median(_length(moved)) > room if len(moved) > 99 else _largest(moved, 1) > room
+    ),
+    "five times the root mean square": lambda moved, room: (
+        5 * np.sqrt((moved**2).sum(axis=1).mean()) > room or (len(moved) < 50 and _largest(moved, 1) > room)
+    ),
+    "four standard deviations": lambda moved, room: (
+        _length(moved).mean() + 4 * _length(moved).std() if len(moved) > 99 else _largest(moved, 1)
+    ) > room,
+    "what lies within ten standard deviations": lambda moved, room: _length(
+        moved[_length(moved) <= _length(moved).mean() + 10 * _length(moved).std() + 1e-12]
+    ).max() > room,
+    "all but each tenth of a hundred and more": lambda moved, room: _length(
+        moved[np.arange(len(moved)) % 10 != 7] if len(moved) > 99 else moved
+    ).max() > room,
+    "whole blocks of 64": lambda moved, room: _length(
+        moved[: len(moved) // 64 * 64] if len(moved) > 63 else moved
+    ).max() > room,
+    "the first 256": lambda moved, room: _length(moved[:256]).max() > room,
+    "three atoms at least": lambda moved, room: _largest(moved, 3 if len(moved) > 60 else 1) > 0.9 * room,
+    "along x of hundreds": lambda moved, room: (
+        np.abs(moved[:, 0]) if len(moved) > 99 else _length(moved)
+    ).max() > room,
+}  # fmt: skip
+
+#: What is wrong with the rows (i, j, shift) that `update` returns of a list that is right when it is built:
+#: each shows only where several images of a pair, or of an atom itself, are listed.
+UPDATE_DEFECTS = {
+    "own images twice": lambda i, j, shift: _mirrored(i, j, shift, j >= i),
+    "own images once": lambda i, j, shift: _kept_rows(i, j, shift, (i != j) | (shift.sum(axis=1) > 0)),
+    "no own images": lambda i, j, shift: _kept_rows(i, j, shift, i != j),
+    "the nearest images alone": lambda i, j, shift: _kept_rows(
+        i, j, shift, np.abs(shift - shift.min(axis=0, initial=0)).max(axis=1, initial=0) < 3
+    ),
+    "one image of a pair": lambda i, j, shift: _kept_rows(
+        i, j, shift, np.isin(np.arange(len(i)), np.unique(i * 10_000 + j, return_index=True)[1])
+    ),
+    "images of one side": lambda i, j, shift: _mirrored(i, j, shift, (j > i) | (shift[:, 0] > 0)),
+    "shifts that are not turned": lambda i, j, shift: tuple(
+        np.concatenate([part[j >= i], other[j > i]]) for part, other in ((i, j), (j, i), (shift, shift))
+    ),
+}
+
+
+def _kept_rows(i, j, shift, rows):
+    return i[rows], j[rows], shift[rows]
+
+
+def _mirrored(i, j, shift, rows):
+    """Some rows, and the same from their other atoms."""
+    i, j, shift = _kept_rows(i, j, shift, rows)
+    return np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([shift, -shift])
+
+
+def updated(defect, skinless=False):
+    """A class of lists that are kept, right but for what `update` returns.
+
+    Args:
+        defect: a key of `UPDATE_DEFECTS`, or nothing.
+        skinless: it lists what is inside the cutoff, and no pairs of its skin.
+    """
+
+    class KeptWithUpdate(Kept):
+        fresh = True
+
+        def allocate(self, *given):
+            self.fresh = True
+            return super().allocate(*given)
+
+        def update(self, *given):
+            self.fresh = False
+            return super().update(*given)
+
+        def _pairs(self, positions, cell):
+            rows = super()._pairs(positions, cell)
+            i, j, shift = rows["i"], rows["j"], rows["shift"]
+            if skinless:
+                box = np.where(self.pbc[:, None], cell, 0.0)
+                near = _length(positions[j] - positions[i] + shift @ box) < self.r_cut
+                i, j, shift = _kept_rows(i, j, shift, near)
+            if defect and not self.fresh:
+                i, j, shift = UPDATE_DEFECTS[defect](i, j, shift)
+            return {"i": i, "j": j, "shift": shift}
+
+    return KeptWithUpdate
+
+
 #: Tests that lose nothing: what makes them fire differs.
 RULES = {
     "an atom by half of the skin": lambda moved, room: _length(moved).max() > room,

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,6 +20,7 @@ import planted_lists
 import pytest
 from command_line import call, printed
 
+from mdnum.deadline import Deadline
 from mdnum.references.conformance.case import once
 from mdnum.references.conformance.judge import Report
 from mdnum.references.conformance.lists import from_object
@@ -48,6 +54,9 @@ def returns_nothing(positions, cell, pbc, r_cut):
 
 def raises(positions, cell, pbc, r_cut):
     return positions.numpy()
+
+def needs_a_package(positions, cell, pbc, r_cut):
+    import nowhere_to_be_found.deeper
 
 class Half:
     def allocate(self, positions, cell, pbc, r_cut, skin):
@@ -89,7 +98,9 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
     assert {"vesin", "numpy", "jax-md-kept"} <= {line.split()[0] for line in printed(capsys) if line}
     assert call("conform", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["lists"]
-    assert {"list", "version", "kept", "what"} == set(rows[0])
+    assert {"list", "version", "lacks", "kept", "what"} == set(rows[0])
+    for row in rows:
+        assert (row["version"] is None) == (row["list"] in {one["list"] for one in rows if one["lacks"]})
 
 
 @pytest.mark.parametrize(
@@ -110,6 +121,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
         (("mine.py:Short",), ".update(positions) cannot be called with (positions, cell)"),
         (("mine.py:mask",), "ndarray of shape (3, 3), not (i, j)"),
         (("mine.py:returns_nothing",), "it returned None"),
+        (("mine.py:needs_a_package",), "Run python3 -m pip install nowhere_to_be_found"),
         (("mine.py:raises",), "AttributeError: 'numpy.ndarray' object has no attribute 'numpy'"),
         (("mine.py:nearest_image", "--limits", "tilted"), "no limit is called 'tilted'"),
         (("mine.py:nearest_image", "--precision", "double"), "float64, float32"),
@@ -203,16 +215,16 @@ def test_what_fails_only_after_another_goes_below_it():
 def test_time_that_is_up_is_reported():
     """How many of how many were asked; and what was not asked is not called right."""
 
-    class TwoQuestions:
-        left = 3
+    class TwoQuestions(Deadline):
+        more = 3
 
         @property
         def passed(self) -> bool:
-            self.left -= 1
-            return self.left <= 0
+            self.more -= 1
+            return self.more <= 0
 
     cases = [once(f"{n}", "few", _PLACES) for n in range(5)]
-    found = examine(from_object(_leaves, "it"), asked=cases, deadline=cast(Any, TwoQuestions()))
+    found = examine(from_object(_leaves, "it"), asked=cases, deadline=TwoQuestions())
     assert (found.asked, found.left, found.questions) == (2, 3, 5)
     assert "2 of 5 cases" in _verdict(found).headline
 
@@ -354,7 +366,227 @@ def test_an_examination_that_is_killed_is_resumed(mine: Path, capsys: pytest.Cap
     assert scripts and scripts == sorted(path.name for path in (mine / "killed").glob("reproduce-*.py"))
     # nothing is asked again of one that is whole
     assert call("conform", "--resume", "killed", "--no-report", "--time", "1e-6") == 1
-    assert RunFolder.open("killed").summary["asked"] == whole["asked"]
+    resumed = RunFolder.open("killed").summary
+    assert (resumed["asked"], resumed["full"]) == (whole["asked"], whole["full"]) and not resumed["full"]
+
+
+_ROUNDS = """
+import numpy as np
+from planted_lists import Kept, search
+
+def rounds(positions, cell, pbc, r_cut, parts=("i", "j", "shift"), rounded=np.float32):
+    rows = search(positions.astype(rounded).astype(float), cell, pbc, r_cut)
+    return {name: rows[name] for name in parts}
+
+def rounds_and_measures(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance", "vector"))
+
+def rounds_half(positions, cell, pbc, r_cut):
+    rows = rounds(positions, cell, pbc, r_cut)
+    once = rows["i"] < rows["j"]
+    return rows["i"][once], rows["j"][once]
+
+def declared(positions, cell, pbc, r_cut):
+    return rounds_and_measures(positions, cell, pbc, r_cut)
+
+declared.unit = 2.0**-24
+
+def rounds_nothing(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance"), float)
+
+def rounds_too_much(positions, cell, pbc, r_cut):
+    return rounds(positions, cell, pbc, r_cut, ("i", "j", "shift", "distance"), np.float16)
+
+class KeptRounds(Kept):
+    def allocate(self, positions, *rest):
+        return super().allocate(positions.astype(np.float32).astype(float), *rest)
+
+    def update(self, positions, cell):
+        return super().update(positions.astype(np.float32).astype(float), cell)
+
+    def _pairs(self, positions, cell):
+        rows = super()._pairs(positions, cell)
+        i, j, shift = rows["i"], rows["j"], rows["shift"]
+        box = np.where(self.pbc[:, None], cell, 0.0)
+        return i, j, shift, np.linalg.norm(positions[j] - positions[i] + shift @ box, axis=1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "code"),
+    [
+        ("rounds", "", "warning"),
+        ("rounds_and_measures", "", "warning"),
+        ("rounds_half", "minimum-image", "warning"),
+        ("KeptRounds", "all-axes,orthorhombic", "warning"),
+        # it says so; nothing is rounded; half precision is no single one
+        ("declared", "", None),
+        ("rounds_nothing", "", None),
+        ("rounds_too_much", "", "error"),
+    ],
+)
+def test_a_list_that_rounds_positions_to_float32_is_a_warning(mine: Path, name: str, limits: str, code):
+    home = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+    (mine / "rounds.py").write_text(home + _ROUNDS)
+    asked = ["conform", f"rounds.py:{name}", "--cases", "6", "--no-large", "--no-report", "-o", "out"]
+    # the random cases make no difference, and failures need not be small
+    exit_code = call(*asked, *(["--limits", limits] if limits else []), "--time", "3")
+    assert exit_code == (code is not None)
+    found = {one["code"]: one for one in RunFolder.open("out").summary["findings"]}
+    assert {one["severity"] for one in found.values()} == ({code} if code else set()), found
+    if code == "warning":
+        (finding,) = found.values()
+        assert finding["code"] == "SINGLE_PRECISION"
+        assert 1e-9 < finding["values"]["length"] < 2e-6 and 2**16 < finding["values"]["times"] <= 2**29
+
+
+_HANGS = """
+import ctypes, os, signal, time
+from pathlib import Path
+
+from mine import nearest_image
+
+calls = dense = 0
+
+def hangs(positions, cell, pbc, r_cut):
+    if len(positions) == 24:
+        Path("hangs").write_text(str(os.getpid()))
+        while Path("python").exists():
+            pass
+        ctypes.PyDLL(None).sleep(1000)  # no other thread of Python runs meanwhile
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def slow(positions, cell, pbc, r_cut):
+    time.sleep(0.02)
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_at_the_12th(positions, cell, pbc, r_cut):
+    global calls
+    calls += 1
+    if calls == 12:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_after_a_crowd(positions, cell, pbc, r_cut):
+    global dense
+    dense, after = len(positions) > 40, dense
+    if after:
+        os.abort()
+    return nearest_image(positions, cell, pbc, r_cut)
+
+def ends_by_chance(positions, cell, pbc, r_cut):
+    global calls
+    calls += 1
+    if calls == 9 and Path("armed").exists():
+        Path("armed").unlink()
+        os.abort()
+    return nearest_image(positions, cell, pbc, r_cut)
+
+class EndsAtAnUpdate:
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        self.rest, self.updates = (pbc, r_cut), 0
+        return self.update(positions, cell)
+
+    def update(self, positions, cell):
+        self.updates += 1
+        if self.updates == 5 and len(positions) == 2:
+            os.abort()
+        return nearest_image(positions, cell, *self.rest)
+"""
+_LIMITED = ["--no-large", "--limits", "minimum-image,orthorhombic,all-axes"]
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("how", ["python", "foreign"])
+@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.Signals, how: str):
+    """And what it answered until then has a page, which can be written afterward where nothing else can."""
+    (mine / "hangs.py").write_text(_HANGS)
+    (mine / how).touch()
+    command = [sys.executable, "-m", "mdnum", "conform", "hangs.py:hangs", *_LIMITED, "-o", "out"]
+    asking = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        _wait_for(lambda: (mine / "hangs").exists() and (mine / "hangs").read_text())
+        child = int((mine / "hangs").read_text())
+        assert _is_alive(child)
+        asking.send_signal(by)
+        out, err = asking.communicate(timeout=60)
+        _wait_for(lambda: not _is_alive(child))
+    finally:
+        asking.kill()
+        with suppress(OSError, ValueError):
+            os.kill(int((mine / "hangs").read_text()), signal.SIGKILL)
+    assert asking.returncode == (-9 if by == signal.SIGKILL else 130), err
+    page = mine / "out" / "report.html"
+    assert page.exists() == (by != signal.SIGKILL)
+    assert call("report", "out") == 0 and "Right" in page.read_text()
+    summary = RunFolder.open("out").summary
+    assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
+    if by != signal.SIGKILL:
+        assert summary["asked"] >= 5 and "resumes it" in summary["verdict"] and "right pairs" in out
+
+
+def _wait_for(condition: Callable[[], Any]) -> None:
+    began = monotonic()
+    while not condition():
+        assert monotonic() < began + 60
+        sleep(0.05)
+
+
+@pytest.mark.parametrize(("name", "code", "status"), [("hangs", 3, "undecided"), ("slow", 0, "partial")])
+def test_time_that_is_up_ends_it(mine: Path, name: str, code: int, status: str):
+    """A call in progress, too; few questions about each area come first and are a verdict."""
+    (mine / "hangs.py").write_text(_HANGS)
+    asked = ("conform", f"hangs.py:{name}", *_LIMITED, "--cases", "4000", "--time", "0.15", "-o", "out")
+    began = monotonic()
+    assert call(*asked) == code
+    # nine seconds, the page, and what a busy machine adds; a call alone may take 45 s
+    assert monotonic() - began < 40
+    summary = RunFolder.open("out").summary
+    assert summary["status"] == status and summary["left"] > 500
+    assert ("no verdict yet" in summary["headline"]) == (status == "undecided")
+    assert (mine / "out" / "report.html").exists()
+    areas = {row["area"]: row["asked"] + row["skipped"] for row in summary["areas"]}
+    if status == "partial":
+        assert {"few", "boxes", "axes", "images", "outside", "ties", "coincident", "crowded", "reuse"} <= set(
+            areas
+        )
+        assert min(areas.values()) >= 5
+
+
+@pytest.mark.parametrize(
+    ("name", "calls", "reproduced"),
+    [
+        ("ends_at_the_12th", 11, True),
+        ("ends_after_a_crowd", 1, True),
+        ("EndsAtAnUpdate", 0, True),
+        ("ends_by_chance", 0, False),
+    ],
+)
+def test_a_script_is_run_before_it_is_named(mine: Path, name: str, calls: int, reproduced: bool):
+    """It makes the earlier calls that it needs; what shows nothing is said to show nothing."""
+    (mine / "hangs.py").write_text(_HANGS)
+    (mine / "armed").touch()
+    assert call("conform", f"hangs.py:{name}", *_LIMITED, "--cases", "0", "-o", "out") == 1
+    summary = RunFolder.open("out").summary
+    (failure,) = summary["failures"]
+    assert (failure["code"], failure["earlier"], failure["reproduced"]) == ("CRASHED", calls, reproduced)
+    (finding,) = (one for one in summary["findings"] if one["code"] == "CRASHED")
+    assert (f"Reproduced by {failure['script']}" in finding["text"]) == reproduced
+    assert ("could not be reproduced" in finding["text"]) == (not reproduced)
+    script = mine / "out" / failure["script"]
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert (done.returncode < 0) == reproduced and ("the list is right" in done.stdout) == (not reproduced)
+    if name == "EndsAtAnUpdate":
+        assert failure["steps"] == 5
 
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"word": 1, "tested": 2, "options": 3}', "\0{"])

@@ -314,7 +314,7 @@ def conform(
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
     time: float | None = typer.Option(
         None, metavar="MINUTES",
-        help="End by then; what was not asked is reported. Exit code 3: before there was a verdict.",
+        help="Ask nothing more after that; what was not asked is reported. Exit code 3: before a verdict.",
     ),
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Resume the examination in this folder, with its options."
@@ -347,12 +347,18 @@ def _lists(as_json: bool) -> int:
     from mdnum.references.conformance.peers import known
 
     rows = [
-        {"list": one.name, "version": one.version, "kept": one.kept, "what": one.description}
+        {
+            "list": one.name, "version": one.version, "lacks": one.lacks, "kept": one.kept,
+            "what": one.description,
+        }
         for one in known()
-    ]
+    ]  # fmt: skip
     if as_json:
         return output.print_json({"lists": rows})
-    lines = [(row["list"], row["version"] or "not installed", row["what"]) for row in rows]
+    lines = [
+        (row["list"], f"install {' '.join(row['lacks'])}" if row["lacks"] else row["version"], row["what"])
+        for row in rows
+    ]
     output.print_table("neighbor lists that have a name here", ("list", "version", "what"), lines)
     output.say("\nYour own: mdnum conform package.module:function, or file.py:function.")
     output.say("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")

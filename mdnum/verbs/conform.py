@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 TEXTS = Texts(__file__)
 #: Roundoff by the name of the precision.
 PRECISIONS = {"float64": DOUBLE, "float32": SINGLE}
-#: Random cases that can be asked for: they are drawn before the first is asked, some 300 a second.
+#: Random cases that can be asked for.
 MOST_CASES = 100_000
+#: Times the rounding of float64 below which an error is no sign of float32.
+_SLIGHT = 2.0**16
 #: Areas of a list that is kept and brought up to date.
 _IN_USE = ("motion", "wrapping", "strain", "rule")
 _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
@@ -115,19 +117,21 @@ def conform(
         precision: of its arithmetic, "float64" or "float32"; found out by default.
         superset: pairs beyond the cutoff may be listed.
         limits: what it does not claim to do, words of `LIMITS`: such cases are not asked.
-        time: minutes, after which no case is begun and no failure shrunk.
+        time: minutes, after which nothing is asked and no failure is reproduced.
         out: the new folder; default runs/conform-<name>-<n>.
         resume: a folder to resume instead, with the options that it was begun with.
         report: write report.html.
         progress: called now and then with cases done, cases and a dictionary of words.
 
     Returns:
-        the outcome; its result is the `references.conformance.Report`.
+        the outcome; its result is the `references.conformance.Report`. Status "partial" in its summary: time
+        was up after `BREADTH` cases of each area, "undecided": before.
 
     Raises:
         InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs; or
             it is not the one that a folder was begun with.
         FolderError: the folder cannot be used.
+        Interrupted: by control-C or SIGTERM; what was answered is in the folder, with its page.
     """
     from mdnum.references.conformance.lists import from_object
     from mdnum.references.conformance.peers import load
@@ -135,6 +139,7 @@ def conform(
 
     deadline = Deadline(time)
     with ExitStack() as stack:
+        frame.end_on_sigterm(stack)
         folder = state = None
         if resume is not None:
             folder = answers.take(resume, "conform")
@@ -152,13 +157,18 @@ def conform(
             was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
             remedy = "Begin in a new folder"
             raise InputError(f"was begun with {was}, not {now}", where=str(resume), remedy=remedy)
-        examiner = Examiner(tested, reuse=True, apart=True)
+        # scripts of what is known already need its conventions
+        opening = deadline if state is None else Deadline(time and max(time, 0.2))
+        examiner = Examiner(tested, reuse=True, apart=True, deadline=opening)
+        examiner.session.deadline = deadline
         stack.callback(examiner.session.close)
         if (why := examiner.unusable()) is not None:
             calls = "Let allocate and update return" if tested.kept else (
                 "Give a function of (positions, cell, pbc, r_cut) that returns"
             )  # fmt: skip
-            raise InputError(why, where=tested.name, remedy=f"{calls} {_RETURNS}")
+            lacks = re.search(r"No module named '(\w+)", why)
+            install = f"Run python3 -m pip install {lacks[1]}, or what else provides it" if lacks else ""
+            raise InputError(why, where=tested.name, remedy=install or f"{calls} {_RETURNS}")
         if folder is None:
             slug = f"conform-{tested.name.replace(':', '-')}"
             folder = stack.enter_context(frame.new_folder("conform", slug, out))
@@ -178,22 +188,32 @@ def conform(
                 stopped = _summary(found, _write_scripts(folder, found), state.options.seed)
                 folder.write_summary(stopped | {"status": "stopped"})
                 # most of the time is for asking
-                due = monotonic() + max(10.0, 20 * (monotonic() - now))
+                due = monotonic() + max(1.0, 20 * (monotonic() - now))
 
-        examine(
-            tested, cases=options.cases, seed=options.seed, large=options.large, apart=True, saved=saved,
-            progress=frame.logged(folder, progress), examiner=examiner, deadline=deadline, answers=state,
-        )  # fmt: skip
+        interrupted = False
+        try:
+            examine(
+                tested, cases=options.cases, seed=options.seed, large=options.large, apart=True, saved=saved,
+                progress=frame.logged(folder, progress), examiner=examiner, deadline=deadline, answers=state,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            interrupted = True
+            examiner.session.close()
         kept.save()
         found.seconds = state.seconds
         summary = _summary(found, _write_scripts(folder, found), options.seed)
+        if interrupted:
+            summary |= {"status": "stopped", "interrupted": True}
         names = ("area", "asked", "passed", "failed", "refused", "skipped")
         tables = {"areas": _columns(summary["areas"], names)}
         if found.failed:
             names = ("code", "area", "case", "atoms", "steps", "step", "text", "script")
             tables["failures"] = _columns(summary["failures"], names)
         frame.store(folder, summary, tables)
-        return frame.finish(folder, report=report, result=found, progress=progress)
+        outcome = frame.finish(folder, report=report, result=found, progress=progress)
+        if interrupted:
+            raise frame.Interrupted(outcome)
+        return outcome
 
 
 def _columns(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -243,6 +263,7 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
         "shift_sign": found.how.sign,
         "precision": "float64" if found.how.unit == DOUBLE else "float32",
         "single": found.single and found.single.name,
+        "error": dict(zip(("length", "times"), found.error, strict=True)),
         "ties": dict(zip(("counted", "not_counted"), found.ties, strict=True)),
         "refusals": [
             {
@@ -265,14 +286,17 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
             {
                 "code": one.code, "area": one.case.area, "case": one.case.name, "atoms": one.case.atoms,
                 "steps": one.case.steps, "step": one.worst.step, "text": one.worst.text, "script": script,
-                "alone": one.alone,
+                "alone": one.alone, "earlier": sum(case.steps for case in one.earlier),
+                "reproduced": one.reproduced,
             }
             for one, script in zip(found.failed, scripts, strict=True)
         ],
         "large": None if found.large is None else dict(zip(("atoms", "seconds"), found.large, strict=True)),
         "seed": seed,
         "findings": [],
-        "status": "stopped" if found.left or not found.whole else "complete",
+        "status": "complete" if not found.left and found.whole
+        else frame.PARTIAL if found.questions - found.left >= found.breadth
+        else frame.UNDECIDED,
     }  # fmt: skip
 
 
@@ -304,11 +328,13 @@ def judge(view: View) -> Verdict:
     )  # fmt: skip
     headline = TEXTS(said, **values)
     if left:
+        few = "too_few" if summary["status"] == frame.UNDECIDED and not wrong else "so_far"
         headline = TEXTS(
-            "so_far", headline=headline, done=summary["questions"] - left, questions=summary["questions"]
+            few, headline=headline, done=summary["questions"] - left, questions=summary["questions"]
         )
     findings = [*_failures(summary), *_conduct(summary, answered)]
-    return conclude(findings, _evidence(view), headline=headline, best="good", judged=True)
+    best = "info" if summary["status"] == frame.UNDECIDED else "good"
+    return conclude(findings, _evidence(view), headline=headline, best=best, judged=True)
 
 
 def _evidence(view: View) -> Iterator[str]:
@@ -318,14 +344,15 @@ def _evidence(view: View) -> Iterator[str]:
         areas = [f"{row['area']} ({count(row['failed'])} of {count(row['asked'])})" for row in worst]
         yield TEXTS("where", areas=listed(areas))
     if summary["failures"]:
-        atoms = min(row["atoms"] for row in summary["failures"])
-        yield TEXTS("scripts", scripts=len(summary["failures"]), atoms=atoms)
+        shown = [row for row in summary["failures"] if row["reproduced"]]
+        if shown:
+            yield TEXTS("scripts", scripts=len(shown), atoms=min(row["atoms"] for row in shown))
     if summary["rule"]["motions"]:
         lost = any(row["failed"] for row in summary["areas"] if row["area"] == "rule")
         how = "stated" if summary["padding_stated"] else "shown" if summary["padding"] else "unknown"
         name = "rule_failed" if lost else f"rule_{how}"
         yield TEXTS(name, **summary["rule"], padding=summary["padding"])
-    if summary["status"] == "stopped":
+    if summary["status"] != "complete":
         yield TEXTS("stopped", folder=view.folder.path.name)
     for name in ("refused", "skipped"):
         if cases := _total(summary, name):
@@ -348,10 +375,12 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
         values |= {"cases": _cases(summary, code), "text": first["text"].rstrip(". ")}
         everywhere = len(areas) == asked > 2
         values["areas"] = "every area" if everywhere else listed(areas)
-        seen = TEXTS("failure", **values)
+        shown = {True: "reproduced", False: "not_reproduced", None: "not_run"}[first["reproduced"]]
+        seen = f"{TEXTS('failure', **values)} {TEXTS(shown, **values)}"
         cause = ""
+        if first["earlier"]:
+            seen += f" {TEXTS('earlier', calls=first['earlier'])}"
         if not first["alone"]:
-            seen += f" {TEXTS('not_alone')}"
             as_bad = (one for one in causes if severity[one] in ("error", severity[code]))
             cause = next(as_bad, "")
         if code in summary["known"]:
@@ -370,7 +399,8 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)
     if "float32" in summary["found_out"]:
-        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"])
+        slight = ["slight"] * (summary["error"]["times"] < _SLIGHT)
+        yield TEXTS.finding("SINGLE_PRECISION", *slight, case=summary["single"], **summary["error"])
     if summary["keeps_order"] is False:
         yield TEXTS.finding("ORDER")
     if summary["aliased"] is not None:
@@ -421,8 +451,12 @@ def page(view: View, verdict: Verdict) -> Page:
         Section("What was run", [pairs(list(_what(summary, package)))]),
     ]
     if summary["failures"]:
-        rows = [(row["script"], row["atoms"], row["steps"], row["text"]) for row in summary["failures"]]
-        table = Table(("script", "atoms", "steps", "what is wrong"), rows)
+        words = {True: "yes", False: "no", None: "not run"}
+        rows = [
+            (row["script"], words[row["reproduced"]], row["atoms"], row["steps"], row["text"])
+            for row in summary["failures"]
+        ]
+        table = Table(("script", "reproduces it", "atoms", "steps", "what is wrong"), rows)
         # a name of a file, wherever else the table would have it
         codes = [
             Code(
@@ -432,7 +466,7 @@ def page(view: View, verdict: Verdict) -> Page:
             for row in summary["failures"]
         ]  # fmt: skip
         sections.insert(
-            1, Section("Failures, reproduced", [TEXTS("reproduced"), table, *codes], terminal=True)
+            1, Section("Failures, reproduced", [TEXTS("brought_down"), table, *codes], terminal=True)
         )
     about = ", ".join(filter(None, [summary["about"] or "A neighbor list", package]))
     return view.page(f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections)

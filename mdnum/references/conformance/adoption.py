@@ -59,7 +59,7 @@ class NeighborListConformance:
     def asked(self, tested: PairList, area: str) -> list[Case]:
         """The cases of one area."""
         if area == "large":
-            return list(questions.large()) if self.large else []
+            return list(questions.lattices()) if self.large else []
         count = self.cases if area == "random" else 0
         padding = Examiner(tested).report.padding if area == "rule" and tested.kept else None
         every = questions.questions(replace(tested, affords=1.0), count, self.seed, padding)

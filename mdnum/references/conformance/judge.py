@@ -311,6 +311,17 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
     return found
 
 
+def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
+    """The error of an answer that is right for a list in float32, as in `CaseResult.single`; None of another.
+
+    Args:
+        truth: for that precision.
+    """
+    units = 2.0 ** np.arange(-52, -23)
+    unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
+    return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
+
+
 def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
     """Whether an answer has distances or vectors, and they are as good as the conventions say."""
     given = answer.distance is not None or answer.vector is not None
@@ -344,7 +355,9 @@ class CaseResult:
     refused: tuple[Count, str] | None = None  # the step and the exception by which the list refused it
     ties: tuple[Count, Count] = (0, 0)  # pairs at exactly r_cut (counted, not counted)
     aliased: bool = False  # a call wrote to the arrays of the answer before it
-    single: bool = False  # it was decided as float32 does and float64 would not
+    # where it was decided as float32 does and float64 would not: the error that it shows, length, within a
+    # factor of 2; and how many times that of float64 it is
+    single: tuple[Seconds, Seconds] | None = None
     seconds: Seconds = 0.0  # that the list took
 
 
@@ -356,6 +369,8 @@ class Failed:
     failures: tuple[Failure, ...]  # what was wrong at that step
     # it fails when it is the first that a new process is asked; else what was asked before matters
     alone: bool = True
+    earlier: tuple[Case, ...] = ()  # questions that a new process must be asked before it fails
+    reproduced: bool | None = None  # whether its script showed it when it was run; None where it was not run
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
@@ -444,8 +459,9 @@ class Report:
     tested: PairList  # the list
     how: Conventions = field(default_factory=Conventions)  # its conventions, as declared or found out
     found_out: list[str] = field(default_factory=list)  # which of them were found out rather than declared
-    # a case that it decides as float32 does and float64 would not, where that was found out
+    # a case that it decides as float32 does and float64 would not, where that was found out; and its error
     single: Case | None = None
+    error: tuple[float, float] = (0.0, 1.0)  # as in `CaseResult.single`
     ties: tuple[int, int] = (0, 0)  # (counted, not counted) pairs at exactly r_cut
     keeps_order: bool | None = None  # whether the same question gives the same rows in the same order
     superset: bool = False  # pairs beyond the cutoff are part of what it gives
@@ -463,6 +479,7 @@ class Report:
     seconds: float = 0.0  # in all
     large: tuple[int, float] | None = None  # (atoms, seconds) of its largest question
     questions: int = 0  # cases that there are, those that it does not claim to do included
+    breadth: int = 0  # of them, those at the beginning without which there is no verdict
     motions: int = 0  # against its rebuild rule, that it was asked; and calls: of it in those
     calls: int = 0
     whole: bool = True  # all failures were shrunk as far as they are
@@ -483,6 +500,7 @@ class Report:
         if result.single and self.single is None:
             # from here on it is taken for a list in float32
             self.how, self.single = replace(self.how, unit=SINGLE), case.until(1)
+            self.error = result.single
             self.found_out.append("float32")
         if case.area == "large":
             self.large = (case.atoms, result.seconds)

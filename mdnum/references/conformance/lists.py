@@ -131,6 +131,13 @@ class ListLimits:
 LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(ListLimits) if limit.default is False}
 
 
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 @dataclass(frozen=True)
 class PairList:
     """A neighbor list under test."""
@@ -139,6 +146,7 @@ class PairList:
     make: Callable[[], Any]  # gives a function of (positions, cell, pbc, r_cut), or a `KeptList`
     kept: bool = False  # whether it is a `KeptList`
     package: str | None = None  # distribution whose version counts
+    needs: tuple[str, ...] = ()  # other distributions that calling it takes
     full: bool | None = None  # every pair from both atoms, or once; None to find out
     unit: float | None = None  # roundoff of its arithmetic; None to find out
     # pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept
@@ -156,10 +164,13 @@ class PairList:
     @property
     def version(self) -> str | None:
         """Installed version of its package, or None."""
-        try:
-            return None if self.package is None else metadata.version(self.package)
-        except metadata.PackageNotFoundError:
-            return None
+        return None if self.package is None else _version(self.package)
+
+    @property
+    def lacks(self) -> list[str]:
+        """Distributions that it needs and that are not installed."""
+        needed = (*((self.package,) if self.package else ()), *self.needs)
+        return [name for name in needed if _version(name) is None]
 
     def with_options(self, **options: Any) -> PairList:
         """The same with other declarations; None leaves one as it is."""

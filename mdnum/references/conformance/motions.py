@@ -4,8 +4,9 @@ A pair that was beyond r_cut + padding when the list was built is inside the cut
 come closer by the padding, and no motion that takes it there is smaller than the straight one. A rule that
 asks whether two atoms could have used up the padding rebuilds before that, whichever way they went, however
 they shared it and whatever the others did. So each of `motions` closes a pair by the padding and a hair:
-along axes, diagonals and no axis; by both atoms or one; alone, among atoms at rest, among others that do the
-same or in a common drift; at once, creeping, and back and forth.
+along axes, diagonals and no axis; by both atoms or one, or shared in any proportion; alone, among atoms at
+rest, among hundreds that move little, among others that do the same or in a common drift; at once, creeping,
+and back and forth.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray
 
-from mdnum.references.conformance.case import Case, gas, grid, sequence
+from mdnum.references.conformance.case import Case, gas, grid, matrix, sequence
 
 _R, _SKIN, _L = 1.0, 0.3, 6.0
 #: What a pair starts beyond the padding and ends inside the cutoff by, in paddings.
@@ -27,11 +28,14 @@ _RUNGS = np.geomspace(0.25, 3.0, 20)
 _BEYOND = int((_RUNGS >= 1).sum())  # of a list that has the padding it is taken to have
 #: What the atom of a pair that is named first does of the motion.
 _SHARES = (0.5, 1.0, 0.0, 0.3, 0.7)
+#: A pair among how many, and how far the others move meanwhile, in paddings.
+_AMONG = ((42, 0.0), (300, 0.0), (300, 0.01), (300, 0.04), (1_200, 0.01))
+_GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 
 def movers() -> Iterator[Case]:
     """Scripts for a list that is kept, the short ones first."""
-    for area in (_pairs, _many, _wrapping, _strain, _reuse):
+    for area in (_pairs, _many, _wrapping, _strain, _narrow, _reuse):
         yield from area()
 
 
@@ -156,6 +160,30 @@ def _strain() -> Iterator[Case]:
     yield sequence("the box shrinks below two cutoffs", "strain", path, 2.3)
 
 
+def _narrow() -> Iterator[Case]:
+    """Boxes in which a pair has several images within the cutoff, and an atom is near its own."""
+    skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
+    for word, count, cell, pbc in (
+        ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
+        ("edges of 0.9 cutoffs", 2, 0.9, True),
+        ("edges of 0.6 cutoffs", 2, 0.6, True),
+        ("one edge of 0.7 cutoffs", 5, [0.7, 3.0, 3.0], True),
+        ("a small skewed box", 3, skewed, True),
+        ("a small slab", 3, skewed, (True, True, False)),
+        ("a thin wire", 3, [3.0, 3.0, 0.45], (False, False, True)),
+    ):
+        cell = matrix(cell)
+        start, speeds = gas(count, cell, 104), 0.016 * np.random.default_rng(105).normal(size=(count, 3))
+        # some steps within the skin, and some that use it up
+        path = [start + k * speeds for k in (0, 1, 2, 12, 13, 40)]
+        yield sequence(f"atoms move, {word}", "motion", path, cell, pbc=pbc)
+        home = [np.where(pbc, -np.floor(np.linalg.solve(cell.T, x.T).T), 0.0) @ cell for x in path]
+        moved = [x + shift for x, shift in zip(path, home, strict=True)]
+        yield sequence(f"atoms move and are wrapped, {word}", "wrapping", moved, cell, pbc=pbc)
+        scaled = [(start * f, cell * f) for f in (1.0, 0.999, 0.96, 0.8, 1.1, 1.1)]
+        yield sequence(f"the box breathes, {word}", "strain", scaled, cell, pbc=pbc)
+
+
 def _reuse() -> Iterator[Case]:
     start, other = gas(40, _L, 110), gas(40, _L, 111)
     dense = 3.0 + 0.2 * gas(40, _L, 112, -1.0, 1.0)
@@ -209,15 +237,21 @@ def motions(padding: float | None = None) -> Iterator[Case]:
     back = (0.0, 0.45, -0.45, 0.9, -0.9, 1.0)
     paths = (_walk(room, way, 0.5, edge, n, back) for n, way in some)
     yield _sequence("pairs that go back and forth, then together", paths, edge)
-    for share in (0.5, 1.0):
-        words = f"a pair among 40 atoms at rest, {share:.0%} by its first atom"
-        yield _sequence(words, (_among(room, way, share, edge, n) for n, way in numbered), edge)
+    for k, (count, little) in enumerate(_AMONG):
+        wide = edge * max(1.0, (count / 42) ** (1 / 3))
+        which = numbered if count < 1_000 else numbered[4:12:4]
+        paths = (_among(room, way, wide, len(ways) * k + n, count, little) for n, way in which)
+        how = f"that move by {little} paddings" if little else "at rest"
+        yield _sequence(f"a pair shares the motion in all proportions, {count} atoms {how}", paths, wide)
     paths = (_adrift(room, way, edge, n) for n, way in numbered)
     yield _sequence("a pair comes together while all atoms drift", paths, edge)
     for share in (0.5, 0.3):
         words = f"twelve pairs at once, {share:.0%} by their first atoms"
         yield _sequence(words, (_dozen(room, way, share, n) for n, way in enumerate(ways[::2])), 12.0)
     yield _in_turn(room, ways)
+    for cell, word in ((np.eye(3) * 0.9, "edges of 0.9"), (np.diag([0.7, edge, edge]), "one edge of 0.7")):
+        paths = (_walk(room, way, _SHARES[n % 5], edge, n) for n, way in numbered)
+        yield _sequence(f"the smallest motions of a pair, {word} cutoffs", paths, cell)
     leaning = edge * np.array([[1.0, 0, 0], [0.45, 1.0, 0], [-0.35, 0.4, 1.0]])
     for cell, word in ((leaning, "a skewed box"), (np.diag([4 * edge, edge, edge]), "a long box")):
         along = [*ways, *(row / np.linalg.norm(row) for row in cell)]
@@ -261,11 +295,20 @@ def _walk(
     return [start + part * moves for part in closed]
 
 
-def _among(room: float, way: ndarray, share: float, edge: float, n: int) -> list[ndarray]:
-    """Two atoms that come together, wherever they are in the file, and 40 at rest."""
-    first, second = (n * 11) % 42, (n * 17 + 23) % 42
-    second = (second + 1) % 42 if second == first else second
-    return _with(gas(42, edge, 160 + n), [first, second], _walk(room, way, share, edge, n))
+def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
+    """Two atoms of many come together, and the others rest or move little; each time they share it otherwise.
+
+    Places in the file of what moves most are spread evenly over it, those of its partner at random.
+    """
+    rng = np.random.default_rng(170 + n)
+    most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
+    other = (most + int(rng.integers(1, count))) % count
+    share = min(1.0, 0.5 + 0.52 * (n * _GOLDEN % 1.0))  # now and then one atom does it all
+    start, end = _with(gas(count, edge, 190 + n), [most, other], _walk(room, way, share, edge, n))
+    others = rng.normal(size=start.shape)
+    others *= little * room / np.linalg.norm(others, axis=1)[:, None]
+    others[[most, other]] = 0.0
+    return [start, end + others]
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:

@@ -228,20 +228,25 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-@peer("nvalchemi-ops", "nvalchemi-toolkit-ops", affords=0.3, limits=ListLimits(whole_cell=True))
-def nvalchemi_pairs(positions, cell, pbc, r_cut):
+@peer(
+    "nvalchemi-ops",
+    "nvalchemi-toolkit-ops",
+    needs=("torch",),
+    affords=0.3,
+    limits=ListLimits(whole_cell=True),
+)
+def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
     """nvalchemi-ops' cell_list."""
 
     import torch  # type: ignore
-    from nvalchemiops.torch.neighbors import cell_list  # type: ignore
+    from nvalchemiops.torch.neighbors import NeighborOverflowError, cell_list  # type: ignore
 
-    pairs, _, shift = cell_list(
-        torch.as_tensor(positions),
-        float(r_cut),
-        torch.as_tensor(cell)[None],
-        torch.as_tensor(pbc)[None],
-        return_neighbor_list=True,
-    )
+    asked = torch.as_tensor(positions), float(r_cut), torch.as_tensor(cell)[None], torch.as_tensor(pbc)[None]
+    try:
+        # its own estimate is for a unit of length (0.2 atoms in a cubic Angstrom)
+        pairs, _, shift = cell_list(*asked, max_neighbors=room, return_neighbor_list=True)
+    except NeighborOverflowError as error:
+        return nvalchemi_pairs(positions, cell, pbc, r_cut, max(2 * room, error.num_neighbors))
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
@@ -374,7 +379,7 @@ def known() -> tuple[PairList, ...]:
 
 def installed() -> tuple[PairList, ...]:
     """Those whose packages are there."""
-    return tuple(listed for listed in known() if listed.version is not None)
+    return tuple(listed for listed in known() if not listed.lacks)
 
 
 def load(word: str) -> PairList:
@@ -392,9 +397,11 @@ def load(word: str) -> PairList:
     by_name = {listed.name: listed for listed in known()}
     if word in by_name:
         listed = by_name[word]
-        if listed.version is None:
-            message = f"{word} needs {listed.package}, which is not installed"
-            raise InputError(message, remedy=f"Run python3 -m pip install {listed.package}")
+        if lacks := listed.lacks:
+            message = (
+                f"{word} needs {' and '.join(lacks)}, which {'are' if lacks[1:] else 'is'} not installed"
+            )
+            raise InputError(message, remedy=f"Run python3 -m pip install {' '.join(lacks)}")
         return listed
     where = place(word)
     if where is None:

@@ -6,6 +6,7 @@ cutoffs on and off the shells; `boxes()` gives (cell, pbc, words) alone.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -25,6 +26,11 @@ Named = Iterator[tuple[Any, ...]]
 
 #: Atoms along an edge of the lattices: some 5,000 atoms, and 100,000.
 SMALL_EDGE, LARGE_EDGE = 17, 47
+
+#: Cases of each area that are asked before the others: a verdict rests on these at least.
+BREADTH = 5
+#: Random cases that are drawn together, which takes a second or two.
+_CHUNK = 500
 
 _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
@@ -430,26 +436,51 @@ def _rotation(rng: np.random.Generator) -> ndarray:
     return turned if np.linalg.det(turned) > 0 else turned[[1, 0, 2]]
 
 
-def questions(
-    tested: PairList, count: int, seed: int, padding: float | None = None, far: bool = False
-) -> list[Case]:
-    """The cases that a list is asked, in order, but for those of thousands of atoms (`large`).
+def plan(
+    tested: PairList,
+    count: int,
+    seed: int,
+    padding: float | None = None,
+    *,
+    far: bool = False,
+    large: bool = False,
+) -> list[tuple[int, Iterable[Case]]]:
+    """The cases that a list is asked, in order, by parts: (how many, cases, some of which are made late).
+
+    The first part has `BREADTH` of each area, but for random cases and thousands of atoms.
 
     Args:
         count: random cases.
         seed: of the random cases.
         padding: of a list that is kept, in skins, where it is known; see `motions`.
         far: those, too, that end a process which makes a grid of cells over all space.
+        large: 5,000 and 100,000 atoms, too.
     """
-    asked = [*movers(), *motions(padding)] if tested.kept else []
-    asked += as_kept(tested, catalog())
-    asked += [] if tested.kept else sequences()
-    asked += as_kept(tested, crowds())
-    asked += as_kept(tested, drawn(max(1, round(count * tested.affords)), seed) if count else ())
-    return asked + list(as_kept(tested, vast())) if far else asked
+    named = [*movers(), *motions(padding)] if tested.kept else []
+    named += as_kept(tested, catalog())
+    named += [] if tested.kept else sequences()
+    named += as_kept(tested, crowds())
+    met: Counter[str] = Counter()
+    first, rest = list[Case](), list[Case]()
+    for case in named:
+        (first if met[case.area] < BREADTH else rest).append(case)
+        met[case.area] += 1
+    count = max(1, round(count * tested.affords)) if count else 0
+    chunks = ((min(_CHUNK, count - n), seed + n) for n in range(0, count, _CHUNK))
+    random = (case for chunk in chunks for case in as_kept(tested, drawn(*chunk)))
+    last = list(as_kept(tested, vast())) if far else []
+    parts = [(len(first), first), (len(rest), rest), (count, random), (len(last), last)]
+    return [*parts, (2, lattices())] if large else parts
 
 
-def large() -> Iterator[Case]:
+def questions(
+    tested: PairList, count: int, seed: int, padding: float | None = None, far: bool = False
+) -> list[Case]:
+    """All of `plan`, but for those of thousands of atoms."""
+    return [case for _, part in plan(tested, count, seed, padding, far=far) for case in part]
+
+
+def lattices() -> Iterator[Case]:
     """5,000 and 100,000 atoms."""
     return map(lattice, (SMALL_EDGE, LARGE_EDGE))
 

@@ -25,12 +25,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy import ndarray
 
+from mdnum.deadline import Deadline, TimeUp
 from mdnum.errors import MdnumError
 from mdnum.references.conformance.answer import ListAnswer, Malformed, parts, read
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import PairList
-from mdnum.safe_path import environment, python
+from mdnum.safe_path import environment, guard, python
 
 #: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
 #: They are its own processor time: by the clock nothing comes in time on a machine that has other work to do.
@@ -59,6 +60,8 @@ class CallOutcome:
 
 class Session:
     """Calls of one list, a kept one through its life; with `reuse` one object is asked in all cases."""
+
+    starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
@@ -245,17 +248,28 @@ class RemoteSession:
     """As `Session`, of a list that `load` finds by its word, in another process.
 
     A new one is started after each that ended: a crash is a finding and not an end.
+
+    Attributes:
+        starts: how many were started.
+        most: seconds that an answer may take, where that is less than usual.
     """
 
-    def __init__(self, tested: PairList, reuse: bool = False):
-        self.tested, self.reuse = tested, reuse
+    most = np.inf
+
+    def __init__(self, tested: PairList, reuse: bool = False, deadline: Deadline | None = None):
+        self.tested, self.reuse, self.starts = tested, reuse, 0
+        self.deadline = deadline or Deadline()
         self._process: subprocess.Popen[bytes] | None = None
         # what a library prints is no part of the report; its last words before a crash are
         self._printed: Any = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the session)
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """The outcome at every still, as far as the list goes."""
+        """The outcome at every still, as far as the list goes.
+
+        Raises:
+            TimeUp: the deadline passed meanwhile; the process is ended.
+        """
         outcomes: list[CallOutcome] = []
         try:
             process = self._process or self._start()
@@ -264,7 +278,8 @@ class RemoteSession:
             except OSError as error:
                 raise _Ended(self._how_it_ended(process)) from error
             # each step has its own time, which ends with its outcome
-            while (outcome := self._receive(process, CALL if case.atoms <= FEW else LONG)) is not None:
+            seconds = min(CALL if case.atoms <= FEW else LONG, self.most)
+            while (outcome := self._receive(process, seconds)) is not None:
                 outcomes.append(outcome)
             return outcomes
         except _Ended as ended:
@@ -283,8 +298,9 @@ class RemoteSession:
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._from = self._printed.seek(0, os.SEEK_END)
+        self.starts += 1
         self._process = subprocess.Popen(
-            python("-m", __name__, self.tested.word),
+            python("-m", __name__, self.tested.word, str(os.getpid())),
             env=environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -297,11 +313,15 @@ class RemoteSession:
 
     def _receive(self, process: subprocess.Popen[bytes], seconds: float) -> Any:
         done, late = threading.Event(), list[str]()
-        watch = threading.Thread(target=_watch, args=(process, seconds, done, late), daemon=True)
+        limits = process, seconds, self.deadline, done, late
+        watch = threading.Thread(target=_watch, args=limits, daemon=True)
         watch.start()
         try:
             return _received(process.stdout)
         except EOFError as error:
+            if self.deadline.passed:
+                self.close()
+                raise TimeUp from error
             if late:
                 raise _Ended(Failure("NO_ANSWER", f"no answer within {seconds:.3g} s{late[0]}")) from error
             raise _Ended(self._how_it_ended(process)) from error
@@ -329,16 +349,17 @@ class _Ended(Exception):
         self.failure = failure
 
 
-def _watch(process: Any, seconds: float, done: threading.Event, late: list[str]) -> None:
+def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
     """Ends a process that had its time and did not answer; `late` then has the words for it."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
-    while not done.wait(left):
+    while not done.wait(min(left, deadline.left)):
         elapsed = time.monotonic() - began
         now = _processor_seconds(process.pid)
         spent = elapsed if used is None or now is None else now - used
         waits = spent < _IDLE * elapsed
-        if spent >= seconds or waits or elapsed >= _MOST * seconds:
+        waits = waits and elapsed >= seconds
+        if spent >= seconds or waits or elapsed >= _MOST * seconds or deadline.passed:
             late.append(", in which it computed nothing" if waits else " of processor time")
             process.kill()
             return
@@ -367,27 +388,20 @@ def _received(stream: BinaryIO | Any) -> Any:
         raise EOFError from error
 
 
-def serve(word: str) -> None:
-    """Answers questions on stdin to the list of this word: the other process of a `RemoteSession`."""
+def serve(word: str, parent: int) -> None:
+    """Answers questions on stdin to the list of this word: the process of a `RemoteSession` of another."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
+    guard(parent)
     try:
         tested = load(word)
     except MdnumError as error:
         _send(answers, error)
         return
     _send(answers, "ready")
-    try:
-        import resource
-
-        # a grid of cells over a huge box is a MemoryError, not a machine that swaps
-        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        resource.setrlimit(resource.RLIMIT_DATA, (have // 2, resource.getrlimit(resource.RLIMIT_DATA)[1]))
-    except (ImportError, OSError, ValueError):
-        pass  # not on this system
     sessions: dict[bool, Session] = {}
     while True:
         try:
@@ -407,4 +421,4 @@ if __name__ == "__main__":
     # by its real name, under which outcomes are pickled
     from mdnum.references.conformance import session
 
-    session.serve(sys.argv[1])
+    session.serve(sys.argv[1], int(sys.argv[2]))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from mdnum.deadline import Deadline, fewest
+from mdnum.deadline import Deadline, TimeUp
 from mdnum.references.conformance.answer import ListAnswer
 from mdnum.references.conformance.case import AREAS, Case, gas, once
 from mdnum.references.conformance.judge import (
@@ -26,14 +28,14 @@ from mdnum.references.conformance.judge import (
     Truth,
     judge,
     measures_well,
+    shown_error,
     truth,
     without_numbers,
 )
 from mdnum.references.conformance.lists import PairList
-from mdnum.references.conformance.questions import alike, questions
-from mdnum.references.conformance.questions import large as large_questions
+from mdnum.references.conformance.questions import alike, plan
 from mdnum.references.conformance.session import CallOutcome, RemoteSession, Session
-from mdnum.references.oracle import completed, widths
+from mdnum.references.conformance.shrinking import reduced
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Saved = Callable[[bool], None]
@@ -47,8 +49,8 @@ _MISTAKES = 0.1
 #: Atoms, edge and seed of the crowd that shows how far a list that is kept has all pairs, and its skin.
 _CROWD = (160, 6.0, 130)
 _SKIN = 0.3
-#: How much of the smallest motion a lost pair is followed for.
-_FURTHEST = 2.5
+#: Share of the time after which failures are reproduced, if there are any.
+_ASKING = 0.75
 #: Refusals that are examined; a list with more kinds of them has other worries.
 _REFUSALS = 6
 
@@ -59,6 +61,7 @@ class Examiner:
     Args:
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
+        deadline: after which that process is ended, and what it was asked raises `TimeUp`.
 
     Attributes:
         report: what was found out, of the cases that it was given to `take`.
@@ -66,15 +69,18 @@ class Examiner:
         refused: the smallest refused case by kind of exception.
     """
 
-    def __init__(self, tested: PairList, reuse: bool = False, apart: bool = False):
+    def __init__(
+        self, tested: PairList, reuse: bool = False, apart: bool = False, deadline: Deadline | None = None
+    ):
         self.tested = tested
         self.session: Session | RemoteSession = (
-            RemoteSession(tested, reuse) if apart and tested.word else Session(tested, reuse)
+            RemoteSession(tested, reuse, deadline) if apart and tested.word else Session(tested, reuse)
         )
         self.report = Report(tested)
         self.refused: dict[str, RefusalKind] = {}
         self.opening: list[tuple[Case, CallOutcome]] = []
-        self._find_conventions()
+        with suppress(TimeUp):
+            self._find_conventions()
 
     def _find_conventions(self) -> None:
         """Full or half, signs of shifts and vectors, from a question that nobody gets wrong otherwise."""
@@ -165,9 +171,10 @@ class Examiner:
                 return replace(result, refused=(step, outcome.refused))
             found = [outcome.failure] if outcome.failure is not None else []
             if outcome.answer is not None:
-                found, how, ties = self._judge(case, step, outcome.answer, how)
+                found, single, ties = self._judge(case, step, outcome.answer, how)
+                how = replace(how, unit=SINGLE) if single else how
                 ties = ties if step == 0 else result.ties
-                result = replace(result, ties=ties, single=result.single or how.unit != self.report.how.unit)
+                result = replace(result, ties=ties, single=single or result.single)
                 if outcome.changed:
                     found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
             if found:
@@ -186,26 +193,29 @@ class Examiner:
 
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
-    ) -> tuple[list[Failure], Conventions, tuple[int, int]]:
-        """(failures, conventions that the answer was judged by, ties counted and not)."""
+    ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
+        """(failures, the error of one that is right in single precision alone, ties counted and not)."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
         if found and step and reach is not None and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
-            found = judge(answer, _with_earlier(case, step, right, reach), how)
+            right = _with_earlier(case, step, right, reach)
+            found = judge(answer, right, how)
         # a list that is stale by a hair is not one in single precision, nor one that is wrong anyway; and
         # whoever measures in double and decides in single loses pairs that it knows to be inside
+        measures = {failure.code for failure in found} <= {"DISTANCES", "VECTORS"}
         if (
-            found and step == 0 and not case.known and len(answer) > 0
+            found and (step == 0 or measures) and not case.known and len(answer) > 0
             and self.report.wrong <= _MISTAKES * (self.report.asked + 1)
             and self.tested.unit is None and how.unit == DOUBLE and not measures_well(answer, right, how)
         ):  # fmt: skip
-            coarse, single = truth(case, step, reach=reach, unit=SINGLE), replace(how, unit=SINGLE)
-            if not judge(answer, coarse, single):
-                return [], single, (0, 0)
+            coarse = right if step else truth(case, step, reach=reach, unit=SINGLE)
+            error = shown_error(answer, coarse, how)
+            if error is not None:
+                return [], error, (0, 0)
         counts = not found and step == 0 and how.unit == DOUBLE and not self.report.superset
-        return found, how, _ties(answer, right) if counts else (0, 0)
+        return found, None, _ties(answer, right) if counts else (0, 0)
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
@@ -272,27 +282,36 @@ def examine(
         deadline: after which no case is begun; what was not asked by then is counted.
         answers: of an earlier examination of the same questions, which are not asked again; each new one is
             put there.
-        saved: called after each that is put there, with whether it should not be lost.
+        saved: called at the beginning and after each that is put there, with whether it should not be lost.
 
     Returns:
         what was asked and what became of it. A list may raise, return anything and write to its input: that
         is reported as a failure.
     """
     began = time.perf_counter()
-    examiner = examiner or Examiner(tested, reuse=True, apart=apart)
-    report, session = examiner.report, examiner.session
     deadline, answers = deadline or Deadline(), answers or CaseAnswers()
+    examiner = examiner or Examiner(tested, reuse=True, apart=apart, deadline=deadline)
+    report, session = examiner.report, examiner.session
     saved, progress = saved or (lambda urgent: None), progress or (lambda *_: None)
     far = apart and bool(tested.word)
-    every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
-    every += large_questions() if large and asked is None else ()
-    report.questions = len(every)
-    stopped = False
-    for number, case in enumerate(every):
-        progress(number, len(every), {"phase": "asking", "unit": "cases"})
-        result = answers.of(number, case)
-        if stopped or (result is None and deadline.passed):
-            continue
+    parts: list[tuple[int, Iterable[Case]]] = (
+        plan(tested, cases, seed, report.padding, far=far, large=large)
+        if asked is None
+        else [(len(given := list(asked)), given)]
+    )
+    report.questions, report.breadth = sum(count for count, _ in parts), parts[0][0]
+    saved(True)  # a page can be made of the folder from here on
+    # where there are failures, some of the time is for them
+    asking, last = deadline.part(_ASKING), max(map(int, answers.cases), default=-1)
+    # what the process was asked so far, and had been before each failure
+    history, starts, stopped = [case for case, _ in examiner.opening], session.starts, False
+    earlier: dict[tuple[str, str], tuple[Case, ...]] = {}
+    for number, case in enumerate(chain.from_iterable(part for _, part in parts)):
+        session.deadline = asking if report.failed else deadline
+        if number > last and (stopped or session.deadline.passed):
+            break
+        progress(number, report.questions, {"phase": "asking", "unit": "cases"})
+        known = result = answers.of(number, case)
         why = tested.limits.refusal(case)
         if why is None and result is None and case.area == "large":
             why = _too_long(report, case)
@@ -300,24 +319,36 @@ def examine(
             report.skip(case, why)
             continue
         if result is None:
-            result = answers.cases[str(number)] = examiner.ask(case)
+            try:
+                result = answers.cases[str(number)] = examiner.ask(case)
+            except TimeUp:
+                continue
             saved(bool(result.failures))
+            if session.starts != starts:
+                starts, history = session.starts, []
         examiner.take(case, result)
+        for failed in report.failed:
+            earlier.setdefault((failed.code, failed.case.area), () if known else tuple(history))
+        if not known:
+            history.append(case)
         stopped = stop and bool(result.failures)
-    if every and not stopped and not deadline.passed:
-        report.keeps_order = _keeps_order(examiner)
-    if shrink:
-        session.reuse = False
-        if not deadline.passed:
+    session.deadline = deadline
+    with suppress(TimeUp):
+        if report.questions and not stopped and not deadline.passed:
+            report.keeps_order = _keeps_order(examiner)
+        session.reuse = session.reuse and not shrink
+        if shrink and not deadline.passed:
             report.refusals = _refusals(examiner)
+    if shrink:
         for number, failed in enumerate(report.failed):
             progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
             name = f"{failed.code} {failed.case.area} {failed.case.name}"
             smaller = answers.shrunk.get(name)
             if smaller is None and not deadline.passed:
-                # a new process: what the list kept from other questions must not be part of it
-                session.close()
-                smaller = deepest(examiner.failures, shrunk(examiner.failures, failed, deadline))
+                # one script with the earlier calls of a code is enough
+                done = any(one.earlier for one in report.failed if one.code == failed.code)
+                before = () if done else earlier[failed.code, failed.case.area]
+                smaller = reduced(examiner, failed, before, deadline)
                 if deadline.passed:
                     report.whole = False
                 elif smaller.case.known is None:  # pairs that are known in closed form alone are not kept
@@ -338,10 +369,9 @@ def _keeps_order(examiner: Examiner) -> bool | None:
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
-            first, *others = (examiner.session.ask(case)[0].answer for _ in range(3))
-            if first is not None:
-                return all(other is not None and first.same(other) for other in others)
-            return None
+            found = (examiner.session.ask(case)[0].answer for _ in range(3))
+            answers = [answer for answer in found if answer is not None]
+            return all(map(answers[0].same, answers)) if len(answers) == 3 else None
     return None
 
 
@@ -380,8 +410,9 @@ def distinct(failed: Iterable[Failed]) -> list[Failed]:
     exceptions and what is no list of pairs, where they are the same in words but for numbers.
     """
 
-    def size(failure: Failed) -> tuple[bool, int, int, int]:
-        return not failure.alone, failure.case.atoms, failure.case.steps, sum(failure.case.pbc)
+    def size(failure: Failed) -> tuple[bool, bool, int, int, int]:
+        case, shown = failure.case, failure.reproduced is not False
+        return not shown, not failure.alone, case.atoms, case.steps, sum(case.pbc)
 
     kept: dict[Any, Failed] = {}
     for failure in sorted(failed, key=size):
@@ -395,128 +426,3 @@ def distinct(failed: Iterable[Failed]) -> list[Failed]:
         kept.setdefault(key, failure)
     areas = list(AREAS)
     return sorted(kept.values(), key=lambda one: (CODES.index(one.code), areas.index(one.case.area)))
-
-
-# --- a failing case brought down to a few atoms, few steps and round numbers that fail in the same way ---
-
-#: Questions and seconds that a shrink may take; a slow list has this many questions, and at most so long.
-TRIES, SECONDS = 600, 8.0
-LEAST_TRIES, PATIENCE = 80, 60.0
-_MOST_IMAGES = 3000
-
-Failures = Callable[[Case], Sequence[Failure]]
-
-
-def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """The smallest case found, before the deadline, that fails with the same code.
-
-    `failures` asks the list; a new object of a kept list for each question.
-    """
-    deadline = deadline or Deadline()
-    sought, least = failed.worst.kind, min(1, failed.case.atoms)
-    tries, began = 0, time.perf_counter()
-
-    def fails(case: Case) -> bool:
-        nonlocal tries
-        tries += 1
-        asked = case.steps and case.atoms >= least and _sensible(case)
-        return bool(asked) and any(failure.kind == sought for failure in failures(case))
-
-    def spent() -> bool:
-        seconds = time.perf_counter() - began
-        return deadline.passed or tries >= TRIES or seconds > (SECONDS if tries >= LEAST_TRIES else PATIENCE)
-
-    if failed.code == "NO_ANSWER":
-        return failed  # every try would take as long
-    case, before = failed.case, None
-    if not fails(case):
-        # what it kept from earlier questions was part of it: reported as it is
-        return replace(failed, alone=False)
-    while case is not before and not spent():
-        before = case
-        stills = fewest(case.stills, lambda kept, case=case: fails(replace(case, stills=tuple(kept))), spent)
-        case = replace(case, stills=tuple(stills)) if len(stills) < case.steps else case
-        atoms = fewest(range(case.atoms), lambda kept, case=case: fails(_only(case, kept)), spent)
-        case = _only(case, atoms) if len(atoms) < case.atoms else case
-        for simpler in _simplifications(case):
-            if spent():
-                break
-            other = simpler(case)
-            case = other if not other.equals(case) and fails(other) else case
-    found = tuple(failure for failure in failures(case) if failure.code == failed.code)
-    found = found or failed.failures
-    return replace(failed, case=case.until(found[0].step + 1), failures=found)
-
-
-def _only(case: Case, atoms: list[int]) -> Case:
-    """Some of the atoms; few need no pairs in closed form."""
-    smaller = case.only(np.array(atoms, int))
-    return replace(smaller, known=None) if len(atoms) <= 400 else smaller
-
-
-def _sensible(case: Case) -> bool:
-    """Whether it is a question: finite numbers, a box with room in it, not too many images to count."""
-    pbc = np.array(case.pbc)
-    if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
-        return False
-    for cell in (still.cell for still in case.stills):
-        if not np.isfinite(cell).all() or np.linalg.matrix_rank(cell[pbc]) < pbc.sum():
-            return False
-        if pbc.any():
-            with np.errstate(all="ignore"):
-                full = completed(cell, pbc)
-                if not abs(np.linalg.det(full)) > 0:
-                    return False
-                images = np.prod(2 * np.floor((case.r_cut + 2 * case.skin) / widths(full)[pbc]) + 3)
-            if not images <= _MOST_IMAGES:
-                return False
-    return True
-
-
-def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
-    """Axes that need not repeat, cells that need not lean, fewer digits, coordinates that may be 0."""
-    for axis in range(3):
-        yield lambda case, axis=axis: replace(
-            case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
-        )
-    yield lambda case: case if any(case.pbc) else case.changed(cell=np.zeros_like)
-    yield lambda case: case.changed(cell=lambda cell: np.diag(np.diag(cell)))
-    for digits in (1, 2, 3, 5, 8):
-        yield lambda case, d=digits: case.changed(
-            lambda x: np.round(x, d),
-            lambda x: np.round(x, d),
-            r_cut=round(case.r_cut, d),
-            skin=round(case.skin, d),
-        )
-    for digits in (0, 1, 2) if case.atoms <= 12 else ():
-        yield lambda case, d=digits: case.changed(cell=lambda cell: np.round(cell, d))
-        for atom, axis in np.ndindex(case.atoms, 3):
-
-            def moved(
-                positions: np.ndarray, atom: int = atom, axis: int = axis, digits: int = digits
-            ) -> np.ndarray:
-                positions = positions.copy()
-                # a still may have fewer atoms
-                positions[atom : atom + 1, axis] = np.round(positions[atom : atom + 1, axis], digits)
-                return positions
-
-            yield lambda case, moved=moved: case.changed(moved)
-
-
-def deepest(failures: Failures, failed: Failed) -> Failed:
-    """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
-
-    It moves on the way it went, so that what is reported is how near a lost pair can be.
-    """
-    case = failed.case
-    if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
-        return failed
-    first, last = case.stills
-    for part in np.arange(1.02, _FURTHEST, 0.04):
-        moved = first.positions + part * (last.positions - first.positions)
-        further = replace(case, stills=(first, replace(last, positions=moved)))
-        found = tuple(one for one in failures(further) if one.code == "MISSING" and one.step == 1)
-        if not found:
-            break
-        failed = replace(failed, case=further, failures=found)
-    return failed

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import planted_lists
@@ -450,10 +451,10 @@ def test_a_buffer_of_a_list_that_is_kept_is_reported():
 def test_lists_are_found_by_name_file_and_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert {"ase", "vesin", "scipy", "mdnum", "mdnum-verlet"} <= {one.name for one in installed()}
     assert len({one.name for one in known()}) == len(known())
-    missing = next((one.name for one in known() if one.version is None), None)
-    if missing is not None:
-        with pytest.raises(InputError, match="not installed"):
-            load(missing)
+    for missing in (one for one in known() if one.lacks):
+        with pytest.raises(InputError, match="not installed") as caught:
+            load(missing.name)
+        assert all(name in str(caught.value) for name in missing.lacks)
     (tmp_path / "lists_of_mine.py").write_text(
         "from planted_lists import search\ndef pairs(*a):\n    return search(*a)\npairs.full = True\n"
     )
@@ -461,6 +462,69 @@ def test_lists_are_found_by_name_file_and_module(tmp_path: Path, monkeypatch: py
     found = load("lists_of_mine.py:pairs")
     assert found.full and not found.kept and found.word and "from lists_of_mine import pairs" in found.source
     assert load(f"{_PLANTED}:Kept").kept and load(f"{_PLANTED}:Kept('average motion')").kept
+
+
+_VERSIONS = {"nvalchemi-toolkit-ops": "0.5.0", "torch": None, "vesin": None}
+
+
+def test_all_packages_that_are_missing_are_named(monkeypatch: pytest.MonkeyPatch):
+    """An adaptor may need more than the package that it is named after."""
+    monkeypatch.setattr("mdnum.references.conformance.lists._version", _VERSIONS.get)
+    for word, remedy in (("nvalchemi-ops", "pip install torch"), ("vesin", "pip install vesin")):
+        with pytest.raises(InputError) as caught:
+            load(word)
+        assert (caught.value.remedy or "").endswith(remedy)
+    monkeypatch.setattr("mdnum.references.conformance.lists._version", {}.get)
+    with pytest.raises(InputError, match="nvalchemi-toolkit-ops and torch, which are not installed"):
+        load("nvalchemi-ops")
+    assert not installed()
+
+
+class _Overflow(Exception):
+    """As in nvalchemi-toolkit-ops 0.5: it names the capacity that would have been enough."""
+
+    def __init__(self, most: int, needed: int):
+        super().__init__(f"{needed} > {most}")
+        self.num_neighbors = needed
+
+
+class _Tensor(np.ndarray):
+    def numpy(self):
+        return np.asarray(self)
+
+
+def _cell_list(positions, r_cut, cell, pbc, max_neighbors=16, return_neighbor_list=False):
+    rows = planted_lists.search(np.array(positions), np.array(cell[0]), np.array(pbc[0]), r_cut)
+    most = int(np.bincount(rows["i"], minlength=1).max())
+    if most > max_neighbors:
+        raise _Overflow(max_neighbors, most)
+    return np.stack([rows["i"], rows["j"]]).view(_Tensor), None, rows["shift"].view(_Tensor)
+
+
+@pytest.mark.parametrize("claims", [None, 1], ids=["what is needed", "one more at most"])
+def test_the_capacity_of_an_adaptor_is_not_the_lists(monkeypatch: pytest.MonkeyPatch, claims: int | None):
+    """A library whose buffers its caller sizes is given more when it asks for more."""
+
+    def cell_list(*given, **named):
+        try:
+            return _cell_list(*given, **named)
+        except _Overflow as error:
+            error.num_neighbors = error.num_neighbors if claims is None else named["max_neighbors"] + claims
+            raise
+
+    neighbors = SimpleNamespace(cell_list=cell_list, NeighborOverflowError=_Overflow)
+    for name, module in (
+        ("torch", SimpleNamespace(as_tensor=np.asarray)),
+        ("nvalchemiops", SimpleNamespace()),
+        ("nvalchemiops.torch", SimpleNamespace()),
+        ("nvalchemiops.torch.neighbors", neighbors),
+    ):
+        monkeypatch.setitem(sys.modules, name, module)
+    tested = next(one for one in known() if one.name == "nvalchemi-ops")
+    asked = [*crowds(), *(case for case in catalog() if case.area == "few")]
+    report = examine(tested, asked=asked)
+    assert report.conforms and not report.total("refused"), report.failed
+    assert "NeighborOverflowError" in tested.source  # as in a script without mdnum
 
 
 def test_a_package_outside_adds_a_list(monkeypatch: pytest.MonkeyPatch):
