@@ -61,14 +61,18 @@ CAUSES: dict[str, Cause] = {
     "NEIGHBOR_CAP_BY_ORDER": Cause(
         ("NEIGHBOR_CAP", "ORDER", *_REWRITTEN),
         rivals=("ORDER", "PLACE_IN_LIST", "NOT_REPEATABLE", "LOW_PRECISION"),
+        tests=("repeat", "place", "in range"),
     ),
     "NEIGHBOR_CAP": Cause(
         ("ORDER", *_REWRITTEN), rivals=("CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NOT_REPEATABLE"),
+        tests=("repeat", "in range"),
     ),
     "ORDER": Cause(_REWRITTEN, rivals=("NOT_REPEATABLE", "LOW_PRECISION")),
     **{code: Cause((*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN)) for k, code in enumerate(_IMAGES)},
-    "LEFT_HANDED": Cause(("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR")),
-    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION")),
+    "LEFT_HANDED": Cause(
+        ("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR"), tests=("determinant",)
+    ),
+    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
     "DUMMY_CELL": Cause(),
     "TOPOLOGY_BY_ORDER": Cause(rivals=("ORDER", "PLACE_IN_LIST")),
     "WHOLE_MOLECULES": Cause(rivals=("IMAGES",)),
