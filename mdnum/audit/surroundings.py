@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,6 +147,11 @@ class EnvironmentWalks:
         """Events that no pair threshold explains and that jump beyond doubt."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
 
+    @property
+    def lower(self) -> list[Event]:
+        """Events at a pair threshold at which a lower derivative jumps than for two atoms alone."""
+        return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
+
 
 def walk_surroundings(
     subject: CalculatorSubject,
@@ -251,13 +256,16 @@ def _targeted(
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
     """What jumps where a known threshold is crossed, to the last representable place if a value does."""
-    curve = route.curve(subject)
+    curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
+    # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
+    for row in range(2):
+        low, high = locate(curve, row, crossing.at - side, crossing.at + side)
+        jump = measure(curve, low, high, STEP, exact=True, curved=False)
+        if jump.order <= row:
+            return _event(subject, route, jump, crossing)
     low, high = crossing.at - _SIDE, crossing.at + _SIDE
-    exact = crossing.threshold.order < 2
-    if exact:
-        low, high = locate(curve, crossing.threshold.order, low, high)
-    jump = measure(curve, low, high, STEP, exact, curved=not exact)
-    return _event(subject, route, jump, crossing)
+    jump = measure(curve, low, high, STEP, exact=False)
+    return _event(subject, route, replace(jump, order=max(jump.order, 2)), crossing)
 
 
 def _event(

@@ -341,11 +341,13 @@ class PerNeighbor(Potential):
 
 
 class Kinked(Embedded):
-    """An embedding function with a kink."""
+    """An embedding function with a kink, at a density that two atoms alone do not reach."""
+
+    cut, kink = 4.6, 2.07
 
     def embedding(self, density):
-        above = density > 0.55
-        return -0.2 * np.where(above, density - 0.55, 0.0), -0.2 * above
+        above = density > self.kink
+        return -0.2 * np.where(above, density - self.kink, 0.0), -0.2 * above
 
 
 class Cut(Potential):
@@ -418,16 +420,14 @@ class RandomForce(Potential):
 class Appearance(Potential):
     """Parameters of species by the order in which they appear."""
 
-    def law(self, r):
-        return super().law(r)
+    def neighbors(self, atoms):
+        self.met = atoms.numbers != atoms.numbers[0]
+        return super().neighbors(atoms)
 
-    def answer(self, atoms):
-        energy, forces = super().answer(atoms)
-        met = list(dict.fromkeys(atoms.numbers))
-        share = np.array([1.0 + 0.1 * met.index(number) for number in atoms.numbers])
-        return energy * float(np.mean(share**2 * (atoms.numbers == atoms.numbers.max()) + 1)), forces * float(
-            np.mean(share**2 * (atoms.numbers == atoms.numbers.max()) + 1)
-        )
+    def terms(self, n, i, j, r, vectors):
+        u, slope = super().terms(n, i, j, r, vectors)
+        size = 1.0 + 0.1 * self.met
+        return size[i] * size[j] * u, size[i] * size[j] * slope
 
 
 def planted(*mistakes: type[Any], on: type[Any] = Potential, **more: Any) -> type[Any]:

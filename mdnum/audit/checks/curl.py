@@ -92,6 +92,7 @@ class CurlCheck(AuditCheck):
             findings=found,
             tables={"Work around closed loops": [_row(one) for one in loops]},
             numbers=numbers,
+            limits={"with_work": (0, ("CURL",))},
             **vars(ways),
         )
 

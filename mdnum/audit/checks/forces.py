@@ -142,6 +142,7 @@ class ForcesCheck(AuditCheck):
             },
             charts=[_chart(slopes)],
             numbers=numbers,
+            limits={"disagree": (0, ("FORCES_NOT_GRADIENT", "ENERGY_STEP"))},
             **vars(ways),
         )
 

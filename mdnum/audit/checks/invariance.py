@@ -137,6 +137,13 @@ class InvarianceCheck(AuditCheck):
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
             numbers=numbers,
+            # of molecules by the order of atoms, what differs is another finding
+            limits={
+                "told_apart": (
+                    0,
+                    ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES", *(one.code for one in same)),
+                )
+            },
             skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
             asked=ways.asked,
             possible=ways.possible,

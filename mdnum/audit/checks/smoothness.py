@@ -29,6 +29,11 @@ _LARGE, _SMALL, _SMALL_FORCE = 1e-3, 1e-7, 1e-5
 _STEEP = 5.0
 
 
+#: Codes that report a jump of the energy, and of the force alone.
+_ENERGY = ("ENERGY_JUMP", "CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NEIGHBOR_CAP")
+_FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
+
+
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
@@ -55,6 +60,7 @@ class SmoothnessCheck(AuditCheck):
             says=says,
             findings=[
                 *_jumps(walks, around, kT),
+                *_at_cutoff(around, kT),
                 *_among_many(around, kT, walks.not_walked),
                 *(one for crowded in crowds for one in _caps(crowded, kT)),
                 *(one for walk in walks.walks for one in reach(walk, kT)),
@@ -62,6 +68,10 @@ class SmoothnessCheck(AuditCheck):
             tables=_tables(walks, around, crowds, kT),
             charts=_charts(walks, crowds, subject),
             numbers=numbers,
+            limits={
+                "largest_energy_jump": (_SMALL * kT, _ENERGY),
+                "largest_force_jump": (_SMALL_FORCE * kT, (*_ENERGY, *_FORCE)),
+            },
             **vars(ways),
         )
 
@@ -169,6 +179,25 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
             severity = "warning" if size > _SMALL_FORCE else "info"
         variants = None if worst.dies else "within", "among" if among else None, "others" if rest else None
         yield finding(code, severity, *variants, **values)
+
+
+def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
+    """A finding where more jumps at a pair threshold among the others than for two atoms alone."""
+    if not around.lower:
+        return
+    worst = min(around.lower, key=lambda one: (one.jump.order, -one.force))
+    threshold = worst.threshold
+    assert threshold is not None
+    energy = abs(worst.jump.energy) if worst.jump.order == 0 else 0.0
+    large = energy > _SMALL * kT or worst.force > _SMALL_FORCE * kT
+    yield finding(
+        "CUTOFF_JUMP_AMONG_MANY",
+        "error" if energy > _LARGE * kT else "warning" if large else "info",
+        None if worst.jump.order == 0 else "force",
+        tests=("alone",), two=_two(threshold), at=place(threshold), route=worst.route, force=worst.force,
+        energy=1e3 * energy, kT=energy / kT, alone=ORDERS[threshold.order], measured=around.measured,
+        places=len(around.lower),
+    )  # fmt: skip
 
 
 def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:

@@ -123,6 +123,7 @@ class StateCheck(AuditCheck):
                 "Atoms alone": alone.rows,
             },
             numbers=numbers,
+            limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
             skipped=[
                 *skipped,
                 *((row.what, row.why) for row in refused),
