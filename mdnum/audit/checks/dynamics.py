@@ -100,14 +100,15 @@ class DynamicsCheck(AuditCheck):
         probe = subject.fresh()
         noise = along_a_line(probe, whole.at(start.positions), rng)
         progress(0, 0, {"phase": "accounting for the energy"})
-        found = balance(probe, whole, limits, rng, noise.energy)
+        found = balance(probe, whole, limits, rng, noise.allowed.energy)
         # the other run's flips count only where they bring energy
         finer = crossings(half, limits) if any(one.order == 0 for one in limits) else []
         # largest difference of the run's energies from those of objects that saw nothing else
         places = np.unique(np.linspace(0, len(whole.potential) - 1, _COMPARED).astype(int))
         again = [subject.fresh().energy(whole.at(whole.positions[n])) for n in places]
         stale = largest(np.array(again) - whole.potential[places])
-        allowed = 40 * max(noise.energy, np.finfo(float).eps * largest(whole.potential))
+        rounding = NoiseFloor(np.finfo(float).eps * largest(whole.potential), 0.0)
+        allowed = noise.louder(rounding).allowed.energy
         brought = found.by_means(finer, len(half.potential))
         return TwoRuns(subject, whole, half, found, brought, limits, (stale, allowed), noise, period).outcome(
             unknown
@@ -249,7 +250,7 @@ class TwoRuns:
             yield finding("NOT_CONSERVED", severity, "old" if old else None, **values("rest", swing=swing))
 
         size = numbers["flips_wander"]
-        if numbers["largest_jump"] > 100 * self.noise.energy and size > _WANDERS:
+        if numbers["largest_jump"] > 2 * self.noise.allowed.energy and size > _WANDERS:
             jump = 1e3 * numbers["largest_jump"]
             told = values("flips", crossings=numbers["crossings"], jump=jump, wander=size)
             severity = "error" if flips.significant and abs(flips.slope) > much else "warning"
