@@ -279,6 +279,8 @@ def needed_to(question: str) -> set[str]:
 
 #: Of the ways of a check: from here on it counts as asked.
 _NEARLY = 0.9
+#: Of the share of the forces that is wrong: a curl that would be seen of this is absent.
+_FAR_BELOW = 0.1
 _QUESTIONS = ("run", "differentiate")
 
 
@@ -314,3 +316,20 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether a check is left of those that make up an answer; of others, none is to come."""
     left = set(wanted) - {result.name for result in results}
     return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _QUESTIONS))
+
+
+def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
+    """Variants of sentences, by code, for what only several checks tell together.
+
+    Wrong forces that do no work around loops are the forces of another energy; those that do have none.
+    """
+    by_name = {result.name: result for result in results}
+    curl, forces = by_name.get("curl"), by_name.get("forces")
+    if curl is None or forces is None or largely_unasked(curl):
+        return {}
+    if curl.numbers["with_work"]:
+        return {"FORCES_NOT_GRADIENT": "no_energy"}
+    # a curl is seen where it is above a share of the stiffness that the wrong part of the forces would show
+    seen = curl.numbers["unseen_share"]
+    wrong = forces.numbers["largest_difference"] / max(forces.numbers["rms_force"], 1e-300)
+    return {"FORCES_NOT_GRADIENT": "another_energy"} if seen < _FAR_BELOW * wrong else {}

@@ -69,9 +69,8 @@ CAUSES: dict[str, Cause] = {
     ),
     "ORDER": Cause(_REWRITTEN, rivals=("NOT_REPEATABLE", "LOW_PRECISION")),
     **{code: Cause((*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN)) for k, code in enumerate(_IMAGES)},
-    "LEFT_HANDED": Cause(
-        ("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR"), tests=("determinant",)
-    ),
+    # a structure is asked about with the vectors that it has, so that only other vectors show it
+    "LEFT_HANDED": Cause(rivals=("LATTICE", "MIRROR"), tests=("determinant",)),
     "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
     "DUMMY_CELL": Cause(),
     "TOPOLOGY_BY_ORDER": Cause(rivals=("ORDER", "PLACE_IN_LIST")),
@@ -89,7 +88,9 @@ CAUSES: dict[str, Cause] = {
     "CURVATURE_JUMP_AMONG_MANY": Cause(spares="run"),
     "DRIFT": Cause(spares="differentiate"),
     "TIMESTEP": Cause(spares="differentiate"),
-    "LOW_PRECISION": Cause(rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)),
+    "LOW_PRECISION": Cause(
+        ("NOISE_FLOOR",), rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)
+    ),
     # findings that explain no other
     **dict.fromkeys(
         (
