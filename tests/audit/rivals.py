@@ -485,5 +485,7 @@ WRONG = {
     "last force at random pairs": (planted(WrongForce, Random), liquid(), ("NOT_REPEATABLE",)),
     "single sum and last force": (planted(SingleSum, WrongForce), liquid(), ("PLACE_IN_LIST",)),
     "single sum and a cap": (planted(SingleSum, Nearest), liquid(), ("NEIGHBOR_CAP",)),
-    "left-handed and mirror": (planted(LeftVolume, Chiral), liquid(), ("FORCES_NOT_GRADIENT", "LEFT_HANDED", "MIRROR")),
+    "left-handed and mirror": (
+        planted(LeftVolume, Chiral), liquid(), ("FORCES_NOT_GRADIENT", "LEFT_HANDED", "MIRROR")
+    ),
 }  # fmt: skip

@@ -132,6 +132,16 @@ def test_caps_are_counted_whatever_neighbors_are_sorted_by():
         assert planted.values(result, "NEIGHBOR_CAP")["kept"] == most == result.numbers["neighbors_kept"]
 
 
+def test_a_force_that_is_zero_to_the_last_bit_promises_nothing():
+    """Of two atoms the second feels nothing; how small a step of its force would show is not known."""
+    check = SmoothnessCheck()
+    check.neighbors, check.routes = 8, 0
+    result = check(rivals.subject(rivals.planted(rivals.WrongForce)))
+    assert result.numbers["force_steps_seen"] is None and "smoothness_least" not in result.says[0]
+    known = check(rivals.subject(rivals.Potential)).numbers["force_steps_seen"]
+    assert 1e-16 < known < 1e-3
+
+
 def test_an_order_that_matters_is_no_cap_where_its_number_does_not():
     """The force on the last atom of eight or more: from eight on, and with one of them far away as well."""
 

@@ -185,7 +185,10 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
     """A finding where more jumps at a pair threshold among the others than for two atoms alone."""
     if not around.lower:
         return
-    worst = min(around.lower, key=lambda one: (one.jump.order, -one.force))
+    worst = min(
+        around.lower,
+        key=lambda one: (one.jump.order, -abs(one.jump.energy) * (not one.jump.order), -one.force),
+    )
     threshold = worst.threshold
     assert threshold is not None
     energy = abs(worst.jump.energy) if worst.jump.order == 0 else 0.0
