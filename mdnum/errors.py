@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -100,3 +101,15 @@ class NumericalError(MdnumError):
     ):
         super().__init__(message, remedy=remedy, where=where)
         self.folder = folder
+
+
+def expect_path(given: object, remedy: str) -> None:
+    """Rejects an array or another object where a path is expected, without quoting what it holds.
+
+    Raises:
+        InputError: names its type, and its shape where it has one.
+    """
+    if not isinstance(given, str | os.PathLike):
+        shape = getattr(given, "shape", None)
+        kind = type(given).__name__ + ("" if shape is None else f" of shape {shape}")
+        raise InputError(f"{kind} given where a path is expected", remedy=remedy)

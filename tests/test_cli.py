@@ -90,6 +90,27 @@ def test_findings_decide_the_exit_code(rollout: Recorder, capsys, severity: str,
     assert call("run", "argon/crystal-108") == 1
 
 
+@pytest.mark.parametrize(
+    ("status", "severity", "expected"),
+    [
+        ("partial", "info", 0), ("undecided", "info", 3),
+        # what was found before the time was up is found
+        ("partial", "warning", 1), ("undecided", "error", 1),
+    ],
+)  # fmt: skip
+def test_time_that_is_up_before_a_verdict_is_neither_fine_nor_a_finding(
+    rollout: Recorder, capsys, status: str, severity: str, expected: int
+):
+    finding = {"code": "x", "severity": severity, "title": "A title", "text": "Seen."}
+    rollout.summary = {**SUMMARY, "findings": [finding], "status": status}
+    assert call("run", "argon/crystal-108") == expected
+    assert call("run", "argon/crystal-108", "--json") == expected
+    # somebody who pressed control-C knows that it was not finished
+    rollout.summary = {**SUMMARY, "status": status, "interrupted": True}
+    assert call("run", "argon/crystal-108") == 130
+    assert call("--help") == 0 and "time (--time) was up" in " ".join(capsys.readouterr().out.split())
+
+
 def test_resume_needs_only_the_folder(rollout: Recorder):
     assert call("run", "--resume", "runs/x-1") == 0
     ((system, options),) = rollout.calls

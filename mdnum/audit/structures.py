@@ -18,8 +18,8 @@ from jaxtyping import Float
 from mdnum.audit.base import CalculatorError, Skipped
 from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
-from mdnum.errors import InputError
-from mdnum.references.load import described
+from mdnum.errors import InputError, expect_path
+from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
 
 #: Tried in this order, and then every other element: argon where anything goes.
 _FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
@@ -56,8 +56,7 @@ def read_structure(words: str | Path) -> Atoms:
     Raises:
         InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
     """
-    import ase.io
-
+    expect_path(words, "Give ASE's Atoms or the path of a file that ASE reads")
     text = str(words)
     head, separator, index = text.rpartition("@")
     path, which = (Path(head), index) if separator and not Path(text).exists() else (Path(text), "-1")
@@ -65,15 +64,8 @@ def read_structure(words: str | Path) -> Atoms:
         raise InputError(
             "no such structure file", where=str(path), remedy="Correct --structure, or leave it out"
         )
-    try:
-        found = ase.io.read(path, index=which)
-    except Exception as error:  # ASE's readers raise whatever their parsing meets
-        raise InputError(
-            f"cannot be read as a structure ({described(error)})",
-            where=text,
-            remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
-        ) from error
-    chosen = found if isinstance(found, list) else [found]
+    with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
+        chosen = list(ase_images(path, which))
     if len(chosen) != 1:
         raise InputError(
             f"means {len(chosen)} structures, and an audit is about one structure",

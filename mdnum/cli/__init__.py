@@ -1,6 +1,7 @@
 """The command line: parse, call, print. No science here, and no import of jax.
 
-Every verb is a function that returns its exit code: 0 fine, 1 findings, 2 a mistake in what was asked.
+Every verb is a function that returns its exit code: 0 fine, 1 findings, 2 a mistake in what was asked, 3 time
+was up before a verdict.
 """
 
 from __future__ import annotations

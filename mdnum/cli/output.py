@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 EXIT_FINE = 0
 EXIT_FINDINGS = 1
 EXIT_USAGE = 2
+EXIT_UNDECIDED = 3  # time was up before a verdict
 EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
 
 _PIPE_WIDTH = 200
@@ -269,15 +270,24 @@ def print_findings(findings: Iterable[Finding]) -> None:
             out.print(Text(f"  {text}"))
 
 
-def exit_code(findings: Iterable[Finding], *, ok: bool = True) -> int:
-    """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
-    matters = any(finding.severity in ("warning", "error") for finding in findings)
-    return EXIT_FINDINGS if matters or not ok else EXIT_FINE
+def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
+    """The exit code of a verb: 1 when a finding asks for attention, whatever the status is.
+
+    Args:
+        findings: those that are only information do not count.
+        status: of summary.json; see `frame.UNDECIDED`.
+    """
+    from mdnum.verbs.frame import PARTIAL, UNDECIDED
+
+    if any(finding.severity in ("warning", "error") for finding in findings):
+        return EXIT_FINDINGS
+    fine = {"complete": EXIT_FINE, PARTIAL: EXIT_FINE, UNDECIDED: EXIT_UNDECIDED}
+    return fine.get(status, EXIT_FINDINGS)
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
     """What a verb answers, as JSON or for people: its page in brief. Returns the exit code."""
-    code = exit_code(outcome.verdict.findings, ok=outcome.summary.get("status", "complete") == "complete")
+    code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({"folder": outcome.folder, **outcome.summary})
         return code

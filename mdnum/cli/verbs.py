@@ -20,6 +20,8 @@ _PLAIN: dict[str, Any] = {"rich_markup_mode": None, "no_args_is_help": True, "ad
 app = typer.Typer(
     name="mdnum",
     help="Neighbor-set flips in cutoff-based molecular dynamics: which, when, and what they did.",
+    epilog="Exit codes: 0 fine, 1 findings, 2 a mistake in what was asked, 3 time (--time) was up before a "
+    "verdict, 130 interrupted.",
     pretty_exceptions_enable=False,
     **_PLAIN,
 )
@@ -216,12 +218,16 @@ def flips(
     format: str | None = typer.Option(
         None, "--format", metavar="WORD", help="The file's format, where its name does not tell."
     ),
+    drop_repeats: bool = typer.Option(
+        False, "--drop-repeats", help="Leave out frames that are earlier ones again, bit for bit."
+    ),
     how: Any = None,
 ) -> Any:  # fmt: skip
     """Find every pair that entered or left a cutoff between frames, and say what that tells and what not."""
     return mdnum.flips(
         trajectory, other, topology=topology, cutoffs=cutoffs or (), pairs=pairs or (),
-        nearest=nearest or (), most=most, between=between, window=window, format=format, **how,
+        nearest=nearest or (), most=most, between=between, window=window, format=format,
+        drop_repeats=drop_repeats, **how,
     )  # fmt: skip
 
 
@@ -257,7 +263,8 @@ def audit(
     ),
     steps: int | None = typer.Option(None, min=16, help="Of the run; 200 by default."),
     time: float | None = typer.Option(
-        None, metavar="MINUTES", help="Ask nothing more after that; what was not asked is listed."
+        None, metavar="MINUTES",
+        help="Ask nothing more after that; what was not asked is listed. Exit code 3: before a verdict.",
     ),
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Ask what the audit in this folder has not asked, of the same calculator."
@@ -306,7 +313,8 @@ def conform(
     ),
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
     time: float | None = typer.Option(
-        None, metavar="MINUTES", help="Begin no case after that; what was not asked is reported."
+        None, metavar="MINUTES",
+        help="End by then; what was not asked is reported. Exit code 3: before there was a verdict.",
     ),
     resume: Path | None = typer.Option(
         None, metavar="DIR", help="Resume the examination in this folder, with its options."
@@ -477,7 +485,7 @@ def _compared(question: str, title: str, help: str) -> Callable[..., int]:
             output.print_records(f"{system}: {title}", checked.report.rows())
             output.print_findings(checked.verdict.findings)
             output.say(checked.verdict.headline)
-        return output.exit_code(checked.verdict.findings, ok=checked.report.ok)
+        return output.exit_code(checked.verdict.findings, "complete" if checked.report.ok else "failed")
 
     return compare
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 import pyarrow as pa
 
-from mdnum.errors import FolderError, MdnumError
+from mdnum.errors import FolderError, MdnumError, expect_path
 from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
@@ -142,6 +142,7 @@ class RunFolder:
         Raises:
             FolderError: no such folder, or no run in it.
         """
+        expect_path(path, "Give the folder of a run")
         folder = cls(Path(path))
         if not folder.path.is_dir():
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))

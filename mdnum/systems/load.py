@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from mdnum import units as unit_systems
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_path
 from mdnum.registry import nearest
 from mdnum.store.files import disk_errors, replacing, write_text
 from mdnum.systems import pairs, schema, structures, toml
@@ -73,6 +73,7 @@ def find(name: str | Path) -> tuple[str, Path]:
     Raises:
         InputError: nothing of that name; says the nearest shipped one.
     """
+    expect_path(name, "Give a shipped name, the path of a system file or its folder, or a loaded system")
     path = Path(name)
     text = str(name)
     if path.is_dir() and (path / SYSTEM_FILE).is_file():

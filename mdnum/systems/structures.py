@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from mdnum.errors import InputError
+from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
 from mdnum.registry import nearest
 from mdnum.systems import schema
 
@@ -72,23 +72,8 @@ def _read(path: Path, index: int) -> Atoms:
         raise InputError("no such structure file", where=str(path), remedy="Correct structure.file")
     if path.suffix == ".extxyz" and index in (0, -1) and (ours := _from_extxyz(path)) is not None:
         return ours
-    # its readers take half a second to import, and ten times as long to read
-    import ase.io
-
-    try:
-        with warnings.catch_warnings():
-            # a reader's warning is about a line that it then refuses, or about nothing
-            warnings.simplefilter("ignore")
-            # whole: a name that begins like a database's address or has an @ in it is the name of a file
-            found = ase.io.read(path.resolve(), index=index, do_not_split_by_at_sign=True)
-    except Exception as error:
-        # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
-        detail = " ".join(str(error).split()) or "no more detail"
-        raise InputError(
-            f"cannot be read as a structure ({type(error).__name__}: {detail})",
-            where=str(path),
-            remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
-        ) from error
+    with reading(path, by="ASE", remedy=CHECK_STRUCTURE):
+        found = next(ase_images(path.resolve(), index), None)
     if not isinstance(found, Atoms) or len(found) == 0:
         raise InputError(
             "holds no atoms", where=str(path), remedy="Correct structure.file or structure.index"

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field
+from itertools import chain
 from multiprocessing import parent_process
 from shutil import rmtree
 from tempfile import mkdtemp, mkstemp
@@ -27,12 +28,15 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import FrameCheck, FrameError, UnreadableFrame
+from mdnum.reading import FrameError, UnreadableFrame
+from mdnum.trajectories.collective import Collective
+from mdnum.trajectories.frame import FrameCheck
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
+from mdnum.trajectories.repeats import Repeats, digest
 from mdnum.trajectories.resolution import Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
-from mdnum.trajectories.topology import READING_FAILS, AtomTable, first_line, formats_of
+from mdnum.trajectories.topology import AtomTable, formats_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.trajectories.trajectory import SAMPLE
 
@@ -167,7 +171,8 @@ class NeighborFlips(AnalysisBase):
 
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
-    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame.
+    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
+    `results.repeats` which frames repeat earlier ones (see `repeats.Repeats`).
     `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
@@ -237,7 +242,7 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._library: LibraryFrames | None = None
-        self._done, self._reading = 0, True
+        self._done = 0
         self._to_the_end = False
         # of what other processes found, as long as there are any
         self._folder: str | None = None
@@ -302,7 +307,7 @@ class NeighborFlips(AnalysisBase):
         for number in self._numbers[:SAMPLE]:
             try:
                 sample.append(self.library.frame(self.library.timestep(int(number)), int(number)))
-            except READING_FAILS:
+            except UnreadableFrame:
                 # met again in its turn, and told there
                 break
         if sample:
@@ -326,18 +331,14 @@ class NeighborFlips(AnalysisBase):
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
-        self._done, self._reading = 0, True
+        self._done = 0
+        # what it knows of earlier frames is of another part, or of another run
+        self._check.collective = Collective()
         self.results, failure = Results(failures=[None]), None
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            failure = _Failure(error.frame, error.message, False)
-        except READING_FAILS as error:
-            if not self._reading:
-                raise
-            # reading the frame before the first of this part has failed where done is -1
-            number = int(self._numbers[self._at + self._done])
-            failure = _Failure(number, f"frame {number} cannot be read ({first_line(error)})", True)
+            failure = _Failure(error.frame, error.message, isinstance(error, UnreadableFrame))
         if failure is not None:
             self.results.failures, done = [failure], max(self._done, 0)
             self.frames, self.times = self.frames[:done], self.times[:done]
@@ -356,19 +357,16 @@ class NeighborFlips(AnalysisBase):
         # in the process that was asked, or sent to nobody knows where and how often it is read: in memory
         folder = None if parent_process() is None or "distributed" in sys.modules else self._folder
         self.results.parts = [[_ProcessPart(folder) for _ in self.rules]]
-        self.results.bounds = [[]]
+        self.results.bounds, self.results.digests = [[]], [[]]
         if self._at:
             # the frame before the first of this part
             self._done = -1
-            ts = self.library.timestep(int(self._numbers[self._at - 1]))
-            self._reading = False
-            self._examined(ts)
+            self._examined(self.library.timestep(int(self._numbers[self._at - 1])))
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
                 part.first = tracker.members()
-            self._done, self._reading = 0, True
+            self._done = 0
 
     def _single_frame(self) -> None:
-        self._reading = False
         bound, found = self._examined(self._ts)
         for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
             if len(flips):
@@ -376,12 +374,13 @@ class NeighborFlips(AnalysisBase):
             part.first = tracker.members() if part.first is None else part.first
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
+        self.results.digests[0].append(self._digest)
         self._done += 1
-        self._reading = True
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
+        self._digest = digest(frame)
         bound = self._bound or 0.0
         if self._bound is None and self._resolution is not None:
             bound = self._resolution.bound(frame, self._check.atoms)
@@ -395,7 +394,7 @@ class NeighborFlips(AnalysisBase):
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence
-        return ResultsGroup(lookup={"parts": flat, "bounds": flat, "failures": flat})
+        return ResultsGroup(lookup=dict.fromkeys(("parts", "bounds", "digests", "failures"), flat))
 
     def _conclude(self) -> None:
         results = self.results
@@ -409,7 +408,11 @@ class NeighborFlips(AnalysisBase):
             _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
         ]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
-        for name in ("parts", "bounds", "failures"):
+        repeats = Repeats()
+        for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):
+            repeats.see(int(number), digested)
+        results.repeats = repeats.stretches
+        for name in ("parts", "bounds", "digests", "failures"):
             del results[name]
         results.failure = failures[failed[0]] if failed else self._behind_the_last()
         results.rules, results.bound, results.resolution = found, bound, self._resolution

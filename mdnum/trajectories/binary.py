@@ -15,8 +15,8 @@ files (ambermd.org/netcdf/nctraj.xhtml).
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -25,7 +25,8 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
+from mdnum.reading import reading
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import NARROWED, box_of, file_of
 from mdnum.trajectories.trajectory import Trajectory
 
@@ -214,11 +215,8 @@ class XtcTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        with closing(XtcFile(path)) as file:
-            try:
-                atoms = file.atoms
-            except ValueError as error:
-                raise self._refused(f"it is no xtc file, or a damaged one ({error})") from None
+        with reading(path, by="mdnum"), closing(XtcFile(path)) as file:
+            atoms = file.atoms
             whole = file.whole_frames()
             # a frame that is cut is one to read
             self._count = whole + (not file.ends_at(whole))
@@ -227,9 +225,10 @@ class XtcTrajectory(Trajectory):
         self._box = b"", Box()
         self.notes = (NARROWED, *self.table.notes)
 
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Any]]:
         with closing(XtcFile(self.path)) as file:
-            yield from self._guarded(numbers, file.read)
+            yield file.read
 
     def _frame(self, number: int, raw: Any) -> Frame:
         # in Å by the operations that MDAnalysis makes, so that both see the same numbers
@@ -358,27 +357,28 @@ class NetcdfTrajectory(Trajectory):
             raise self._refused("it is no Amber NetCDF file, or one that ends in its head")
         self._head, self._count = head, head.whole + 1
         if not head.whole:
-            raise self._ends(0)
+            raise self._unreadable(0, self._ends)
         self.bits = 8 * head.variables["coordinates"].dtype.itemsize
         self.time = "ps" if "time" in head.variables else "frame"
         self._has(head.atoms)
         self.notes = self.table.notes
 
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], dict[str, np.ndarray]]]:
         names = {"coordinates", "velocities", "time", "cell_lengths", "cell_angles"}
         variables = self._head.variables
         with self.path.open("rb") as file:
-            for number in numbers:
-                if number >= self._head.whole:
-                    raise self._ends(number)
-                yield (
-                    number,
-                    {name: self._value(file, variables[name], number) for name in names & set(variables)},
-                )
 
-    def _ends(self, number: int) -> UnreadableFrame:
-        count = self._head.records or 0
-        return self._unreadable(number, f"the file ends in it, and its head tells of {count:,} frames")
+            def get(number: int) -> dict[str, np.ndarray]:
+                if number >= self._head.whole:
+                    raise ValueError(self._ends)
+                return {name: self._value(file, variables[name], number) for name in names & set(variables)}
+
+            yield get
+
+    @property
+    def _ends(self) -> str:
+        return f"the file ends in it, and its head tells of {self._head.records or 0:,} frames"
 
     def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
         box, velocities = Box(), raw.get("velocities")

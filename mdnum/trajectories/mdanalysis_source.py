@@ -12,33 +12,27 @@ import gzip
 import struct
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.reading import CHECK, reading
 from mdnum.trajectories.binary import head_of, opened
-from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.rules import CutoffRule
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
 from mdnum.trajectories.topology import (
     NARROWED,
-    READING_FAILS,
     AtomTable,
     Boxes,
-    box_of,
     file_of,
     formats_of,
-    opened_by_mdanalysis,
     topology_universe,
 )
-from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
 
-# a distance that bonded atoms have, and others do not come to, Å
-_CLOSE = 1.4
 # of trr: magic, length of the word with its end, length of the word, the word; then thirteen numbers
 _TRR = struct.Struct(">3i12s13i")
 _TRR_MAGIC = 1993
@@ -64,23 +58,29 @@ class LibraryFrames:
         """MDAnalysis's timestep of a frame, which may be the one after that at which the reader stands.
 
         Raises:
-            ValueError: reading it would end the process, or its last number was cut.
+            UnreadableFrame: it cannot be read, or should not: that would end the process, or its last number
+                was cut.
         """
-        if self._guard is not None:
-            self._guard.check(number)
-        self._refuse_cut_text(number)
-        return self.trajectory.next() if forward else self.trajectory[number]
+        with self._reading(number):
+            if self._guard is not None:
+                self._guard.check(number)
+            self._refuse_cut_text(number)
+            return self.trajectory.next() if forward else self.trajectory[number]
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """A frame from a timestep, copied."""
-        return Frame(
-            index=number,
-            time=float(number) if untimed else float(ts.time),
-            positions=np.array(ts.positions, np.float64),
-            box=self.boxes.box(ts, number),
-            velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
-            labels=self.labels(number),
-        )
+        """A frame from a timestep, copied; errors as of `timestep`."""
+        with self._reading(number):
+            return Frame(
+                index=number,
+                time=float(number) if untimed else float(ts.time),
+                positions=np.array(ts.positions, np.float64),
+                box=self.boxes.box(ts, number),
+                velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
+                labels=self.labels(number),
+            )
+
+    def _reading(self, number: int) -> AbstractContextManager[None]:
+        return reading(file_of(self.trajectory) or "the trajectory", number)
 
     def _refuse_cut_text(self, number: int) -> None:
         """Refuses the last frame of text whose last number was cut; no other can be."""
@@ -109,21 +109,27 @@ class MDAnalysisTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
-        self._universe, said = self._opened(format)
-        self.table = AtomTable.of(self._universe.atoms)
-        self.table.give_elements(self._universe)
-        trajectory = self._universe.trajectory
-        self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
-        self.length = _length_of(trajectory)
-        self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-        boxes = Boxes(trajectory)
-        self.notes = (NARROWED, *self.table.notes, *boxes.notes, *differing_box(trajectory, boxes))
+        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
+        with reading(path, remedy=CHECK + hint if topology is None else CHECK):
+            self._universe, said = self._universe_of(format)
+            self.table = AtomTable.of(self._universe.atoms)
+            self.table.give_elements(self._universe)
+            trajectory = self._universe.trajectory
+            self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
+            self.length = _length_of(trajectory)
+            self.time = "frame" if _has_no_times(trajectory, said) else "ps"
+            self._boxes = Boxes(trajectory)
+            self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
     @property
     def universe(self) -> Any:
         return self._universe
 
-    def _opened(self, format: str | None) -> tuple[Any, list[str]]:
+    def other_box(self, number: int) -> tuple[str, Box] | None:
+        with reading(self.path, number):
+            return self._boxes.other(self._universe.trajectory[number], number)
+
+    def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
         """A Universe of the trajectory, and the warnings that opening it gave."""
         import MDAnalysis
 
@@ -131,39 +137,35 @@ class MDAnalysisTrajectory(Trajectory):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             if self.topology is None:
-                universe = opened_by_mdanalysis(
-                    path, lambda: MDAnalysis.Universe(str(path), format=format), path
-                )
+                universe = MDAnalysis.Universe(str(path), format=format)
             else:
                 universe = topology_universe(self.topology)
                 atoms = len(universe.atoms)
                 other = atoms_in(path, atoms, format)
                 self._belongs(atoms, atoms if other is None else other)
-                opened_by_mdanalysis(path, lambda: _loaded(universe, path, format), path)
+                _loaded(universe, path, format)
             # a topology without coordinates has no trajectory at all
-            if not opened_by_mdanalysis(path, lambda: len(getattr(universe, "trajectory", ())), path):
+            if not len(getattr(universe, "trajectory", ())):
                 raise self._empty()
         return universe, [str(one.message) for one in caught]
 
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Frame]]:
-        trajectory = self._universe.trajectory
-        frames, at = LibraryFrames(trajectory), None
-        for number in numbers:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                try:
-                    # some formats go forward only, so that the next frame is asked for as the next
-                    forward = at is not None and number == at + 1 and trajectory.ts.frame == at
-                    frame = frames.frame(frames.timestep(number, forward), number, self.time == "frame")
-                except READING_FAILS as error:
-                    raise self._unreadable(number, error) from error
-            at = number
-            yield number, frame
-        count = int(trajectory.n_frames)
-        if at is None or not (self.slice.stop is None or self.slice.stop > count):
-            return
-        if rest := left_over(trajectory):
-            raise self._unreadable(count, rest)
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Frame]]:
+        trajectory, at = self._universe.trajectory, None
+        with reading(self.path):
+            frames = LibraryFrames(trajectory)
+
+        def get(number: int) -> Frame:
+            nonlocal at
+            # some formats go forward only, so that the next frame is asked for as the next
+            forward = at is not None and number == at + 1 and trajectory.ts.frame == at
+            ts, at = frames.timestep(number, forward), number
+            return frames.frame(ts, number, self.time == "frame")
+
+        yield get
+
+    def _behind(self) -> str | None:
+        return left_over(self._universe.trajectory)
 
     def _frame(self, number: int, raw: Frame) -> Frame:
         return raw
@@ -240,45 +242,6 @@ def _has_no_times(trajectory: Any, said: list[str]) -> bool:
     return "time" not in trajectory.ts.data and any(
         "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
     )
-
-
-def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
-    """A sentence on where MDAnalysis takes a box for another one than the file has, from two frames."""
-    if not boxes.own:
-        return
-    worst, said = -1, ""
-    for number in (0, trajectory.n_frames - 1):
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                ts = trajectory[number]
-                ours, theirs = boxes.box(ts, number), box_of(ts.dimensions)
-            apart = float(np.abs(ours.matrix - theirs.matrix)[ours.pbc].max(initial=0.0))
-            # float32, and angles from cosines
-            if not apart > 1e-4 * float(np.abs(ours.matrix).max()):
-                continue
-            counts = []
-            for box in (theirs, ours):
-                tracker = Tracker(CutoffRule(_CLOSE))
-                tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
-                counts.append(len(tracker.members()))
-        except (*READING_FAILS, InputError):
-            # a frame that cannot be used is told in its turn
-            continue
-        if counts[0] - counts[1] > worst:
-            worst = counts[0] - counts[1]
-            said = (
-                "The file's box is not the one that MDAnalysis makes of its lengths and angles: its vectors "
-                f"differ by up to {apart:.3g} Å, so that images stand elsewhere. mdnum takes the file's. In "
-                f"frame {number} MDAnalysis puts {counts[0]:,} pairs of atoms closer than {_CLOSE:g} Å, "
-                f"the file's {counts[1]:,}."
-            )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # selections by place are made at the frame where the reader stands
-        trajectory[0]
-    if said:
-        yield said
 
 
 # ---- behind the last frame

@@ -15,28 +15,27 @@ from __future__ import annotations
 import io
 import re
 import tomllib
-import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from ase.io.formats import UnknownFileTypeError, filetype, iread
+from ase.io.formats import UnknownFileTypeError, filetype, get_ioformat
 from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Bool, Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
-from mdnum.trajectories.topology import CHECK, AtomTable
+from mdnum.reading import ase_images, reading, with_elements
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.topology import AtomTable
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
-# what the end of the file looks like to ASE's reader of traj
-_ENDS = "buffer is smaller than requested size"
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -44,8 +43,6 @@ class AseFrames(Trajectory):
     """Frames that are ASE's Atoms once they are read."""
 
     reader = "ASE"
-    # ASE's reader of each format raises what it likes on files that end early or hold something else
-    _fails = (Exception,)
     _timed, _per_time = False, 1.0
 
     def _atoms_of(self, raw: Any) -> Any:
@@ -57,7 +54,8 @@ class AseFrames(Trajectory):
         units = _units(self.path)
         self.length, self.time = units.length, units.time if self._timed else "frame"
         self._per_time = units.time_factor
-        return AtomTable.plain(first.get_chemical_symbols())
+        order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
+        return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
@@ -65,14 +63,26 @@ class AseFrames(Trajectory):
         if momenta is not None and np.any(momenta):
             velocities = np.asarray(momenta, np.float64) / atoms.get_masses()[:, None] * self._per_time
         timed = self._timed and "time" in atoms.info
+        labels, identified = np.array(atoms.get_chemical_symbols()), _ids(atoms) is not None
+        if identified:
+            order = self._by_id(number, atoms.arrays["id"])
+            atoms, labels = atoms[order], labels[order]
+            velocities = None if velocities is None else velocities[order]
         return Frame(
             index=number,
             time=float(atoms.info["time"]) if timed else float(number),
             positions=np.array(atoms.positions, np.float64),
             box=Box(np.array(atoms.cell.array, np.float64), np.array(atoms.pbc, bool)),
             velocities=velocities,
-            labels=np.array(atoms.get_chemical_symbols()),
+            labels=labels,
+            identified=identified,
         )
+
+
+def _ids(atoms: Any) -> np.ndarray | None:
+    """Ids that say which atom is which; None where there are none, or not one for each."""
+    ids = atoms.arrays.get("id")
+    return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
 
 class AseTrajectory(AseFrames):
@@ -81,41 +91,28 @@ class AseTrajectory(AseFrames):
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
         self.format = format
-        if format == "traj":
-            try:
-                with TrajectoryReader(str(path)) as reader:
-                    self._count = len(reader)
-            except Exception as error:
-                raise self._refused(
-                    f"ASE cannot open it ({error})", "Check that it was written to its end"
-                ) from error
-        _, first = self._first()
-        self._has(len(first), self._of_atoms(first))
-
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        path, at = str(self.path), 0
-        if self.format == "traj":
-            with TrajectoryReader(path) as reader:
-                yield from self._guarded(
-                    numbers, lambda number: reader[number] if number < len(reader) else None
-                )
-            return
-        images = iread(path, index=slice(None), format=self.format, do_not_split_by_at_sign=True)
-
-        def following(number: int) -> Any:
-            nonlocal at
-            skipped, at = number - at, number + 1
-            return next(islice(images, skipped, None), None)
-
-        yield from self._guarded(numbers, following)
-
-    def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
-        if isinstance(error, UnknownFileTypeError) and self.format == str(error):
+        try:
+            get_ioformat(format)
+        except UnknownFileTypeError:
             raise self._refused(
-                f"--format {self.format!r} is known to neither MDAnalysis nor ASE",
+                f"--format {format!r} is known to neither MDAnalysis nor ASE",
                 "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ...",
-            ) from error
-        return super()._unreadable(number, "the file ends in it" if _ENDS in str(error) else error)
+            ) from None
+        if format == "traj":
+            with reading(path, by="ASE"), TrajectoryReader(str(path)) as reader:
+                self._count = len(reader)
+        first = self._first()
+        with self._reading(0):
+            self._has(len(first), self._of_atoms(first))
+
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Any]]:
+        if self.format == "traj":
+            with TrajectoryReader(str(self.path)) as reader:
+                yield lambda number: with_elements(reader[number]) if number < len(reader) else None
+            return
+        images = ase_images(self.path, format=self.format)
+        yield self._in_order(lambda: next(images, None))
 
 
 def format_of(path: Path) -> str:
@@ -129,16 +126,14 @@ def format_of(path: Path) -> str:
     if plain.suffix == ".extxyz":
         return "extxyz"
     try:
-        return filetype(str(path))
+        with reading(path, by="ASE"):
+            return filetype(str(path))
     except UnknownFileTypeError as error:
         raise InputError(
             "neither MDAnalysis nor ASE knows this format",
             remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
             where=str(path),
         ) from error
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        said = str(error).rstrip(".")
-        raise InputError(f"it cannot be read ({said})", remedy=CHECK, where=str(path)) from error
 
 
 def _units(path: Path) -> Units:
@@ -212,17 +207,11 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 class TextTrajectory(Trajectory):
     """A text file of frames. A reader of a format says where a block ends and what is in it."""
 
-    # what lines that are no frame raise
-    _fails = (ValueError, IndexError, KeyError)
-
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        number, block = self._first()
-        try:
-            atoms = len(self._frame(number, block).positions)
-            table = self._described(block)
-        except self._fails as error:
-            raise self._unreadable(0, error) from error
+        block = self._first()
+        with self._reading(0):
+            atoms, table = len(self._frame(0, block).positions), self._described(block)
         self._has(atoms, table)
 
     @abstractmethod
@@ -237,23 +226,12 @@ class TextTrajectory(Trajectory):
     def _described(self, block: list[str]) -> AtomTable:
         """What the first frame says of its atoms."""
 
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, list[str]]]:
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], Any]]:
         from ase.io.formats import open_with_compression
 
-        wanted = next(numbers, None)
         with open_with_compression(str(self.path), "r") as lines:
-            number = 0
-            while wanted is not None:
-                try:
-                    block = self._block(lines)
-                except (ValueError, IndexError, OSError, EOFError) as error:
-                    raise self._unreadable(number, error) from error
-                if block is None:
-                    return
-                if number == wanted:
-                    yield number, block
-                    wanted = next(numbers, None)
-                number += 1
+            yield self._in_order(lambda: self._block(lines))
 
 
 def _whole_number(line: str, what: str) -> int:
@@ -277,8 +255,6 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
     """Extended XYZ."""
 
     format = "extxyz"
-    # ASE's readers raise what they like
-    _fails = (Exception,)
 
     def _block(self, lines: Any) -> list[str] | None:
         head = lines.readline()
@@ -294,7 +270,27 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
     def _atoms_of(self, raw: Any) -> Any:
         from ase.io import read
 
-        return read(io.StringIO("".join(raw)), format="extxyz")
+        return with_elements(read(io.StringIO("".join(raw)), format=self.format))
+
+
+class XdatcarTrajectory(ExtxyzTrajectory):
+    """VASP's XDATCAR; the head is repeated where the cell changes. ASE's reader gives all frames or none."""
+
+    format = "vasp-xdatcar"
+    # lines with the cell and the atoms, and how many atoms there are
+    _head: tuple[list[str], int] = ([], 0)
+
+    def _block(self, lines: Any) -> list[str] | None:
+        line = lines.readline()
+        if "configuration=" not in line:
+            # the name in its first line may be blank
+            head = [line, *islice(lines, 6)]
+            if not "".join(head).strip():
+                return None
+            self._head = head, sum(_whole_number(one, "a number of atoms") for one in head[-1].split())
+            line = lines.readline()
+        head, atoms = self._head
+        return [*head, line, *_rows(lines, 0, atoms)]
 
 
 # ---- LAMMPS
@@ -313,7 +309,6 @@ class LammpsDump(TextTrajectory):
     """A text dump of LAMMPS. Atoms are in the order of their ids."""
 
     format = "lammpstrj"
-    _ids: np.ndarray | None = None
 
     def _described(self, block: list[str]) -> AtomTable:
         items = _items(block)
@@ -350,7 +345,8 @@ class LammpsDump(TextTrajectory):
         velocities = numbers(_VELOCITIES) if timed and set(_VELOCITIES) <= set(columns) else None
         step = _whole_number(items["TIMESTEP"][0], "the time step")
         time = float(items["TIME"][0]) if timed else float(step)
-        return Frame(number, time, positions, Box(matrix, pbc), velocities, _labels(columns, rows))
+        labels = _labels(columns, rows)
+        return Frame(number, time, positions, Box(matrix, pbc), velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
@@ -359,18 +355,7 @@ class LammpsDump(TextTrajectory):
                 "the dump has no ids, and LAMMPS changes the order of atoms as they move",
                 "Dump the column id",
             )
-        ids = rows[:, columns.index("id")].astype(np.int64)
-        order = np.argsort(ids, kind="stable")
-        known = self._ids = ids[order] if self._ids is None else self._ids
-        if not np.array_equal(known, ids[order]):
-            lost = np.setdiff1d(known, ids)
-            seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise self._odd(
-                number,
-                f"{seen} of the first frame: {len(rows):,} atoms, and {len(known):,} there",
-                "Dump one group of atoms that stays the same",
-            )
-        return order
+        return self._by_id(number, rows[:, columns.index("id")].astype(np.int64))
 
     def _block(self, lines: Any) -> list[str] | None:
         block: list[str] = []

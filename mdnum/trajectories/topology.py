@@ -4,7 +4,7 @@ MDAnalysis keeps three lengths and three angles, from which a box has its first 
 in the xy plane. Most programs turn their boxes like that; where one does not, its coordinates are turned
 otherwise too, and images would be put into wrong places without a word:
 
-- CHARMM's are symmetric matrices (since version 22, in dcd files);
+- CHARMM's are symmetric matrices (since version 22, in dcd files, which do not say so: see dcd_boxes);
 - HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
 - those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
 
@@ -16,8 +16,6 @@ one's, though it is the next one's.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,14 +26,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
+from mdnum.reading import ase_images, reading
 from mdnum.trajectories.frame import Box
 
-#: what readers raise on files that end early or hold something else
-READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
 #: what a reader of results from MDAnalysis's coordinates should know
 NARROWED = "MDAnalysis hands every coordinate over in float32, whatever the file stores."
-#: what to do about a file that nobody can read
-CHECK = "Check that the file is whole and of the kind its name says"
 
 _UNNAMED = "The file says how many atoms there are and nothing else; names and elements need a topology."
 _GUESSED = "Elements are guessed from the names of the atoms."
@@ -122,16 +117,13 @@ class AtomTable:
         """
         try:
             return cls.of(topology_universe(topology).atoms)
-        except InputError:
-            from ase.io import read
-
+        except InputError as refused:
             try:
-                atoms: Any = read(str(topology))
-            except Exception as error:
-                raise InputError(
-                    "neither MDAnalysis nor ASE reads this topology", where=str(topology)
-                ) from error
-            return cls.plain(atoms.get_chemical_symbols())
+                with reading(topology, by="ASE"):
+                    return cls.plain(next(ase_images(topology, -1)).get_chemical_symbols())
+            except InputError:
+                # MDAnalysis knows most of the formats, and says more of them
+                raise refused from None
 
     def give_elements(self, universe: Any) -> None:
         """Adds the elements that were guessed, for selections by element."""
@@ -139,53 +131,17 @@ class AtomTable:
             universe.add_TopologyAttr("elements", self.species)
 
 
-def first_line(error: BaseException) -> str:
-    """The message of an error in a line."""
-    cause: BaseException | None = error
-    while cause is not None and not str(cause).strip():
-        cause = cause.__context__
-    text = str(error if cause is None else cause).strip().splitlines()
-    if text and cause is not error and not text[0].startswith("could not convert"):
-        # how a reader stumbles over an end is its own business, unless a word is no number
-        text = []
-    if not text and isinstance(error, StopIteration | EOFError):
-        return "the file ends in it"
-    return text[0].rstrip(".") if text else type(error).__name__
-
-
 def topology_universe(topology: str | Path) -> Any:
-    """A Universe of a topology, with or without coordinates.
+    """A Universe of a topology, without coordinates: its readers of these may write files beside it.
 
     Raises:
         InputError: MDAnalysis does not read it.
     """
-    import MDAnalysis
+    from MDAnalysis import Universe
+    from MDAnalysis.core._get_readers import get_parser_for
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return opened_by_mdanalysis(Path(topology), lambda: MDAnalysis.Universe(str(topology)), None)
-
-
-def opened_by_mdanalysis(file: Path, act: Callable[[], Any], trajectory: Path | None) -> Any:
-    """What opening a file gives; all that goes wrong in it is an InputError."""
-    hook = sys.unraisablehook
-    # readers that could not open complain once more when they are thrown away
-    sys.unraisablehook = lambda _: None
-    try:
-        return act()
-    except (*READING_FAILS, ImportError) as error:
-        said = first_line(error)
-        if isinstance(error, ImportError) or "install" in str(error):
-            raise InputError(
-                f"reading it needs a package that is not installed ({said})",
-                remedy="Install the package, or convert the file to xtc or extxyz",
-                where=str(file),
-            ) from None
-        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-        remedy = CHECK + hint if file == trajectory else CHECK
-        raise InputError(f"MDAnalysis cannot open it ({said})", remedy=remedy, where=str(file)) from None
-    finally:
-        sys.unraisablehook = hook
+    with reading(topology), get_parser_for(str(topology))(str(topology)) as parser:
+        return Universe(parser.parse())
 
 
 # ---- boxes
@@ -218,12 +174,24 @@ class Boxes:
             words = formats_of(trajectory)
             if make := next((_MATRICES[word] for word in words if word in _MATRICES), None):
                 self._matrix = make(str(path), trajectory)
+                self.notes = getattr(self._matrix, "notes", ())
             if _PDB & set(words) and trajectory.n_frames > 1 and path.is_file():
                 stat = path.stat()
                 self._models, records = _models(str(path), stat.st_size, stat.st_mtime_ns)
                 self.notes = (_ONCE,) if self._models and records == 1 else ()
         self._changed = bool(getattr(trajectory, "transformations", ()))
         self.own = self._matrix is not None or bool(self._models)
+
+    def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
+        """As `Trajectory.other_box`, for a timestep that is this frame of the file."""
+        instead = getattr(self._matrix, "instead", None)
+        if instead is not None and (matrix := instead(number)) is not None:
+            return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))
+        ours, theirs = self.box(ts, number), box_of(ts.dimensions)
+        apart = float(np.abs(ours.matrix - theirs.matrix)[ours.pbc].max(initial=0.0))
+        # float32, and angles from cosines
+        differs = self.own and apart > 1e-4 * float(np.abs(ours.matrix).max())
+        return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
@@ -257,23 +225,11 @@ def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
     return Box(matrix if matrix.any() else np.full((3, 3), np.nan), np.ones(3, bool))
 
 
-def _charmm(path: str, trajectory: Any) -> Matrices:
-    from MDAnalysis.lib.formats.libdcd import DCDFile
+def _dcd(path: str, trajectory: Any) -> Matrices:
+    # it looks for pairs of atoms, which needs what is above this module
+    from mdnum.trajectories.dcd_boxes import DcdBoxes
 
-    file = DCDFile(path)
-
-    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        if (np.asarray(ts.dimensions[3:]) == 90).all():
-            return None
-        file.seek(number)
-        xx, xy, yy, xz, yz, zz = np.array(file.read().unitcell, np.float64)
-        symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        # in these places stand cosines otherwise, or angles, which give other lengths
-        lengths = np.sqrt((symmetric**2).sum(axis=1))
-        cosines = max(abs(xy), abs(xz), abs(yz)) <= 1
-        return symmetric if not cosines and np.allclose(lengths, ts.dimensions[:3], rtol=1e-5) else None
-
-    return matrix
+    return DcdBoxes(path, trajectory)
 
 
 def _hoomd(path: str, trajectory: Any) -> Matrices:
@@ -324,7 +280,7 @@ def _dlpoly(path: str, trajectory: Any) -> Matrices:
     return matrix
 
 
-_MATRICES = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
+_MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 
 @lru_cache(maxsize=4)

@@ -15,6 +15,7 @@ import warnings
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
 from itertools import islice
@@ -24,9 +25,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from mdnum.errors import InputError
-from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame
-from mdnum.trajectories.topology import CHECK, AtomTable, first_line, topology_universe
+from mdnum.errors import InputError, expect_path
+from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
+from mdnum.trajectories.frame import Box, Frame, FrameCheck
+from mdnum.trajectories.repeats import Repeats
+from mdnum.trajectories.topology import AtomTable, topology_universe
 
 #: Frames from which the resolution of a file is read.
 SAMPLE = 8
@@ -40,12 +43,18 @@ _LANGUAGE = (
     'Write it as MDAnalysis does: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
 )
 _SHOWN = 8
+#: What to do with frames that are not in a file.
+IN_MEMORY = (
+    "Give the path of a trajectory; arrays (frames, atoms, 3) go into mdnum.trajectories.NeighborFlips("
+    "MDAnalysis.Universe.empty(atoms).load_new(array), r_cut=...)"
+)
 
 
 class Trajectory(ABC):
     """Frames of one file, read lazily and in order, as often as wanted.
 
-    A reader says how many atoms there are (`_has`), finds frames (`_raw`) and decodes them (`_frame`).
+    A reader says how many atoms there are (`_has`), finds frames (`_reader`) and decodes them (`_frame`).
+    What it raises in doing so becomes an unreadable frame.
 
     Args:
         path: the file.
@@ -62,10 +71,14 @@ class Trajectory(ABC):
     time: str = "frame"
     table: AtomTable  # what is known of the atoms
     notes: tuple[str, ...] = ()  # what a reader of the results should know about the reading, each a sentence
-    # what a frame that is none raises while it is decoded
-    _fails: tuple[type[BaseException], ...] = (OSError, EOFError, ValueError, RuntimeError, LookupError)
     # frames in the file, where they are known
     _count: int | None = None
+    # ids of the atoms in ascending order, where the file has them
+    _ids: np.ndarray | None = None
+    # whether frames that repeat earlier ones are left out; which did, and what was found of frames, when read
+    drop_repeats = False
+    repeats: Repeats
+    check: FrameCheck
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):
         self.path, self.slice = path, slice
@@ -99,6 +112,10 @@ class Trajectory(ABC):
         """Species of every atom, words, shape (atoms,)."""
         return self.table.species
 
+    def other_box(self, number: int) -> tuple[str, Box] | None:
+        """(code of a finding, another box that a frame may be taken to have); None without one."""
+        return None
+
     @property
     def name(self) -> str:
         """The file's name."""
@@ -108,7 +125,12 @@ class Trajectory(ABC):
     def in_file(self) -> int | None:
         """Frames in the file; None where they are not known without reading it."""
         if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
-            self._count = sum(1 for _ in self._raw(chosen(slice(None), None)))
+            with self._opened() as get:
+                for number in chosen(slice(None), None):
+                    with self._reading(number):
+                        if get(number) is None:
+                            self._count = number
+                            break
         return self._count
 
     @property
@@ -128,18 +150,26 @@ class Trajectory(ABC):
             UnreadableFrame: one cannot be read. Those before it have been given.
             InputError: a frame has another number of atoms.
         """
-        for number, raw in self._raw(chosen(self.slice, self.in_file)):
-            try:
-                frame = self._frame(number, raw)
-            except self._fails as error:
-                raise self._unreadable(number, error) from error
-            if len(frame.positions) != self.atoms:
-                raise self._odd(
-                    number,
-                    f"has {len(frame.positions):,} atoms and the first {self.atoms:,}",
-                    "Leave out the frames with another number of atoms: a flip needs the pair before",
-                )
-            yield frame
+        number = None
+        with self._opened() as get:
+            for number in chosen(self.slice, self.in_file):
+                with self._reading(number):
+                    if (raw := get(number)) is None:
+                        return
+                    frame = self._frame(number, raw)
+                if len(frame.positions) != self.atoms:
+                    raise self._odd(
+                        number,
+                        f"has {len(frame.positions):,} atoms and the first {self.atoms:,}",
+                        "Leave out the frames with another number of atoms: a flip needs the pair before",
+                    )
+                yield frame
+        end = self.in_file or 0
+        if number is None or not (self.slice.stop is None or self.slice.stop > end):
+            return
+        with self._reading(end):
+            if rest := self._behind():
+                raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
         """The first of the frames asked for, `SAMPLE` of them; fewer where one of them cannot be read.
@@ -169,27 +199,63 @@ class Trajectory(ABC):
         return ":".join("" if end is None else str(end) for end in ends)
 
     @abstractmethod
-    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
-        """Frames by their numbers, which go up, as `_frame` takes them; ends with the file."""
+    def _reader(self) -> AbstractContextManager[Callable[[int], Any]]:
+        """Opens the file: gives frames by ascending number, as `_frame` takes them; None at the end."""
 
     @abstractmethod
     def _frame(self, number: int, raw: Any) -> Frame:
-        """A frame from what `_raw` gave."""
+        """A frame from what `_reader` gave."""
 
-    def _guarded(self, numbers: Iterator[int], get: Callable[[int], Any]) -> Iterator[tuple[int, Any]]:
-        """Frames by number as a reader gives them, up to None; what it raises is an unreadable frame."""
-        for number in numbers:
-            try:
-                raw = get(number)
-            except self._fails as error:
-                raise self._unreadable(number, error) from error
-            if raw is None:
-                return
-            yield number, raw
+    def _behind(self) -> str | None:
+        """What is left in the file behind its last frame, in words."""
+        return None
 
-    def _first(self) -> tuple[int, Any]:
+    def _by_id(self, number: int, ids: np.ndarray) -> np.ndarray:
+        """The order of a frame's atoms by their ids, which are those of the first frame."""
+        order = np.argsort(ids, kind="stable")
+        known = self._ids = ids[order] if self._ids is None else self._ids
+        if not np.array_equal(known, ids[order]):
+            lost = np.setdiff1d(known, ids)
+            seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
+            raise self._odd(
+                number,
+                f"{seen} of the first frame: {len(ids):,} atoms, and {len(known):,} there",
+                "Dump one group of atoms that stays the same",
+            )
+        return order
+
+    @contextmanager
+    def _opened(self) -> Iterator[Callable[[int], Any]]:
+        with ExitStack() as stack:
+            with reading(self.path, by=self.reader):
+                get = stack.enter_context(self._reader())
+            yield get
+
+    def _reading(self, number: int) -> AbstractContextManager[None]:
+        return reading(self.path, number, by=self.reader)
+
+    def _in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
+        """Frames by number, of a reader that goes forward only."""
+        at = 0
+
+        def get(number: int) -> Any:
+            nonlocal at
+            raw = None
+            while at <= number:
+                # the frame at fault may be one that is skipped
+                with self._reading(at):
+                    raw = following()
+                if raw is None:
+                    break
+                at += 1
+            return raw
+
+        return get
+
+    def _first(self) -> Any:
         """The first of the file."""
-        first = next(self._raw(iter([0])), None)
+        with self._opened() as get, self._reading(0):
+            first = get(0)
         if first is None:
             raise self._empty()
         return first
@@ -200,8 +266,7 @@ class Trajectory(ABC):
     def _odd(self, number: int, seen: str, remedy: str) -> FrameError:
         return FrameError(f"frame {number} {seen}", frame=number, remedy=remedy, where=str(self.path))
 
-    def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
-        said = error if isinstance(error, str) else first_line(error)
+    def _unreadable(self, number: int, said: str) -> UnreadableFrame:
         return UnreadableFrame(f"frame {number} cannot be read ({said})", frame=number, where=str(self.path))
 
 
@@ -223,6 +288,8 @@ def open_trajectory(
     Raises:
         InputError: no such file, nobody reads it, or it does not belong to the topology.
     """
+    for one in (path, "" if topology is None else topology):
+        expect_path(one, IN_MEMORY)
     file, words = split_path(str(path))
     if words and slice:
         raise InputError(f"frames are named twice, by @{words} and by {slice!r}", remedy="Name them once")
@@ -296,7 +363,8 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
         if word.upper() in known and not extended:
             return library
     word = format or text.format_of(file)
-    return text.ExtxyzTrajectory if word == "extxyz" else partial(text.AseTrajectory, format=word)
+    blocks = {"extxyz": text.ExtxyzTrajectory, "vasp-xdatcar": text.XdatcarTrajectory}
+    return blocks.get(word) or partial(text.AseTrajectory, format=word)
 
 
 def _first_lines(file: Path) -> tuple[str, str]:

@@ -46,6 +46,7 @@ _BOLTZMANN = 8.617333262e-5
 _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 
 
+@frame.keywords_checked
 def audit(
     calculator: str | Callable[[], Any] | None = None,
     structure: Atoms | str | Path | None = None,

@@ -31,6 +31,7 @@ _DISAGREE = 0.01
 _NAMED = 4
 
 
+@frame.keywords_checked
 def bounce(
     system: BallSystem | str | Path,
     *,

@@ -81,6 +81,7 @@ class Examination(CaseAnswers):
     seconds: Annotated[float, Ge(0)] = 0.0  # that were spent
 
 
+@frame.keywords_checked
 def conform(
     pairs: str | Callable[..., Any] | PairList | None = None,
     *,

@@ -70,6 +70,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
     return Table(tuple(columns), rows, title)
 
 
+@frame.keywords_checked
 def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     """Run a demonstration, or all of them.
 

@@ -6,19 +6,19 @@ import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
-from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering
+from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords_checked
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -42,6 +42,7 @@ _BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", 
 _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
 
 
+@keywords_checked
 def flips(
     trajectory: str | Path,
     other: str | Path | None = None,
@@ -54,6 +55,7 @@ def flips(
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
     format: str | None = None,
+    drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
@@ -72,6 +74,8 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
+        drop_repeats: leave out every frame that is an earlier one again, bit for bit; the others keep their
+            numbers. Such frames are reported either way.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
@@ -91,8 +95,10 @@ def flips(
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
+        a.drop_repeats = b.drop_repeats = drop_repeats
         return compare(a, b, asked or _default_rules(a), between, **keep)
     opened = open_trajectory(trajectory, topology, format=format)
+    opened.drop_repeats = drop_repeats
     asked = asked or _default_rules(opened)
     groups = selected(opened, between)
     sample = opened.sample()
@@ -125,6 +131,9 @@ def flips(
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
+            "alternative_box": _with_other_box(opened, sample[0], found, groups),
+            "repeats": opened.repeats.plain(),
+            "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
@@ -206,6 +215,10 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
     """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
+    from mdnum.trajectories.trajectory import IN_MEMORY
+
+    for one in (first, second):
+        expect_path(one, IN_MEMORY)
     names = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
     bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in names]
     if topology is None and not bare[0] and bare[1]:
@@ -219,9 +232,22 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 # ---- the ledger, and what is counted from it
 
 
+def _with_other_box(trajectory: Trajectory, frame: Any, found: Pass, groups: Groups) -> dict[str, Any] | None:
+    """The pairs of each rule in a frame with another box that it may be taken to have; None without one."""
+    from mdnum.trajectories.tracker import Tracker
+
+    if (other := trajectory.other_box(frame.index)) is None:
+        return None
+    trackers = [Tracker(one.rule, *groups, list(map(str, trajectory.species))) for one in found.rules]
+    for one in trackers:
+        one.step(replace(frame, box=other[1]))
+    pairs = [one.pairs for one in trackers]
+    return {"code": other[0], "frame": frame.index, "box": other[1].plain(), "pairs": pairs}
+
+
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
-    from mdnum.trajectories.frame import UnreadableFrame
+    from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
         return False

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 ALL = "all"
 
 
+@frame.keywords_checked
 def fork(
     system: System | BallSystem | str | Path,
     vary: str | None = None,
@@ -113,6 +115,7 @@ def fork(
     return followed(loaded, twin_of(choice, loaded), labels, asked, **keep)
 
 
+@frame.keywords_checked
 def fork_screen(
     system: System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
@@ -150,6 +153,7 @@ def fork_screen(
     return answer.outcome
 
 
+@partial(frame.keywords_checked, more=PairQuestion.__annotations__)
 def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked: Any) -> Outcome:
     """Compare two finished runs of one world: what was different, and where they diverge.
 
@@ -203,6 +207,7 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
     return followed(system, twin_of(found), labels, replace(question, steps=last), stored, **keep)
 
 
+@frame.keywords_checked
 def fork_benign(
     system: System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:

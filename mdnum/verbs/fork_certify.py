@@ -33,6 +33,7 @@ _NOTHING, _NO_BITS = 0.05, 1.0
 _NARROW = ("float16", "bfloat16")
 
 
+@frame.keywords_checked
 def fork_certify(
     system: System | BallSystem | str | Path,
     *,
@@ -267,6 +268,7 @@ def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
 # -- programs ------------------------------------------------------------------------------------------
 
 
+@frame.keywords_checked
 def fork_processes(
     system: System | str | Path,
     *,

@@ -33,6 +33,7 @@ _VISIBLE, _TREND = 0.05, 3
 _ROOM = 0.03
 
 
+@frame.keywords_checked
 def fork_map(
     system: System | BallSystem | str | Path,
     key: str,
@@ -294,6 +295,7 @@ def _with_unit(text: str, unit: str) -> str:
 # -- forecasts -----------------------------------------------------------------------------------------
 
 
+@frame.keywords_checked
 def fork_forecast(
     system: System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:

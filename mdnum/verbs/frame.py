@@ -11,7 +11,9 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 
 from __future__ import annotations
 
+import functools
 import importlib
+import inspect
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,13 +22,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, ParamSpec, TypedDict, TypeVar
 
 import numpy as np
 
 from mdnum import units
 from mdnum.errors import FolderError, InputError
 from mdnum.plain import plain
+from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
@@ -36,8 +39,14 @@ from mdnum.store.files import default_folder
 if TYPE_CHECKING:
     from mdnum.units import Units
 
+P, R = ParamSpec("P"), TypeVar("R")
+
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
+#: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
+PARTIAL, UNDECIDED = "partial", "undecided"
 
 #: Lines of log.txt for a phase of a run that is followed step by step.
 STEPWISE = 50
@@ -187,6 +196,39 @@ class Keep(TypedDict, total=False):
     overrides: Mapping[str, Any] | None
     report: bool
     progress: Progress | None
+
+
+class UnknownKeyword(InputError, TypeError):
+    """A verb has no such keyword; also the TypeError that Python raises for one."""
+
+
+def keywords_checked(verb: Callable[P, R], more: Iterable[str] = ()) -> Callable[P, R]:
+    """A public verb that rejects a keyword it does not have before it reads or writes anything.
+
+    What a verb passes on as `**keep` would otherwise be looked at only when its folder is made, after options
+    that the misspelled one was to replace have been used.
+
+    Args:
+        more: names of keywords that it passes on besides those of `Keep`.
+
+    Raises:
+        UnknownKeyword: with the nearest name that it has, and all of them.
+    """
+    parameters = inspect.signature(verb).parameters.values()
+    known = [one.name for one in parameters if one.kind not in (one.VAR_KEYWORD, one.POSITIONAL_ONLY)]
+    known += [
+        name for one in parameters if one.kind is one.VAR_KEYWORD for name in (*Keep.__annotations__, *more)
+    ]
+
+    @functools.wraps(verb)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        for word in kwargs:
+            if word not in known:
+                error = unknown(f"keyword of {verb.__name__}()", word, known)
+                raise UnknownKeyword(error.message, remedy=error.remedy)
+        return verb(*args, **kwargs)
+
+    return checked
 
 
 @dataclass

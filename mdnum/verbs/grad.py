@@ -50,6 +50,7 @@ _LEFT_OUT = 0.01
 _CLOSE = 0.01
 
 
+@frame.keywords_checked
 def grad(
     system: System | BallSystem | str | Path,
     of: str | None = None,

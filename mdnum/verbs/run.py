@@ -21,7 +21,7 @@ from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, say
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, keywords_checked, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ COMPILE = "from mdnum.md import decide, kernel; kernel._driver(), decide._noting
 _BESIDE = 2000
 
 
+@keywords_checked
 def run(
     system: System | str | Path | None,
     *,

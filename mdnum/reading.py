@@ -1,0 +1,169 @@
+"""The one way through which files reach the readers of other packages.
+
+ASE's and MDAnalysis's readers raise what their parsing meets: any exception of Python's, messages of many
+lines, or none. `reading` turns each into one line with the file and the frame.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError, MdnumError
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+#: what to do about a file that nobody can read
+CHECK = "Check that the file is whole and of the kind its name says"
+#: what to do about a structure that nobody can read
+CHECK_STRUCTURE = "Check that `ase.io.read` opens it; extxyz is the safest format"
+# what the end of the file looks like to ASE's reader of traj
+_ENDS = "buffer is smaller than requested size"
+# what MDAnalysis puts around the message of one of its parsers
+_WRAPPED = ("Failed to construct topology", "Failed to load from the topology")
+# calls at the end of a file after which a reader is taken to count and not to read
+_PATIENCE = 10_000
+
+
+class FrameError(InputError):
+    """A frame holds what cannot be right; it has this number in its file, from 0."""
+
+    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
+        super().__init__(message, remedy=remedy, where=where)
+        self.frame = frame
+
+
+class UnreadableFrame(FrameError):
+    """A frame in the middle of a file cannot be read; those before it were given out."""
+
+    def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
+        before = f"The frames before it were read; to stop there add @:{frame} to the path"
+        super().__init__(message, frame=frame, remedy=remedy or (before if frame else CHECK), where=where)
+
+
+@contextmanager
+def reading(
+    file: str | Path, frame: int | None = None, *, by: str = "MDAnalysis", remedy: str = CHECK
+) -> Iterator[None]:
+    """Everything that a reader raises inside becomes one line; its warnings are dropped.
+
+    Args:
+        file: that is read.
+        frame: number in the file of the frame that is read; None while the file is opened.
+        by: the package whose reader it is.
+        remedy: what to do where the file cannot be opened.
+
+    Raises:
+        UnreadableFrame: the frame cannot be read.
+        InputError: the file cannot be opened, or needs a package that is not installed. mdnum's own errors
+            pass as they are.
+    """
+    hook = sys.unraisablehook
+    # readers that could not open complain once more when they are thrown away
+    sys.unraisablehook = lambda _: None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except MdnumError:
+        raise
+    except Exception as error:
+        said, where = first_line(error), str(file)
+        if frame is not None:
+            raise UnreadableFrame(
+                f"frame {frame} cannot be read ({said})", frame=frame, where=where
+            ) from error
+        if isinstance(error, ImportError) or "install" in str(error):
+            raise InputError(
+                f"reading it needs a package that is not installed ({said})",
+                remedy="Install the package, or convert the file to xtc or extxyz",
+                where=where,
+            ) from error
+        raise InputError(f"{by} cannot open it ({said})", remedy=remedy, where=where) from error
+    finally:
+        sys.unraisablehook = hook
+
+
+def first_line(error: BaseException) -> str:
+    """The message of an error in a line."""
+    cause: BaseException | None = error
+    while cause is not None and not str(cause).strip():
+        cause = cause.__context__
+    text = str(error if cause is None else cause).strip().splitlines()
+    if text and text[0].startswith(_WRAPPED):
+        text = [line.removeprefix("Error: ") for line in text if line.startswith("Error: ")] or text
+    if text and cause is not error and not text[0].startswith("could not convert"):
+        # how a reader stumbles over an end is its own business, unless a word is no number
+        text = []
+    if (not text and isinstance(error, StopIteration | EOFError)) or (text and _ENDS in text[0]):
+        return "the file ends in it"
+    said = text[0].rstrip(".") if text else ""
+    # the message of some is no more than a key or a number
+    return said if " " in said else f"{type(error).__name__}: {said}" if said else type(error).__name__
+
+
+# ---- ASE
+
+
+class _Lines(io.TextIOWrapper):
+    """A text file that stops a reader that keeps reading at its end because it trusts a count in the head."""
+
+    _at_end = 0
+
+    def readline(self, size: int = -1, /) -> str:
+        line = super().readline(size)
+        self._at_end = 0 if line else self._at_end + 1
+        if self._at_end > _PATIENCE:
+            raise ValueError("the file ends before what its head announces")
+        return line
+
+
+def ase_images(
+    path: str | Path, index: int | slice | str = slice(None), format: str | None = None
+) -> Iterator[Atoms]:
+    """Structures that ASE reads from a file; to be used inside of `reading`.
+
+    Args:
+        path: taken as it is: a name that begins like a database's address, or has an @ in it, is a file's.
+        index: which of them, as a number, a slice or in ASE's words, which may be a choice in a database.
+        format: in ASE's word; None to find it.
+    """
+    # its readers take half a second to import
+    from ase.io.formats import filetype, get_ioformat, iread, open_with_compression, read
+    from ase.utils import string2index
+
+    if isinstance(index, str):
+        with suppress(ValueError):
+            index = string2index(index)
+    file: Any = str(path)
+    format = format or filetype(file)
+    kind = get_ioformat(format)
+    if kind.acceptsfd and not kind.isbinary:
+        lines: Any = open_with_compression(file, "r")
+        file = _Lines(lines.detach(), lines.encoding, lines.errors)
+    found: Any = read if isinstance(index, str) else iread
+    yield from map(with_elements, found(file, index, format, do_not_split_by_at_sign=True))
+
+
+def with_elements(atoms: Any) -> Atoms:
+    """The atoms, each of which is of an element or of none (0).
+
+    Raises:
+        ValueError: one has another atomic number, which ASE gives no symbol or, below 0, a wrong one.
+    """
+    from ase.data import chemical_symbols
+
+    numbers = atoms.numbers
+    bad = np.flatnonzero((numbers < 0) | (numbers >= len(chemical_symbols)))
+    if bad.size:
+        most = len(chemical_symbols) - 1
+        raise ValueError(f"atom {bad[0]} has the atomic number {numbers[bad[0]]}; expected 0 to {most}")
+    return atoms

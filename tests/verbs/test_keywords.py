@@ -1,0 +1,102 @@
+"""What every public verb does with a keyword that it does not have, and with an array for a path."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from itertools import pairwise
+
+import MDAnalysis
+import numpy as np
+import pytest
+
+import mdnum
+from mdnum.errors import InputError
+from mdnum.trajectories import NeighborFlips
+from mdnum.verbs.frame import Keep
+
+# other names of the package take no options of a verb
+_NO_VERBS = {"systems", "load", "build", "diagnose", "MdnumCalculator"}
+VERBS = sorted(
+    name for name in mdnum.__all__ if name not in _NO_VERBS and inspect.isfunction(getattr(mdnum, name))
+)
+
+
+def test_no_verb_is_forgotten() -> None:
+    assert {"run", "fork", "grad", "flips", "conform", "audit_calculator", "bounce"} <= set(VERBS)
+    assert len(VERBS) >= 15
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_a_misspelled_keyword_is_rejected_with_the_nearest_right_one(
+    name: str, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    verb = getattr(mdnum, name)
+    positional = [None] * sum(
+        one.default is one.empty and one.kind is one.POSITIONAL_OR_KEYWORD
+        for one in inspect.signature(verb).parameters.values()
+    )
+    # an argument that cannot be used is not reached
+    with pytest.raises(InputError, match=r"'reports'.*Did you mean report\?") as caught:
+        verb(*positional, reports=False)
+    assert isinstance(caught.value, TypeError)
+    with pytest.raises(InputError, match="no keyword of"):
+        verb(*positional, zzz=1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("verb", "word", "right"),
+    [
+        (mdnum.flips, "cutoff", "cutoffs"),
+        (mdnum.flips, "topolgy", "topology"),
+        (mdnum.run, "override", "overrides"),
+        (mdnum.fork_folders, "repeat", "repeats"),
+        (mdnum.grad, "replica", "replicas"),
+    ],
+)
+def test_of_each_verb_its_own_keywords_are_known(verb, word: str, right: str) -> None:
+    with pytest.raises(InputError, match=rf"Did you mean {right}\?"):
+        verb(*["nothing"] * (2 if verb is mdnum.fork_folders else 1), **{word: 5.0})
+
+
+def test_right_keywords_pass(tmp_path) -> None:
+    # told apart by what is wrong instead
+    with pytest.raises(InputError, match="no such file"):
+        mdnum.flips("nothing.xtc", cutoffs=[5.0], **dict.fromkeys(Keep.__annotations__))
+
+
+# without the type checks of the tests, which would answer before mdnum does
+ARRAYS = """
+import numpy as np, mdnum
+three = np.zeros((5, 40, 3))
+for name, arguments in (
+    ("flips", (three,)), ("flips", (three, "other.xtc")), ("flips", ("a.xtc", three)), ("flips", ([three],)),
+    ("run", (three,)), ("fork", (three,)), ("grad", (three, "msd", "epsilon")), ("bounce", (three[0],)),
+    ("fork_folders", (three, "b")), ("audit_calculator", ("ase.calculators.emt:EMT", three[0])),
+):
+    try:
+        getattr(mdnum, name)(*arguments)
+    except mdnum.InputError as error:
+        print(name, error)
+"""
+
+
+def test_an_array_for_a_path_is_refused_in_a_line(tmp_path) -> None:
+    words = [sys.executable, "-W", "ignore", "-c", ARRAYS]
+    (tmp_path / "a.xtc").write_bytes(b"no trajectory")
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 10
+    for line in lines:
+        assert "given where a path is expected" in line and len(line) < 250
+        assert "of shape (5, 40, 3)" in line or "of shape (40, 3)" in line or "list given" in line
+
+
+def test_arrays_go_where_the_message_says() -> None:
+    x = np.random.default_rng(3).uniform(0, 9, (5, 40, 3)).astype(np.float32)
+    found = NeighborFlips(MDAnalysis.Universe.empty(40).load_new(x), r_cut=3.0).run().results
+    inside = [np.linalg.norm(one[:, None] - one, axis=2)[np.triu_indices(40, 1)] < 3.0 for one in x]
+    assert len(found.flips) == sum(np.count_nonzero(a != b) for a, b in pairwise(inside))
