@@ -323,13 +323,11 @@ def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
 
     Wrong forces that do no work around loops are the forces of another energy; those that do have none.
     """
-    by_name = {result.name: result for result in results}
-    curl, forces = by_name.get("curl"), by_name.get("forces")
-    if curl is None or forces is None or largely_unasked(curl):
+    numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
+    curl, forces = numbers.get("curl"), numbers.get("forces")
+    if not curl or not forces:
         return {}
-    if curl.numbers["with_work"]:
-        return {"FORCES_NOT_GRADIENT": "no_energy"}
-    # a curl is seen where it is above a share of the stiffness that the wrong part of the forces would show
-    seen = curl.numbers["unseen_share"]
-    wrong = forces.numbers["largest_difference"] / max(forces.numbers["rms_force"], 1e-300)
-    return {"FORCES_NOT_GRADIENT": "another_energy"} if seen < _FAR_BELOW * wrong else {}
+    # a curl would be seen that is far below the share of the forces that is wrong
+    seen = curl["unseen_share"] * forces["rms_force"] < _FAR_BELOW * forces["largest_difference"]
+    which = "no_energy" if curl["with_work"] else "another_energy" if seen else ""
+    return {"FORCES_NOT_GRADIENT": which}
