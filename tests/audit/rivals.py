@@ -28,7 +28,7 @@ def liquid(*krypton: int) -> Atoms:
 def slab() -> Atoms:
     atoms = liquid()
     atoms.pbc = (True, True, False)
-    atoms.cell[2, 2] = 12.0
+    atoms.set_cell(atoms.cell.array * np.array([[1.0], [1.0], [3.0]]))
     return atoms
 
 

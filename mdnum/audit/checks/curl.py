@@ -82,7 +82,7 @@ class CurlCheck(AuditCheck):
                 np.median([(abs(one.curl) + one.error) / max(one.stiffness, 1e-300) for one in loops])
             ),
         }  # fmt: skip
-        values = {"loops": len(loops), "wrong": len(wrong)}
+        values: dict[str, Any] = {"loops": len(loops), "wrong": len(wrong)}
         values |= {"limit": abs(limit.curl) + limit.error, "stiffness": limit.stiffness}
         found = []
         if worst:

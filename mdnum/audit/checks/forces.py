@@ -101,7 +101,8 @@ class ForcesCheck(AuditCheck):
         worker = subject.fresh()
         atoms, noise = settled(worker, rng, at_least=FEW)
         ways = Ways()
-        if 2 * noise.energy / _LADDER[2] > _DROWNED * rms(worker.forces(atoms)):
+        summed = 0.0 if steps(worker, atoms).energy else worker.known["order"][1].energy
+        if 2 * summed / _LADDER[2] > _DROWNED * rms(worker.forces(atoms)):
             # the rounding of a long sum grows with the number of atoms, and hides the force on one of them
             try:
                 with worker.trying():
@@ -322,7 +323,9 @@ def _drowned(
         return []
     # forces that are known well are not tested where the energy is not
     severity = "error" if max(noise.force, noise.typical) > _DROWNED * scale else "warning"
-    values = {"force": noise.force, "energy": noise.energy, "scale": scale, "known": known}
+    values: dict[str, Any] = {
+        "force": noise.force, "energy": noise.energy, "scale": scale, "known": known
+    }  # fmt: skip
     return [finding("NOISE_FLOOR", severity, **values)]
 
 
