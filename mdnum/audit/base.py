@@ -136,6 +136,8 @@ class CheckResult:
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # records by title
     charts: list[Chart] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)  # figures by name
+    # by name of a figure: the limit above which it is a finding, and the codes of those that report it
+    limits: dict[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
     skipped: list[Skipped] = field(default_factory=list)  # what was not asked, and why
     asked: int = 1  # ways of asking that were gone, those on which the calculator failed included
     possible: int = 1  # ways that there are in all; more than asked where the time was up
@@ -186,7 +188,18 @@ class AuditCheck:
         """Ask it, with name, title and the time that it took."""
         began = perf_counter()
         found = self.ask(subject, progress or idle)
+        found = replace(found, findings=[*found.findings, *_above_limits(found)])
         return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
+
+
+def _above_limits(result: CheckResult) -> Iterator[Observed]:
+    """Findings of figures that are above their limits where no finding of the check reports them."""
+    codes = {one.code for one in result.findings}
+    for name, (limit, reports) in result.limits.items():
+        value = result.numbers.get(name)
+        if value is not None and not value <= limit and not codes & set(reports):
+            what = name.replace("_", " ")
+            yield finding("ABOVE_LIMIT", "warning", what=what, value=float(value), limit=float(limit))
 
 
 @dataclass
@@ -266,6 +279,8 @@ def needed_to(question: str) -> set[str]:
 
 #: Of the ways of a check: from here on it counts as asked.
 _NEARLY = 0.9
+#: Of the share of the forces that is wrong: a curl that would be seen of this is absent.
+_FAR_BELOW = 0.1
 _QUESTIONS = ("run", "differentiate")
 
 
@@ -301,3 +316,18 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether a check is left of those that make up an answer; of others, none is to come."""
     left = set(wanted) - {result.name for result in results}
     return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _QUESTIONS))
+
+
+def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
+    """Variants of sentences, by code, for what only several checks tell together.
+
+    Wrong forces that do no work around loops are the forces of another energy; those that do have none.
+    """
+    numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
+    curl, forces = numbers.get("curl"), numbers.get("forces")
+    if not curl or not forces:
+        return {}
+    # a curl would be seen that is far below the share of the forces that is wrong
+    seen = curl["unseen_share"] * forces["rms_force"] < _FAR_BELOW * forces["largest_difference"]
+    which = "no_energy" if curl["with_work"] else "another_energy" if seen else ""
+    return {"FORCES_NOT_GRADIENT": which}

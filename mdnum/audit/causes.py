@@ -46,7 +46,7 @@ CAUSES: dict[str, Cause] = {
     "NOT_REPEATABLE": Cause(
         ("STALE_STATE", "STALE_DYNAMICS", "PLACE_IN_LIST", "NEIGHBOR_CAP_BY_ORDER", "NEIGHBOR_CAP", "ORDER",
          "TOPOLOGY_BY_ORDER", *_REWRITTEN, "MIRROR", "DUMMY_CELL", "ENERGY_STEP", "NOISE_FLOOR",
-         "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL"),
+         "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL", "STEEP_SWITCH", "LONELY_FORCE", "LONELY_ENERGY"),
         rivals=("STALE_STATE", "LOW_PRECISION", "ORDER"), tests=("repeat",),
     ),
     "STALE_STATE": Cause(
@@ -61,14 +61,17 @@ CAUSES: dict[str, Cause] = {
     "NEIGHBOR_CAP_BY_ORDER": Cause(
         ("NEIGHBOR_CAP", "ORDER", *_REWRITTEN),
         rivals=("ORDER", "PLACE_IN_LIST", "NOT_REPEATABLE", "LOW_PRECISION"),
+        tests=("repeat", "place", "in range"),
     ),
     "NEIGHBOR_CAP": Cause(
         ("ORDER", *_REWRITTEN), rivals=("CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NOT_REPEATABLE"),
+        tests=("repeat", "in range"),
     ),
     "ORDER": Cause(_REWRITTEN, rivals=("NOT_REPEATABLE", "LOW_PRECISION")),
     **{code: Cause((*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN)) for k, code in enumerate(_IMAGES)},
-    "LEFT_HANDED": Cause(("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR")),
-    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION")),
+    # a structure is asked about with the vectors that it has, so that only other vectors show it
+    "LEFT_HANDED": Cause(rivals=("LATTICE", "MIRROR"), tests=("determinant",)),
+    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
     "DUMMY_CELL": Cause(),
     "TOPOLOGY_BY_ORDER": Cause(rivals=("ORDER", "PLACE_IN_LIST")),
     "WHOLE_MOLECULES": Cause(rivals=("IMAGES",)),
@@ -85,7 +88,9 @@ CAUSES: dict[str, Cause] = {
     "CURVATURE_JUMP_AMONG_MANY": Cause(spares="run"),
     "DRIFT": Cause(spares="differentiate"),
     "TIMESTEP": Cause(spares="differentiate"),
-    "LOW_PRECISION": Cause(rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED")),
+    "LOW_PRECISION": Cause(
+        ("NOISE_FLOOR",), rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)
+    ),
     # findings that explain no other
     **dict.fromkeys(
         (
@@ -93,7 +98,7 @@ CAUSES: dict[str, Cause] = {
             "ENERGY_STEP", "NET_FORCE", "NET_TORQUE", "NOISE_FLOOR", "QUANTIZED", "TWO_ENERGIES",
             "NOT_BIT_IDENTICAL", "KEPT_ANSWER", "BROKEN_BY_FAILURE", "CHANGED_INPUT", "LONELY_NOT_FINITE",
             "LONELY_FAILS", "LONELY_FORCE", "LONELY_ENERGY", "BLEW_UP", "STALE_DYNAMICS", "NOT_CONSERVED",
-            "FLIPS_CHANGE_ENERGY", "HIDDEN_JUMPS", "CALCULATOR_FAILED",
+            "FLIPS_CHANGE_ENERGY", "HIDDEN_JUMPS", "CALCULATOR_FAILED", "ABOVE_LIMIT",
         ),
         Cause(),
     ),

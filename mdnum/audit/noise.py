@@ -5,23 +5,31 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from ase import Atoms
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.special import stdtrit
 
 from mdnum.audit.base import CalculatorError, Observed, finding
-from mdnum.audit.subject import CalculatorSubject, differences, largest, no_rounding, rms
+from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, no_rounding, rms
 
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
 _SPACING = 1e-5
-_POINTS = 9
+_POINTS = 25
+#: Of the standard deviation that differences over so many points give, the share of values that it rests on:
+#: neighboring differences share points, so that its square scatters like that of fewer.
+_INDEPENDENT = 0.28
+#: How many times the noise a difference may be, at least: the largest of some hundred forces is compared, and
+#: another order of summation scatters more than moving along a line. And how often a difference of two
+#: answers may be above by chance.
+_ALLOWED, _BY_CHANCE = 40.0, 1e-6
 #: Å by which atoms are moved from where they were given, so that no distance sits on a threshold by design.
 RATTLE = 0.03
 #: Structures of which the quietest is taken, and random moves of the size of rounding.
-_TRIES, _DRAWS = 5, 4
+_TRIES, _DRAWS = 5, 8
 #: Atoms below which symmetry may hide the noise.
 FEW = 8
 #: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
@@ -34,6 +42,12 @@ _STAYS, _STAIRS = 3, 0.1
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
 #: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
 _QUIETER = 1e-3
+#: Orders of the atoms that are compared with the given one; Å between the points of a line on which two are
+#: compared, and how many: far enough for the terms of a sum to be rounded anew.
+_ORDERS, _ORDER_SPACING, _ORDER_POINTS = 3, 1e-3, 9
+#: Of a difference between two orders: what scatters by more from point to point is no smooth function. Of the
+#: energy and of what the forces are worth over the structure: rounding of a sum is below the second.
+_AT_RANDOM, _SUMMED = 0.05, 1e-5
 #: Decimals of a number that are taken for rounding, at most: a double of more is too near to its own.
 _MOST_DECIMALS = 9
 #: Different answers, 0 aside, from which is judged.
@@ -56,12 +70,26 @@ class NoiseFloor:
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
     typical: float = 0.0  # the same of the median component
+    freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """The larger of two, each part by itself."""
+        """The larger of two, each part by itself, as well known as the one that is known less well."""
         return NoiseFloor(
-            max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical)
-        )
+            max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
+            min(self.freedom, other.freedom),
+        )  # fmt: skip
+
+    @property
+    def allowed(self) -> NoiseFloor:
+        """What two answers may differ by: every comparison with noise is one with this.
+
+        A standard deviation that few values gave may be far too small by chance, which Student's t takes into
+        account.
+        """
+        student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
+        return replace(self, **{
+            name: max(_ALLOWED, student) * getattr(self, name) for name in ("energy", "force", "typical")
+        })  # fmt: skip
 
 
 def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
@@ -79,8 +107,8 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     answers = [subject.both(place) for place in places]
     energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
     columns = np.array(forces).reshape(_POINTS, -1)
-    energy = float(_scatter(energies[:, None])[0])
-    scatters = _scatter(columns)
+    energy = float(scatter(energies[:, None])[0])
+    scatters = scatter(columns)
     force = float(np.max(scatters))
     if no_rounding(energy, force, (energies[0], columns), subject.kT):
         # by chance, or by a threshold: the point that sticks out is asked again
@@ -88,7 +116,10 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
             subject.again(places[at], *answers[at])
     # values that round to the same number at every point still carry the rounding of one operation
     floor, typical = np.finfo(float).eps, float(np.median(scatters))
-    return NoiseFloor(max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical)
+    return NoiseFloor(
+        max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical,
+        _INDEPENDENT * _POINTS,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -140,13 +171,72 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     return subject.known[key]
 
 
-def _scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
+def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
     """Standard deviation of the noise in each column, the middle one of three orders of difference."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
         found.append(np.sqrt(weight * np.mean(np.diff(values, n=order, axis=0) ** 2, axis=0)))
     return np.median(found, axis=0)
+
+
+def order_change(
+    subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
+) -> tuple[float, NoiseFloor]:
+    """The largest change of the energy in other orders of the atoms, eV, and what rounding makes of it.
+
+    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise.
+
+    The rounding of a sum is drawn anew wherever its terms are others, while terms that are missing in another
+    order change smoothly along a line.
+
+    Args:
+        atoms: a structure away from thresholds.
+        noise: along a line there, in one order.
+    """
+    count, none = len(atoms), NoiseFloor(0.0, 0.0)
+    if count < 2:
+        return 0.0, none
+    orders = [np.arange(count)[::-1], *(rng.permutation(count) for _ in range(_ORDERS - 1))]
+    there = subject.fresh()
+    base = there.both(atoms)
+    try:
+        with subject.trying():
+            answers = [in_order(there, atoms, order) for order in orders]
+    except CalculatorError:
+        return 0.0, none  # reported elsewhere
+    energy, force = np.max([differences(base, answer) for answer in answers], axis=0)
+    allowed, total = noise.allowed, count * largest(base[1])
+    quiet = energy <= min(allowed.energy, _NOISY * np.spacing(abs(base[0]))) and force <= allowed.force
+    size = total * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
+    if quiet or energy > _SUMMED * size or force > _SUMMED * total:
+        return energy, none
+    line = _ORDER_SPACING * direction(count, rng)
+    rows = []
+    for at in range(_ORDER_POINTS):
+        moved = displaced(atoms, at * line)
+        one, other = there.both(moved), in_order(there, moved, orders[0])
+        rows.append([other[0] - one[0], *(other[1] - one[1]).ravel()])
+    values = np.array(rows)
+    drawn, sizes = scatter(values), np.sqrt(np.mean(values**2, axis=0))
+    worst = 1 + int(np.argmax(sizes[1:]))
+    # whatever is above the noise has to be drawn anew
+    smooth = drawn < _AT_RANDOM * sizes
+    if (energy > allowed.energy and smooth[0]) or (force > allowed.force and smooth[worst]):
+        return energy, none
+    return energy, NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
+
+
+def in_order(
+    subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
+) -> tuple[float, Forces]:
+    """Energy and forces of the atoms in another order, the forces put back into the given one."""
+    there = atoms[order]
+    assert isinstance(there, Atoms)
+    energy, forces = subject.both(there)
+    back = np.empty_like(forces)
+    back[order] = forces
+    return energy, back
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
@@ -179,7 +269,7 @@ def under_jitter(
         # either answer may be the one that sticks out
         if no_rounding(change, force, base, subject.kT) and not subject.again(there, *moved):
             subject.again(atoms, *base)
-        worst = worst.louder(NoiseFloor(change, force))
+        worst = worst.louder(NoiseFloor(change, force, freedom=_DRAWS))
     return worst
 
 
@@ -222,6 +312,9 @@ def settled(
     # what goes in steps may not move at all on so short a line
     stairs = steps(subject, there)
     noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
+    # another order of the same sum is rounded otherwise, which no line shows
+    subject.known["order"] = order_change(subject, there, noise, rng)
+    noise = noise.louder(subject.known["order"][1])
     subject.known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 
@@ -308,12 +401,17 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     both = Digits(None, max(one.bits for one in read.values())).format
     narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
     whose = next((word for word, name in narrow.items() if name), None)
-    if whose is None and not (ulps > _NOISY and share > _NOISY * eps):
+    change, floor = subject.known.get("order", (0.0, NoiseFloor(0.0, 0.0)))
+    summed = floor.energy > 0
+    if whose is None and not (ulps > _NOISY and (share > _NOISY * eps or summed)):
         return
     yield finding(
         "LOW_PRECISION",
         "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info",
+        ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
         "format" if whose else None,
+        tests=("rounding",),
+        change=change,
         whose=whose,
         format=narrow[whose] if whose else None,
         energy=noise.energy,

@@ -282,6 +282,8 @@ def _seen(
     if not felt.any():
         return None
     visible = np.maximum(steps[felt], rounding)
+    if visible.min() < np.finfo(float).tiny / np.finfo(float).eps:
+        return None  # a force that is 0 to the last bit has no noise to measure
     return float(places[felt][0]), float(places[felt][-1]), float(np.median(visible)), float(visible.max())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -12,23 +12,32 @@ from ase import Atoms
 from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
-from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
+from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, order_change, settled, under_jitter
+from mdnum.audit.places import wrong_places
 from mdnum.audit.structures import group, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 
-#: How many times the measured noise a difference may be: the largest of some hundred forces is seen, noise is
-#: a standard deviation, and another order of summation scatters more than moving along a line.
-_ALLOWED = 40.0
+#: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
+#: are said to differ.
+_NEARLY = 30.0
 #: Of kT for the whole structure, and of the root mean square force: a difference below is one of precision.
 _SMALL = 1e-3
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
 #: rectangular cells alone, or molecules by the order of their atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
-
+#: Findings of what differs, beside the codes of the ways.
+_REPORTS = ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES")
 
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
+
+
+#: Tests that a way of writing a structure down makes by itself: one that mirrors has vectors of the same
+#: handedness, and a place was found by exchanging atoms in two orders, each answer by a new object.
+_SEPARATE = {
+    "LEFT_HANDED": ("determinant",), "MIRROR": ("determinant",), "PLACE_IN_LIST": ("repeat", "place"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -129,6 +138,7 @@ class InvarianceCheck(AuditCheck):
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
             numbers=numbers,
+            limits={"told_apart": (0, (*_REPORTS, *(one.code for one in same)))},
             skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
             asked=ways.asked,
             possible=ways.possible,
@@ -143,6 +153,12 @@ class InvarianceCheck(AuditCheck):
                 wrong.setdefault(one.same.code, []).append(one)
         if "ORDER" in wrong or any(same.code == "ORDER" for same, _ in refused):
             wrong = self._without_topology(wrong, judge)
+        variants: tuple[str, ...] = ()
+        more: dict[str, Any] = {}
+        if "ORDER" in wrong and (places := wrong_places(judge.subject, judge.atoms, judge.noise.allowed)):
+            wrong["PLACE_IN_LIST"] = wrong.pop("ORDER")
+            forces = () if places.energy else (f"forces_{places.pattern}",)
+            variants, more = (*forces, places.pattern), places.values
         yield from judge.notes
         for code, cases in wrong.items():
             worst = max(cases, key=lambda one: one.excess)
@@ -157,9 +173,11 @@ class InvarianceCheck(AuditCheck):
                 code,
                 # of a narrow cell, the structure itself is answered for as it should be
                 "error" if large and code != "NARROW_CELL" else "warning",
+                *(variants if code == "PLACE_IN_LIST" else ()),
                 what=worst.same.what, energy=worst.energy, kT=kT, allowed=worst.allowed.energy,
                 force=worst.force, allowed_force=worst.allowed.force, differ=len(cases), slug=slug,
-                tried=sum(one.same.code == code for one in differences),
+                tried=sum(one.same.code == worst.same.code for one in differences),
+                tests=_SEPARATE.get(code, ()), **more if code == "PLACE_IN_LIST" else {},
             )  # fmt: skip
 
     def _without_topology(
@@ -210,6 +228,15 @@ class _Judge:
         if not found.agrees:
             # another object, which has seen nothing else: what it remembers is another question
             found, _ = self._compared(self.subject.fresh(), same, *reference)
+            if not found.agrees and found.excess < _NEARLY:
+                # noise may be larger in the other way of writing it down, that of a longer sum above all
+                noise = found.allowed
+                for there, copies in ((base, 1), (same.atoms, same.copies)):
+                    other = self.subject.fresh()
+                    line = along_a_line(other, there, self._rng)
+                    line = line.louder(order_change(other, there, line, self._rng)[1]).allowed
+                    noise = noise.louder(replace(line, energy=line.energy / copies))
+                found = replace(found, allowed=noise)
             # who stands alone may have answered so by chance, and is asked again
             if found.agrees:
                 self.worker.again(same.atoms, *answer)
@@ -241,7 +268,7 @@ class _Judge:
                     noise = noise.louder(along_a_line(worker, base, self._rng))
                 if rounding:
                     noise = noise.louder(under_jitter(worker, base, 2.0**power, self._rng))
-                allowed = NoiseFloor(_ALLOWED * noise.energy, _ALLOWED * noise.force)
+                allowed = noise.allowed
             self._known[key] = base, *worker.both(base), allowed
         return self._known[key][1:]
 
@@ -438,9 +465,11 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
         ("c replaced by c - a + b", [[1, 0, 0], [0, 1, 0], [-1, 1, 1]]),
         ("a, b, c replaced by b, c, a", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
         ("a and b exchanged", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+        ("c replaced by -c", [[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
     ):
         there = _in_cell(atoms, np.array(matrix) @ atoms.cell.array)
-        yield _same("LATTICE", atoms, f"the same lattice, {what}", there)
+        code = "LATTICE" if np.linalg.det(matrix) > 0 else "LEFT_HANDED"
+        yield _same(code, atoms, f"the same lattice, {what}", there)
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -454,7 +483,11 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         ("x, y, z exchanged in a cycle", "ROTATION", cyclic),
         ("structure and cell mirrored", "MIRROR", np.diag([-1.0, 1.0, 1.0])),
     ):
-        there = _in_cell(atoms, atoms.cell.array @ turn.T)
+        cell = atoms.cell.array @ turn.T
+        if np.linalg.det(turn) < 0:
+            # the same lattice by vectors that are not left-handed for it, which is another question
+            cell[np.argmax(np.abs(cell[:, 0]))] *= -1
+        there = _in_cell(atoms, cell)
         there.positions = atoms.positions @ turn.T
         yield _same(code, atoms, what, there, factor=4, turn=turn)
 

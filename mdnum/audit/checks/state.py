@@ -26,9 +26,6 @@ from mdnum.audit.structures import Pair, molecules, pairs, whole
 from mdnum.audit.subject import Answered, CalculatorSubject, Forces, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
-#: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
-#: terms in another order.
-_ALLOWED = 40.0
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
 #: and by new objects.
 _AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
@@ -123,6 +120,7 @@ class StateCheck(AuditCheck):
                 "Atoms alone": alone.rows,
             },
             numbers=numbers,
+            limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
             skipped=[
                 *skipped,
                 *((row.what, row.why) for row in refused),
@@ -229,8 +227,8 @@ def _through(
             # a larger energy has more noise than was measured
             share = max(1.0, abs(new[0]) / size) if size else 1.0
             row.energy, row.force = differences(old, new)
-            row.allowed = _ALLOWED * noise.energy * share
-            force = _ALLOWED * share * max(noise.force, _EPS * max(1.0, largest(new[1])))
+            row.allowed = noise.allowed.energy * share
+            force = share * noise.louder(NoiseFloor(0.0, _EPS * max(1.0, largest(new[1])))).allowed.force
             row.remembers = row.energy > row.allowed or row.force > force
         yield place + 1, row
 
@@ -451,11 +449,11 @@ class Alone:
             return None
         energy, force = answer[0], largest(felt(answer[1]))
         expected = energy if expected is None else expected
-        allowed = _ALLOWED * max(self._noise.energy, _EPS * abs(expected))
+        allowed = self._noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
         self.rows.append({
             "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(energy - expected) <= allowed,
-            "no force": force <= _ALLOWED * max(self._noise.force, _EPS),
+            "adds up": abs(energy - expected) <= allowed.energy,
+            "no force": force <= allowed.force,
         })  # fmt: skip
         return energy
 
