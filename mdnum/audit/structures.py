@@ -24,6 +24,8 @@ from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
 #: Tried in this order, and then every other element: argon where anything goes.
 _FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
 _LAST_ELEMENT = 95
+#: Calls for building a structure, at most.
+BUILDING_CALLS = 400
 _MOST_ATOMS, _FEWEST_ATOMS = 500, 32
 #: Å between molecules of water, as in the liquid.
 _SPACING = 3.1

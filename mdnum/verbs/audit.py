@@ -154,15 +154,20 @@ def _ask_all(
         subject.known["thresholds"] = state.thresholds
     timestep = _internal(state.timestep, loaded.units)
     log = frame.logged(folder, progress)
-    earlier, state.during, state.why = state.cut, None, ""
-    for name in state.left:
+    state.during, state.why = next(iter(state.left), None), ""
+    # what leads to an answer first, in brief, and only then any check in full
+    first = [name for name in state.left if CHECKS[name].basic and name not in state.cut]
+    rounds = [(name, True) for name in first if len(state.left) > 1]
+    for name, brief in [*rounds, *((name, False) for name in state.left)]:
         check = CHECKS[name](timestep, state.steps)
+        check.brief = brief
         log(0, 0, {"phase": name})
         state.during = name
         try:
-            result = _repeatable(_ask(check, subject, log), subject, state.results)
+            others = [one for one in state.shown if one.name != name]
+            result = _repeatable(_ask(check, subject, log), subject, others)
         except KeyboardInterrupt:
-            if not state.results:
+            if not state.shown:
                 raise
             state.why = "stopped"
             break
@@ -170,14 +175,19 @@ def _ask_all(
             state.why = TIME_UP
             break
         _keep_evidence(folder, loaded, check)
-        if any(reason == TIME_UP for _, reason in result.skipped):
+        cut = any(reason == TIME_UP for _, reason in result.skipped)
+        if not result.asked and name in state.cut:  # its calls were used up: the brief form is what is known
+            result = replace(state.cut[name], skipped=result.skipped)
+        if brief or cut:
             # asked again, and not as far: what was known stays known
-            again = earlier if earlier is not None and earlier.name == name else result
-            state.cut, state.why = max(again, result, key=lambda one: one.asked), TIME_UP
+            again = state.cut.get(name, result)
+            state.cut[name] = max(again, result, key=lambda one: one.asked)
+        else:
+            state.results.append(result)
+            state.cut.pop(name, None)
+        if cut:
+            state.why = TIME_UP
             break
-        state.results.append(result)
-        if state.cut is not None and state.cut.name == name:
-            state.cut = None
         if name == "smoothness":
             state.thresholds = find_thresholds(subject)
         state.failed = sorted(path.name for path in (folder.path / "structures").glob("failed-*.extxyz"))
@@ -185,8 +195,6 @@ def _ask_all(
         answers.save()
         summary = plain(_summary(state))
         _judge(AuditView(folder, summary, given=state)).store(folder, summary)
-    if state.cut is not None and state.during is None:
-        state.cut = None
     answers.save()
     frame.store(folder, _summary(state), _tables(state))
     outcome = frame.finish(
@@ -199,10 +207,16 @@ def _ask_all(
 
 def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
-    from mdnum.audit.base import CalculatorError, CheckResult, finding
+    from mdnum.audit.base import CalculatorError, CallsUp, CheckResult, finding
 
+    named: dict[str, Any] = {"name": check.name, "title": check.title}
     try:
         return check(subject, log)
+    except CallsUp as up:
+        return CheckResult(
+            (["calls_up"], {"calls": check.calls}), skipped=[(f"the rest of {check.name}", up.why)], asked=0,
+            **named,
+        )  # fmt: skip
     except CalculatorError as error:
         values = {"check": check.name, "why": error.message}
         values["file"] = error.structure.name if error.structure else ""
@@ -211,8 +225,7 @@ def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> 
             (["failed"], values),
             [finding("CALCULATOR_FAILED", "error", saved, **values)],
             skipped=[(f"the rest of {check.name}", error.message)],
-            name=check.name,
-            title=check.title,
+            **named,
         )
 
 
@@ -314,7 +327,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
-    from mdnum.audit.base import answers
+    from mdnum.audit.base import TIME_UP, answers, to_come
 
     atoms, given = state.atoms, units.get(state.units)
     said = answers(state.shown, state.checks)
@@ -322,8 +335,9 @@ def _summary(state: AuditState) -> dict[str, Any]:
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
     rest = [{"what": f"the check of {name}", "why": why, "part": name} for name in left]
     found = [(one, one.name) for one in state.shown]
-    unfinished = "stopped" if state.why == "stopped" else "unfinished"
-    status = "complete" if state.during is None else unfinished
+    early = frame.UNDECIDED if to_come(state.shown, state.checks) else frame.PARTIAL
+    status = {"stopped": "stopped", TIME_UP: early}.get(state.why, "unfinished")
+    status = "complete" if state.during is None else status
     return _in_units(
         {
             "system": state.name,

@@ -27,7 +27,7 @@ from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalcul
 from mdnum.audit.thresholds import walk_pairs
 from mdnum.errors import InputError
 
-NAMES = ["invariance", "smoothness", "forces", "curl", "state", "dynamics"]
+NAMES = ["forces", "curl", "invariance", "smoothness", "state", "dynamics"]
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ class InvarianceCheck(AuditCheck):
     is left out. `structures` holds both ways of writing down wherever their answers differ.
     """
 
-    name, title, order = "invariance", "Invariance", 10
+    name, title, order, calls = "invariance", "Invariance", 40, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:

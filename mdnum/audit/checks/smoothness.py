@@ -32,7 +32,7 @@ _STEEP = 5.0
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
-    name, title, order = "smoothness", "Smoothness", 20
+    name, title, order, calls = "smoothness", "Smoothness", 50, 5000
     needed_to = ("differentiate",)
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2

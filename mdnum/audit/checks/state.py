@@ -11,9 +11,11 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import (
+    CALLS_UP,
     TIME_UP,
     AuditCheck,
     CalculatorError,
+    CallsUp,
     CheckResult,
     Observed,
     Progress,
@@ -57,13 +59,16 @@ class StateCheck(AuditCheck):
     Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
     """
 
-    name, title, order = "state", "Memory", 50
+    name, title, order, basic, calls = "state", "Memory", 60, True, 700
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One object, asked again and again, beside new ones."""
         rng = np.random.default_rng(self.seed)
-        atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
+        with subject.meter.limited():
+            atoms, noise = settled(subject.fresh(), rng, at_least=FEW, brief=self.brief)
+            if self.brief:
+                return self._brief(subject, atoms, rng)
         # two atoms first, which most calculators answer for quickly
         approached, skipped = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
@@ -76,12 +81,12 @@ class StateCheck(AuditCheck):
                     for reached, row in _through(subject, sequence, noise, name):
                         rows.append(row)
                         progress(done + reached, total, {"phase": "state", "unit": "structures"})
-            except TimeUp:
+            except TimeUp as up:
                 left = sum(one.compared for one in sequence) - (len(rows) - compared)
-                skipped.append((f"{left} questions of the sequence “{name}”", TIME_UP))
+                skipped.append((f"{left} questions of the sequence “{name}”", up.why))
             done += len(sequence)
-        if not rows and any(why == TIME_UP for _, why in skipped):
-            raise TimeUp
+        if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
+            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
         repeats = _repeated(subject, atoms)
         tolerance = _tolerance(subject, atoms)
         alone = Alone(subject, atoms, noise)
@@ -94,21 +99,19 @@ class StateCheck(AuditCheck):
             chance = {"answers": len(stale), "energy": worst.energy, "force": worst.force}
             stale = []
         refused = [row for row in rows if row.refused and not row.remembers]
-        identical = repeats["bit-identical"], repeats["bit-identical between objects"]
         finite = [row.energy for row in stale if np.isfinite(row.energy)]
         says = "failing" if stale and not finite else "stale" if stale else "chance" if chance else "none"
-        how = "not_repeated" if not identical[0] else "repeated" if identical[1] else "not_between"
         values: dict[str, Any] = {
             "rows": len(rows), "stale": len(stale), "sequences": len({row.sequence for row in rows}),
             "answers": chance.get("answers", 0), "energy": max(finite, default=chance.get("energy", 0.0)),
         }  # fmt: skip
         numbers = {
-            "structures": len(rows), "remembered": len(stale), "bit_identical": identical[0],
+            "structures": len(rows), "remembered": len(stale), "bit_identical": repeats["bit-identical"],
             "largest": max((row.energy for row in rows), default=0.0),
-            "bit_identical_objects": identical[1], "kept_within": tolerance,
+            "bit_identical_objects": repeats["bit-identical between objects"], "kept_within": tolerance,
         }  # fmt: skip
         return CheckResult(
-            says=([f"state_{says}", f"state_{how}"], values),
+            says=([f"state_{says}", _how(repeats)], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
                 *self._memory(stale),
@@ -130,6 +133,16 @@ class StateCheck(AuditCheck):
             ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
+        )
+
+    def _brief(self, subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> CheckResult:
+        """Repeats alone."""
+        repeats = _repeated(subject, atoms, brief=True)
+        return CheckResult(
+            says=([_how(repeats)], {}),
+            findings=list(_unsteady(repeats, {}, subject.kT)),
+            tables={"The same question again": [repeats]},
+            possible=1 + sum(map(len, all_sequences(atoms, rng).values())),
         )
 
     def _memory(self, stale: list[Comparison]) -> Iterator[Observed]:
@@ -258,24 +271,39 @@ def _again(
     )
 
 
-def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
+def _how(repeats: Mapping[str, Any]) -> str:
+    """The name of the sentence about repeated calls."""
+    if not repeats["bit-identical"]:
+        return "state_not_repeated"
+    return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
+
+
+def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
     """The same structure again: of one object, with another structure between, and of new objects."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
+    at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)
+
+    def asked(one: CalculatorSubject) -> tuple[np.ndarray, np.ndarray]:
+        # both energies, where there are two: a run logs the one that forces do not belong to
+        return np.array([value for value in one.energies(atoms) if value is not None]), one.forces(atoms)
+
     within = []
-    for number in range(_AT_ONCE + _BETWEEN):
-        within.append(used.both(atoms))
-        if number >= _AT_ONCE:
+    for number in range(at_once + between):
+        within.append(asked(used))
+        if number >= at_once:
             used.energy(aside)
         else:
             used.forget()
-    objects = [within[0], *(subject.fresh().both(atoms) for _ in range(_NEW - 1))]
+    objects = [within[0], *(asked(subject.fresh()) for _ in range(new - 1))]
 
-    def spread(answers: list[tuple[float, np.ndarray]]) -> tuple[bool, float, float]:
-        (energy, forces), *others = answers
-        same = all(one[0] == energy and one[1].tobytes() == forces.tobytes() for one in others)
-        force = np.max(np.ptp([one[1] for one in answers], axis=0), initial=0.0)
-        return same, float(np.ptp([one[0] for one in answers])), float(force)
+    def spread(answers: list[tuple[np.ndarray, np.ndarray]]) -> tuple[bool, float, float]:
+        (energies, forces), *others = answers
+        same = all(
+            one[0].tobytes() == energies.tobytes() and one[1].tobytes() == forces.tobytes() for one in others
+        )
+        energy, force = (np.max(np.ptp(values, axis=0), initial=0.0) for values in zip(*answers, strict=True))
+        return same, float(energy), float(force)
 
     everywhere, one, several = subject.repeats.new, spread(within), spread(objects)
     return {
