@@ -310,12 +310,16 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     both = Digits(None, max(one.bits for one in read.values())).format
     narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
     whose = next((word for word, name in narrow.items() if name), None)
-    if whose is None and not (ulps > _NOISY and share > _NOISY * eps):
+    loud, smooth = share > _NOISY * eps, not narrow["energies"] and ulps <= _NOISY
+    if whose is None and not loud:
         return
+    severity = "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info"
+    if loud and smooth:  # forces alone have lost what the energy they belong to still has
+        severity = "error" if share > _SMALL else "warning"
     yield finding(
         "LOW_PRECISION",
-        "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info",
-        "format" if whose else None,
+        severity,
+        "format" if whose else "forces" if smooth else None,
         whose=whose,
         format=narrow[whose] if whose else None,
         energy=noise.energy,

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from mdnum.audit.base import TIME_UP, TimeUp, in_order, needed_to
 from mdnum.audit.checks import CHECKS
-from mdnum.audit.checks.state import Alone
+from mdnum.audit.checks.alone import Alone
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.record import load_calculator
 from mdnum.audit.structures import default_structure, read_structure
@@ -27,7 +27,9 @@ from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalcul
 from mdnum.audit.thresholds import walk_pairs
 from mdnum.errors import InputError
 
-NAMES = ["forces", "curl", "invariance", "smoothness", "state", "dynamics"]
+NAMES = [
+    "forces", "curl", "caller", "invariance", "periodicity", "alone", "smoothness", "state", "dynamics",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -259,7 +261,9 @@ def check(name: str):
 
 def test_checks_are_known_in_their_order():
     assert in_order(list(CHECKS)) == NAMES
-    assert needed_to("run") == {"invariance", "forces", "state", "dynamics"}
+    assert needed_to("run") == {
+        "caller", "invariance", "periodicity", "alone", "forces", "state", "dynamics",
+    }  # fmt: skip
     assert needed_to("differentiate") == {"smoothness", "forces", "curl"}
     assert all(CHECKS.description(name).endswith("?") for name in NAMES)
 
@@ -277,9 +281,9 @@ def test_evidence_is_the_same_on_a_machine_a_million_times_slower(name: str, mon
     assert slow.seconds > 1e5 > quick.seconds
 
 
-@pytest.mark.parametrize("name", NAMES[:5])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("alone", "dynamics")])
 def test_a_deadline_leaves_ways_unasked_and_says_which(name: str):
-    asked = three(40 if name in ("invariance", "smoothness") else 100)
+    asked = three({"forces": 100, "curl": 100, "state": 100, "caller": 42, "periodicity": 20}.get(name, 40))
     if name == "smoothness":
         asked.known["walks"] = walk_pairs(three())
     result = check(name)(asked)

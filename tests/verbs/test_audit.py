@@ -20,7 +20,8 @@ from command_line import call
 from other_package import install
 
 import mdnum
-from mdnum.audit.base import CheckResult, answers, finding
+from mdnum.audit import checks
+from mdnum.audit.base import CheckResult, answers, finding, in_order
 from mdnum.audit.causes import heads
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
@@ -32,7 +33,7 @@ from mdnum.verbs import frame
 from mdnum.verbs.audit import _headline, _in_units
 
 QUICK = "invariance,forces"
-CHECKS = ["forces", "curl", "invariance", "smoothness", "state", "dynamics"]
+CHECKS = in_order(list(checks.CHECKS))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def codes(outcome) -> set[str]:
 def test_what_is_right_is_safe_and_in_the_folder(good):
     summary = good.summary
     assert summary["safe_to_run"] == summary["safe_to_differentiate"] == "yes"
-    assert "6 checks found nothing" in summary["headline"] and good.verdict.tone == "good"
+    assert "9 checks found nothing" in summary["headline"] and good.verdict.tone == "good"
     assert list(good.result) == CHECKS and summary["kT"] == pytest.approx(120 * 8.617333e-5, rel=1e-6)
     folder = RunFolder.open(good.folder)
     assert folder.world == "audit" and folder.summary == plain(summary)
@@ -158,7 +159,7 @@ def test_what_cannot_be_asked_is_named(asked, message, tmp_path):
         mdnum.audit_calculator(**words, out=tmp_path / "a")
 
 
-REST = ("invariance", "forces", "curl", "state", "dynamics")
+REST = ("invariance", "forces", "curl", "state", "dynamics", "caller", "periodicity", "alone")
 
 
 def part(name: str, *found: tuple[str, str], asked: int = 1, possible: int = 1) -> CheckResult:

@@ -91,7 +91,7 @@ class InvarianceCheck(AuditCheck):
         """One structure, written down in many ways."""
         rng = np.random.default_rng(self.seed)
         judge = _Judge(subject, rng)
-        same = _in_turns(all_of(judge.atoms, subject.atoms, rng))
+        same = _in_turns(self.ways(judge.atoms, subject.atoms, rng))
         refused: list[tuple[Same, CalculatorError]] = []
         ways = Ways()
 
@@ -133,6 +133,10 @@ class InvarianceCheck(AuditCheck):
             asked=ways.asked,
             possible=ways.possible,
         )
+
+    def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+        """Other ways to write a structure down; arguments as for `all_of`."""
+        return all_of(atoms, given, rng)
 
     def _findings(
         self, differences: list[_Difference], judge: _Judge, refused: list[tuple[Same, CalculatorError]]
