@@ -117,7 +117,8 @@ def audit(
         raise InputError("no calculator is named", remedy="Name one, or resume an audit")
     loaded = _loaded(calculator)
     _internal(timestep, loaded.units)
-    atoms, wanted = _structure(structure, loaded), _wanted(checks)
+    # a quarter of the time, so that most is left for what it is asked
+    atoms, wanted = _structure(structure, loaded, Deadline(time and time / 4)), _wanted(checks)
     kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
     kT = kT if temperature is None else temperature * loaded.units.k_B
     state = AuditState(
@@ -299,15 +300,16 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
     return _loaded(state.name if calculator is None else calculator)
 
 
-def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator) -> Atoms:
+def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, deadline: Any) -> Atoms:
     from ase import Atoms
 
-    from mdnum.audit.structures import default_structure, read_structure
+    from mdnum.audit.building import default_structure
+    from mdnum.audit.structures import read_structure
 
     if isinstance(structure, Atoms):
         found = structure
     else:
-        found = default_structure(loaded) if structure is None else read_structure(structure)
+        found = default_structure(loaded, deadline) if structure is None else read_structure(structure)
     if not len(found):
         raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
     return found

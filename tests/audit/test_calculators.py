@@ -18,11 +18,12 @@ from audit.planted import Good, chain, codes
 from scipy.spatial import KDTree
 
 from mdnum.audit.base import TIME_UP, TimeUp, in_order, needed_to
+from mdnum.audit.building import default_structure
 from mdnum.audit.checks import CHECKS
 from mdnum.audit.checks.alone import Alone
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.record import load_calculator
-from mdnum.audit.structures import default_structure, read_structure
+from mdnum.audit.structures import read_structure
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalculator
 from mdnum.audit.thresholds import walk_pairs
 from mdnum.errors import InputError
@@ -187,7 +188,7 @@ def test_a_calculator_that_takes_long_is_asked_about_fewer_atoms(monkeypatch):
         for make in (LennardJones, Slow, Held)
     )
     assert len(slow) == 32 and len(quick) == len(held) > 100
-    assert f"of {len(quick)} atoms, for two cutoffs" in slow.info["origin"]
+    assert "one calculation of 108 atoms takes 0.4 s" in slow.info["origin"]
     assert held.info["origin"] == quick.info["origin"]
 
 

@@ -14,12 +14,12 @@ from ase.neighborlist import neighbor_list
 from audit import planted
 from audit.planted import Good, Single, asked, but, chain, codes, crystal, decimals, subject, values
 
+from mdnum.audit.building import water
 from mdnum.audit.checks import CHECKS, invariance
 from mdnum.audit.checks.alone import Alone
 from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.sequences import all_sequences
-from mdnum.audit.structures import water
 from mdnum.audit.subject import CalculatorError
 
 ROWS = "One object, asked again and again, beside new ones"

@@ -8,8 +8,8 @@ from audit.planted import but
 
 import mdnum
 from mdnum.audit.base import Meter, needed_to
+from mdnum.audit.building import BUILDING_CALLS
 from mdnum.audit.checks import CHECKS
-from mdnum.audit.structures import BUILDING_CALLS
 from mdnum.cli.output import EXIT_UNDECIDED, exit_code
 from mdnum.verbs import frame
 
@@ -88,9 +88,8 @@ def test_all_checks_together_have_a_limit_of_calls():
 def test_a_check_whose_calls_are_used_up_is_not_fine(monkeypatch, tmp_path):
     monkeypatch.setattr(CHECKS["invariance"], "calls", 60)
     monkeypatch.setattr(CHECKS["dynamics"], "calls", 50)
-    found = mdnum.audit_calculator(
-        planted.Good, planted.crystal(), checks="invariance,forces,state,dynamics", out=tmp_path / "a"
-    )
+    checks = ",".join(needed_to("run"))
+    found = mdnum.audit_calculator(planted.Good, planted.crystal(), checks=checks, out=tmp_path / "a")
     parts = {one["name"]: one for one in found.summary["parts"]}
     assert 0 < parts["invariance"]["asked"] < parts["invariance"]["possible"]
     # of dynamics the brief form is known
