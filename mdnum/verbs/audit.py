@@ -23,7 +23,7 @@ from mdnum.plain import plain
 from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Key, Page, Plot, Section, cell, curves, pairs, points_of, records
-from mdnum.report.words import count, heading, many, number
+from mdnum.report.words import count, heading, listed, many, number
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
 from mdnum.store.files import read_text, remove, subfolder, write_text
@@ -469,17 +469,18 @@ def _judge(view: AuditView) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    from mdnum.audit.base import TIME_UP, answers, largely_unasked, to_come
+    from mdnum.audit.base import CALLS_UP, TIME_UP, answers, largely_unasked, to_come
 
-    said = answers(state.shown, state.checks)
+    said, formula = answers(state.shown, state.checks), state.atoms.get_chemical_formula()
+    name = TEXTS("on", name=state.name, formula=formula)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
     asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
     if len(set(slugs.values())) == 1:
-        head = TEXTS(f"same_{slugs['run']}", name=state.name)
+        head = TEXTS(f"same_{slugs['run']}", name=name)
     elif len(asked) == 1:
-        head = TEXTS("one", name=state.name, answer=asked[0])
+        head = TEXTS("one", name=name, answer=asked[0])
     else:
-        head = TEXTS("both", name=state.name, run=asked[0], differentiate=asked[1])
+        head = TEXTS("both", name=name, run=asked[0], differentiate=asked[1])
     begun = {one.name for one in state.shown}
     left = [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
 
@@ -489,7 +490,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         ]
 
     if state.shown and not asked and to_come(state.shown, state.checks):
-        head = TEXTS("nothing_yet", name=state.name, ways=", ".join([*ways(state.shown), *left]))
+        head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
         return _unfinished(state, head, TIME_UP)
     rest = ", ".join([*ways(one for one in state.shown if largely_unasked(one)), *left])
     if rest:
@@ -509,6 +510,9 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         head = TEXTS("found_nothing", head=head, checks=len(state.shown))
     else:
         head = TEXTS("nothing_asked", head=head)
+    refused = sum(why not in (TIME_UP, CALLS_UP) for one in state.shown for _, why in one.skipped)
+    head += " " + TEXTS("unasked", elements=listed(list(dict.fromkeys(state.atoms.symbols))))
+    head += " " + TEXTS("refused", n=refused) if refused else ""
     return _unfinished(state, head, TIME_UP)
 
 

@@ -358,7 +358,9 @@ def test_who_answers_through_atoms_alone_is_asked_through_atoms(make, name: str)
 def test_a_structure_with_room_does_not_hide_the_nearest_image(make, expected, monkeypatch):
     rng = np.random.default_rng(0)
     monkeypatch.setattr(invariance, "all_of", lambda atoms, *_: invariance.narrow(atoms, rng))
-    assert codes(asked("invariance", make, bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2))) == expected
+    wide = bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2)
+    for atoms in (wide, mixed(wide.copy(), *range(0, 32, 2))):
+        assert codes(asked("invariance", make, atoms)) == expected
 
 
 def test_a_shell_on_the_cutoff_is_shown_by_an_ulp_of_the_cell():

@@ -177,15 +177,15 @@ def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[s
     return told["run"], told["differentiate"], _headline(state, found)
 
 
-CARE = "Use x with care, to run and to differentiate: "
+CARE = "Use x on Ar with care, to run and to differentiate: "
 
 
 @pytest.mark.parametrize(
     ("parts", "answer", "headline"),
     [
-        ([part("forces")], "not asked", "x: 1 check found nothing."),
+        ([part("forces")], "not asked", "x on Ar: 1 check found nothing."),
         ([part("smoothness", ("A", "warning")), *map(part, REST)], "with care", f"{CARE}a."),
-        ([part("curl", ("B", "error"))], "no", "Neither run nor differentiate x as it is: b."),
+        ([part("curl", ("B", "error"))], "no", "Neither run nor differentiate x on Ar as it is: b."),
         (
             [part("state", *((f"A{n}", "warning") for n in range(5)))], "with care",
             f"{CARE}a0; a1; and 3 more findings.",
@@ -193,7 +193,8 @@ CARE = "Use x with care, to run and to differentiate: "
     ],
 )  # fmt: skip
 def test_findings_add_up_to_two_answers(parts, answer, headline):
-    assert judged(parts) == (answer, answer, headline)
+    unasked = "Not asked: stress, and elements other than Ar."
+    assert judged(parts) == (answer, answer, f"{headline} {unasked}")
 
 
 def test_what_is_largely_unasked_is_not_safe():
@@ -208,7 +209,7 @@ def test_what_is_largely_unasked_is_not_safe():
     assert run == differentiate == "not asked" and "safe" not in headline
     # nothing is safe as long as a check that it needs has not begun
     run, differentiate, headline = judged([few, *parts[:1]], every)
-    assert run == differentiate == "not asked" and headline.startswith("x: nothing can be said yet (11 of 52")
+    assert run == differentiate == "not asked" and headline.startswith("x on Ar: nothing can be said yet (11 of 52")
     run, differentiate, headline = judged([few, *parts[:1], *parts[2:4]], every)
     assert (run, differentiate) == ("not asked", "yes") and "safe to differentiate" in headline
     # codes that do not bear on a question
@@ -255,7 +256,7 @@ def test_one_mistake_is_one_finding_with_others_below_it(tmp_path):
     assert cause["code"] == "IMAGES" and {"FACES", "TRANSLATION", "EXTENSIVE"} <= set(cause["below"])
     (head,) = [one for one in outcome.verdict.findings if not one.cause]
     assert head.code == "IMAGES" and len(outcome.verdict.findings) == 1 + len(cause["below"]) > 5
-    assert outcome.summary["headline"].endswith(f"{head.title}.")
+    assert f": {head.title}." in outcome.summary["headline"]
     assert (tmp_path / "a" / "report.html").read_text().count('<article class="finding') == 1
 
 
