@@ -152,6 +152,8 @@ class CheckResult:
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # records by title
     charts: list[Chart] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)  # figures by name
+    # by name of a figure: the limit above which it is a finding, and the codes of those that report it
+    limits: dict[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
     skipped: list[Skipped] = field(default_factory=list)  # what was not asked, and why
     asked: int = 1  # ways of asking that were gone, those on which the calculator failed included
     possible: int = 1  # ways that there are in all; more than asked where the time was up
@@ -210,7 +212,18 @@ class AuditCheck:
         began = perf_counter()
         subject.meter.most = subject.meter.calls + self.calls
         found = self.ask(subject, progress or idle)
+        found = replace(found, findings=[*found.findings, *_above_limits(found)])
         return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
+
+
+def _above_limits(result: CheckResult) -> Iterator[Observed]:
+    """Findings of figures that are above their limits where no finding of the check reports them."""
+    codes = {one.code for one in result.findings}
+    for name, (limit, reports) in result.limits.items():
+        value = result.numbers.get(name)
+        if value is not None and not value <= limit and not codes & set(reports):
+            what = name.replace("_", " ")
+            yield finding("ABOVE_LIMIT", "warning", what=what, value=float(value), limit=float(limit))
 
 
 @dataclass

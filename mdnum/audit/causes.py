@@ -62,9 +62,11 @@ CAUSES: dict[str, Cause] = {
     "NEIGHBOR_CAP_BY_ORDER": Cause(
         ("NEIGHBOR_CAP", "ORDER", *_REWRITTEN),
         rivals=("ORDER", "PLACE_IN_LIST", "NOT_REPEATABLE", "LOW_PRECISION"),
+        tests=("repeat", "place", "in range"),
     ),
     "NEIGHBOR_CAP": Cause(
         ("ORDER", *_REWRITTEN), rivals=("CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NOT_REPEATABLE"),
+        tests=("repeat", "in range"),
     ),
     # parameters by order of appearance are others for parts that hold fewer species
     "ORDER": Cause(
@@ -74,8 +76,10 @@ CAUSES: dict[str, Cause] = {
         code: Cause((*_IMAGES[k + 1 :], "MIXED_PERIODICITY", *_AMONG_MANY, *_RUN))
         for k, code in enumerate(_IMAGES)
     },
-    "LEFT_HANDED": Cause(("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR")),
-    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION")),
+    "LEFT_HANDED": Cause(
+        ("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR"), tests=("determinant",)
+    ),
+    "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
     "DUMMY_CELL": Cause(("MIXED_PERIODICITY",), rivals=("MIXED_PERIODICITY",)),
     "MIXED_PERIODICITY": Cause(rivals=("DUMMY_CELL", "IMAGES", "EXTENSIVE")),
     "CHANGE_NOT_SEEN": Cause(
@@ -106,7 +110,7 @@ CAUSES: dict[str, Cause] = {
             "ENERGY_STEP", "NET_FORCE", "NET_TORQUE", "NOISE_FLOOR", "QUANTIZED", "TWO_ENERGIES",
             "NOT_BIT_IDENTICAL", "KEPT_ANSWER", "BROKEN_BY_FAILURE", "CHANGED_INPUT", "LONELY_NOT_FINITE",
             "LONELY_FAILS", "LONELY_FORCE", "LONELY_ENERGY", "BLEW_UP", "STALE_DYNAMICS", "NOT_CONSERVED",
-            "FLIPS_CHANGE_ENERGY", "HIDDEN_JUMPS", "CALCULATOR_FAILED",
+            "FLIPS_CHANGE_ENERGY", "HIDDEN_JUMPS", "CALCULATOR_FAILED", "ABOVE_LIMIT",
         ),
         Cause(),
     ),

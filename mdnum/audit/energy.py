@@ -212,6 +212,7 @@ class HiddenJump:
     share: float  # of the way
     energy: float  # after minus before, without the work done between, eV
     ties: tuple[tuple[int, int], ...]  # (atom, k) whose k-th and next neighbors change places there
+    radius: float | None = None  # Å, of the pair threshold that is crossed there, smoothly for two atoms
 
 
 @dataclass(frozen=True)
@@ -246,16 +247,26 @@ class HiddenJumps:
         counts = Counter(k for jump in self.jumps for k in {k for _, k in jump.ties})
         return counts.most_common(1)[0] if counts else None
 
+    @property
+    def radius(self) -> tuple[float, int] | None:
+        """(radius, at how many jumps a pair passes it), the most frequent pair threshold."""
+        counts = Counter(jump.radius for jump in self.jumps if jump.radius is not None)
+        return counts.most_common(1)[0] if counts else None
+
 
 def hidden_jumps(
-    probe: CalculatorSubject, run: NveRun, rest: Steps, sharp: Mapping[int, Sequence[float]], noise: float
+    probe: CalculatorSubject,
+    run: NveRun,
+    rest: Steps,
+    crossed: Mapping[int, Sequence[RunCrossing]],
+    noise: float,
 ) -> HiddenJumps:
     """Search the steps that leave most unexplained: is it all at single places of their way?
 
     Args:
         probe: another object than the run's.
         rest: energy that each step leaves unexplained; nan where that is not known.
-        sharp: by step, shares of its way at which a known threshold jumps, which are not counted again.
+        crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
         noise: of the energy, eV.
     """
     limit = max(40 * noise, _SMALL * probe.kT)
@@ -268,12 +279,12 @@ def hidden_jumps(
         if searched and probe.meter.calls - began > _CALLS:
             break
         searched[step] = float(rest[step])
-        jumps += _within(probe, run, step, np.asarray(sharp.get(step, ()), np.float64), limit)
+        jumps += _within(probe, run, step, crossed.get(step, ()), limit)
     return HiddenJumps(tuple(jumps), searched, tuple(candidates))
 
 
 def _within(
-    probe: CalculatorSubject, run: NveRun, step: int, sharp: np.ndarray, limit: float
+    probe: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], limit: float
 ) -> list[HiddenJump]:
     """The jumps on the way of one step."""
     curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
@@ -289,9 +300,11 @@ def _within(
     found = []
     for low, high in parts:
         middle = 0.5 * (low + high)
-        if not len(sharp) or np.abs(sharp - middle).min() >= 1e-3:
+        near = [one.threshold for one in crossed if abs(one.share - middle) < 1e-3]
+        if not any(one.order == 0 for one in near):
             ties = _exchanged(*(run.at(run.way(step, share)) for share in (low, high)))
-            found.append(HiddenJump(step, middle, _unexplained(curve, low, high), ties))
+            radius = near[0].radius if near else None
+            found.append(HiddenJump(step, middle, _unexplained(curve, low, high), ties, radius))
     return found
 
 
@@ -389,12 +402,10 @@ def balance(
             measured |= dict(zip(places, jumped, strict=True))
     means = EnergyBalance(crossed, rest, measured, rest).means
     jumps = np.zeros(count)
-    known: dict[int, list[float]] = {}
     for place, one in enumerate(crossed):
         jumps[one.step] += measured.get(place, one.sign * means.get(one.threshold, 0.0))
-        if orders[place] == 0:
-            known.setdefault(one.step, []).append(one.share)
-    hidden = hidden_jumps(probe, run, rest, known, noise)
+    flips = {step: [crossed[place] for place in places] for step, places in by_step.items()}
+    hidden = hidden_jumps(probe, run, rest, flips, noise)
     return EnergyBalance(crossed, jumps, measured, rest, hidden)
 
 

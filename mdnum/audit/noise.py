@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from ase import Atoms
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mdnum.audit.base import CalculatorError, Observed, finding
-from mdnum.audit.subject import CalculatorSubject, differences, largest, no_rounding, rms
+from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, no_rounding, rms
 
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
@@ -34,6 +34,13 @@ _STAYS, _STAIRS = 3, 0.1
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
 #: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
 _QUIETER = 1e-3
+#: Orders of the atoms that are compared with the given one; Å between the points of a line on which two are
+#: compared, and how many: far enough for the terms of a sum to be rounded anew.
+_ORDERS, _ORDER_SPACING, _ORDER_POINTS = 3, 1e-3, 9
+#: Of a difference between two orders: what scatters by more from point to point is no smooth function. Of the
+#: energy and of what the forces are worth over the structure: rounding of a sum is below the second. A
+#: difference of so many times the noise is one.
+_AT_RANDOM, _SUMMED, _SEEN = 0.05, 1e-5, 40.0
 #: Decimals of a number that are taken for rounding, at most: a double of more is too near to its own.
 _MOST_DECIMALS = 9
 #: Different answers, 0 aside, from which is judged.
@@ -79,8 +86,8 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     answers = [subject.both(place) for place in places]
     energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
     columns = np.array(forces).reshape(_POINTS, -1)
-    energy = float(_scatter(energies[:, None])[0])
-    scatters = _scatter(columns)
+    energy = float(scatter(energies[:, None])[0])
+    scatters = scatter(columns)
     force = float(np.max(scatters))
     if no_rounding(energy, force, (energies[0], columns), subject.kT):
         # by chance, or by a threshold: the point that sticks out is asked again
@@ -140,13 +147,88 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     return subject.known[key]
 
 
-def _scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
+def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
     """Standard deviation of the noise in each column, the middle one of three orders of difference."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
         found.append(np.sqrt(weight * np.mean(np.diff(values, n=order, axis=0) ** 2, axis=0)))
     return np.median(found, axis=0)
+
+
+@dataclass(frozen=True)
+class OrderChange:
+    """What other orders of the atoms of one structure change."""
+
+    energy: float = 0.0  # the largest change, eV
+    force: float = 0.0  # of a force component, eV/Å
+    # what rounding makes of it: standard deviations; 0 where the change is no rounding
+    floor: NoiseFloor = NoiseFloor(0.0, 0.0)
+
+    @property
+    def rounding(self) -> bool:
+        """Whether rounding of sums in another order explains the change."""
+        return self.floor.energy > 0 or self.floor.force > 0
+
+
+def order_change(
+    subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
+) -> OrderChange:
+    """Compare a few orders; where they differ, tell rounding from what is smooth along a line.
+
+    The rounding of a sum is drawn anew wherever its terms are others, while terms that are missing in another
+    order change smoothly with the positions.
+
+    Args:
+        atoms: a structure away from thresholds.
+        noise: along a line there, in one order.
+    """
+    count = len(atoms)
+    if count < 2:
+        return OrderChange()
+    orders = [np.arange(count)[::-1], *(rng.permutation(count) for _ in range(_ORDERS - 1))]
+    there = subject.fresh()
+    base = there.both(atoms)
+    try:
+        with subject.trying():
+            answers = [in_order(there, atoms, order) for order in orders]
+    except CalculatorError:
+        return OrderChange()  # reported elsewhere
+    changes = np.array([differences(base, answer) for answer in answers])
+    energy, force = changes.max(axis=0)
+    if energy <= _SEEN * noise.energy and force <= _SEEN * noise.force:
+        return OrderChange(energy, force)
+    size = largest(base[1]) * count * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
+    if energy > _SUMMED * size or force > _SUMMED * count * largest(base[1]):
+        return OrderChange(energy, force)
+    line = _ORDER_SPACING * direction(count, rng)
+    rows = []
+    for at in range(_ORDER_POINTS):
+        moved = displaced(atoms, at * line)
+        one, other = there.both(moved), in_order(there, moved, orders[0])
+        rows.append([other[0] - one[0], *(other[1] - one[1]).ravel()])
+    values = np.array(rows)
+    drawn, sizes = scatter(values), np.sqrt(np.mean(values**2, axis=0))
+    worst = 1 + int(np.argmax(sizes[1:]))
+    # whatever is above the noise has to be drawn anew
+    smooth = (energy > _SEEN * noise.energy and drawn[0] < _AT_RANDOM * sizes[0]) or (
+        force > _SEEN * noise.force and drawn[worst] < _AT_RANDOM * sizes[worst]
+    )
+    if smooth:
+        return OrderChange(energy, force)
+    return OrderChange(energy, force, NoiseFloor(float(sizes[0]), float(sizes[worst])))
+
+
+def in_order(
+    subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
+) -> tuple[float, Forces]:
+    """Energy and forces of the atoms in another order, the forces put back into the given one."""
+    there = atoms[order]
+    assert isinstance(there, Atoms)
+    energy, forces = subject.both(there)
+    back = np.empty_like(forces)
+    back[order] = forces
+    return energy, back
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
@@ -224,6 +306,9 @@ def settled(
     if not brief:
         stairs = steps(subject, there)
         noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
+        # another order of the same sum is rounded otherwise, which no line shows
+        subject.known["order"] = order_change(subject, there, noise, rng)
+        noise = noise.louder(subject.known["order"].floor)
     subject.known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 
 from mdnum.audit.base import CalculatorError, Progress, Ways
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
+from mdnum.audit.noise import digits
 from mdnum.audit.structures import Pair, molecules, whole
 from mdnum.audit.subject import CalculatorSubject, differences
 from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
@@ -46,8 +47,9 @@ _MOST = 160
 _FEWEST = 4
 #: The crowd is between these fractions of the cutoff.
 _NEAR, _FAR = 0.5, 0.94
-#: How far to either side of a tie is asked, the second for calculators that compute in float32.
-_SIDES = (1e-9, 1e-6)
+#: How far to either side of a tie is asked, in the last digit of the largest coordinate in float32: some sort
+#: neighbors by distances that are rounded so.
+_SIDE_OF_TIE = 4.0
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
 #: With how many neighbors ties are tried, three calls each; the share of one of several species is less.
@@ -144,6 +146,11 @@ class EnvironmentWalks:
     def unexplained(self) -> list[Event]:
         """Events that no pair threshold explains and that jump beyond doubt."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
+
+    @property
+    def lower(self) -> list[Event]:
+        """Events at a pair threshold at which a lower derivative jumps than for two atoms alone."""
+        return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 
 def walk_surroundings(
@@ -249,13 +256,16 @@ def _targeted(
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
     """What jumps where a known threshold is crossed, to the last representable place if a value does."""
-    curve = route.curve(subject)
+    curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
+    # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
+    for row in range(2):
+        low, high = locate(curve, row, crossing.at - side, crossing.at + side)
+        jump = measure(curve, low, high, STEP, exact=True, curved=False)
+        if jump.order <= row:
+            return _event(subject, route, jump, crossing)
     low, high = crossing.at - _SIDE, crossing.at + _SIDE
-    exact = crossing.threshold.order < 2
-    if exact:
-        low, high = locate(curve, crossing.threshold.order, low, high)
-    jump = measure(curve, low, high, STEP, exact, curved=not exact)
-    return _event(subject, route, jump, crossing)
+    jump = measure(curve, low, high, STEP, exact=False)
+    return _event(subject, route, replace(jump, order=max(jump.order, 2)), crossing)
 
 
 def _event(
@@ -334,6 +344,17 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 # -- crowds ----------------------------------------------------------------------------------------
 
 
+class CrowdOrder(NamedTuple):
+    """How the order of the atoms of a crowd matters."""
+
+    # number of neighbors at which it starts to matter, None if it never does
+    start: int | None = None
+    energy: float = 0.0  # how much it changes the energy then, eV; 0 within rounding
+    force: float = 0.0  # how much it changes a force, eV/Å; 0 within rounding
+    # whether it is the number within reach: with one of them out of reach, the order does not matter
+    by_number: bool = False
+
+
 @dataclass(frozen=True)
 class Crowd:
     """A center with many neighbors, none as far as another, and what came of crowding it."""
@@ -345,10 +366,9 @@ class Crowd:
     energy: float  # jump at the exchange, eV; 0 without one
     force: float  # largest jump of a force there, eV/Å
     distance: float  # from the center at which the exchange takes place; nan without one
-    # number of neighbors at which the order of atoms starts to matter, None if it never does
-    order_from: int | None
-    order_energy: float  # how much it changes the energy then, eV
-    order_force: float  # how much it changes a force, eV/Å
+    # whether it is their number: with one of the others out of reach, the same place shows no jump
+    by_number: bool
+    order: CrowdOrder
     # (k, largest force jump) for each tie with the k-th neighbor that was tried
     jumps: tuple[tuple[int, float], ...]
 
@@ -421,36 +441,30 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     direction = gap(atoms)
     between = 0.5 * (distances[1:] + distances[:-1])
 
-    def walker(place: float) -> Atoms:
-        return atoms + Atoms([walk.pair.species[0]], [atoms.positions[0] + place * direction])
+    def walker(place: float, without: int | None = None) -> Atoms:
+        others = atoms if without is None else atoms[np.arange(count + 1) != without]
+        return others + Atoms([walk.pair.species[0]], [atoms.positions[0] + place * direction])
 
-    def resolved(side: float) -> bool:
-        """Whether the calculator tells two places this near apart, wherever they are."""
-        return not any(
-            (subject.forces(walker(place - side)) == subject.forces(walker(place + side))).all()
-            for place in between[:: max(len(distances) // 6, 1)]
-        )
+    side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
-    side = next((one for one in _SIDES if resolved(one)), _SIDES[-1])
+    def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
+        """Changes from place - side to place + side that a smooth function has not; one atom may be left out.
 
-    def change(place: float) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Changes from place - side to place + side that a smooth function has not.
-
-        (|change of the energy beyond the force's work|, for each atom |change of its force beyond the change
-        over the next stretch of that length|).
+        (|change of the energy beyond the force's work|, for each atom |change of its force beyond the mean of
+        those over the stretches of that length before and after|).
         """
-        first, before = subject.both(walker(place - side))
-        second, after = subject.both(walker(place + side))
-        later = subject.forces(walker(place + 3 * side))
+        first, before = subject.both(walker(place - side, without))
+        second, after = subject.both(walker(place + side, without))
+        earlier, later = (subject.forces(walker(place + 3 * one * side, without)) for one in (-1, 1))
         energy = abs(second - first + float((before[-1] + after[-1]) @ direction) * side)
-        return energy, np.linalg.norm((after - before) - (later - after), axis=1)
+        return energy, np.linalg.norm(1.5 * (after - before) - 0.5 * (later - earlier), axis=1)
 
     quiet = [change(place) for place in between[:: max(count // 10, 1)]]
-    # a force's change and that of its change are four roundings of each of three components
+    # a force's change beyond its neighbors' is some four roundings of each of three components
     noise_energy = max(max(energy for energy, _ in quiet), 1e-14, 4 * quantum[0] / _SURE)
     # an atom that its neighbors press hard has forces with more rounding in them than another
     forces = np.linalg.norm(subject.forces(walker(float(between[0]))), axis=1)
-    rounding = 2.0**-50 if side == _SIDES[0] else 2.0**-21
+    rounding = 2.0**-21 if digits(forces).bits <= 24 else 2.0**-50
     floor = np.maximum(rounding * np.maximum(forces, np.median(forces)), 1e-14)
     floor = np.maximum(floor, 4 * np.sqrt(3) * quantum[1] / _SURE)
     noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
@@ -467,17 +481,24 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     kept, energy, force = max(over, key=lambda one: (one[2], one[1])) if over else (None, 0.0, 0.0)
     if energy <= _SURE * noise_energy:  # the force alone jumped
         energy = 0.0
+    by_number = False
+    if kept is not None:
+        place = float(distances[kept - 1])
+        if not 0.5 * force <= change(place)[1].max() <= 2 * force and force:
+            kept, energy, force = None, 0.0, 0.0  # by chance, which repeats tell
+        elif kept > 1:
+            fewer = change(place, without=1)
+            floor = np.delete(noise_force, 1)
+            by_number = fewer[0] <= _SURE * noise_energy and not (fewer[1] > _SURE * floor).any()
     return Crowd(
         walk.pair.species[0], radius, count, kept, energy, force,
-        float(distances[kept - 1]) if kept else float("nan"),
-        *_order(subject, walk, radius, count), tuple(jumps),
+        float(distances[kept - 1]) if kept else float("nan"), by_number,
+        _order(subject, walk, radius, count), tuple(jumps),
     )  # fmt: skip
 
 
-def _order(
-    subject: CalculatorSubject, walk: PairWalk, radius: float, most: int
-) -> tuple[int | None, float, float]:
-    """(fewest neighbors at which permuting atoms changes anything, by how much energy, and force)."""
+def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
+    """From how many neighbors on permuting atoms changes anything, by how much, and if by their number."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -486,14 +507,26 @@ def _order(
             low = count
         else:
             high, changed = count, found
-    return high, *changed
+    if high is None:
+        return CrowdOrder()
+    # what comes and goes is no order; what stays when one neighbor is out of reach is not their number
+    if _permuted(subject.fresh(), walk, radius, high) is None:
+        return CrowdOrder()
+    alone = walk.cutoff is not None and _permuted(subject, walk, radius, high, aside=True) is None
+    return CrowdOrder(high, *changed, alone)
 
 
 def _permuted(
-    subject: CalculatorSubject, walk: PairWalk, radius: float, count: int
+    subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Changes of energy and force with the order of atoms; None if another order of sums explains them."""
+    """Changes of energy and force with the order of atoms; None if another order of sums explains them.
+
+    Args:
+        aside: the last neighbor is out of reach of all others.
+    """
     atoms, _ = cluster(walk.pair, radius, count)
+    if aside:
+        atoms.positions[-1] += 3 * (atoms.positions[-1] - atoms.positions[0])
     energy, forces = subject.both(atoms)
     rng = np.random.default_rng(2)
     worst = np.zeros(2)
@@ -504,5 +537,12 @@ def _permuted(
     # terms are at most as large as their sum is where the crowd repels; rounding of float32 is allowed
     total = np.abs(forces).sum()
     scale = np.array([total * np.ptp(atoms.positions, axis=0).max() + abs(energy), total])
-    changed = (worst > np.maximum(1e-6 * scale, STEPS * np.array(walk.quantum))).any()
-    return (float(worst[0]), float(worst[1])) if changed else None
+    changed = worst > np.maximum(1e-6 * scale, STEPS * np.array(walk.quantum))
+    if not changed.any():
+        return None
+    # the same order again: what differs then as well is no order
+    again = np.array(differences((energy, forces), subject.fresh().both(atoms)))
+    if (again[changed] > 0.1 * worst[changed]).any():
+        subject.again(atoms, energy, forces)
+        return None
+    return tuple(np.where(changed, worst, 0.0).tolist())

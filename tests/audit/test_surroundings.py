@@ -147,7 +147,7 @@ def crowded(most: int = NEIGHBORS, **options):
 @pytest.mark.parametrize("options", [{}, {"single": True}, {"keep": 10**6, "places": 5}])
 def test_nothing_is_dropped_by_what_drops_nothing(options: dict[str, object]):
     found = crowded(**options)
-    assert (found.kept, found.order_from, found.neighbors, found.energy) == (None, None, NEIGHBORS, 0.0)
+    assert (found.kept, found.order.start, found.neighbors, found.energy) == (None, None, NEIGHBORS, 0.0)
 
 
 @pytest.mark.parametrize("kept", [5, 9])
@@ -155,7 +155,7 @@ def test_a_choice_of_the_nearest_is_found(kept: int):
     found = crowded(keep=kept)
     # energies are equal at the tie; half a pair force moves over from one neighbor to the other, and turns
     # its direction on the center
-    assert (found.kept, found.energy, found.order_from) == (kept, 0.0, None)
+    assert (found.kept, found.energy, found.order.start, found.by_number) == (kept, 0.0, None, True)
     half = 0.5 * laws.soft(found.distance)[1]
     atoms, _ = cluster(PAIR, R_CUT, NEIGHBORS)
     turned = np.linalg.norm(gap(atoms) - atoms.positions[kept] / found.distance)
@@ -169,7 +169,7 @@ def test_a_choice_of_the_nearest_is_found_beyond_rounding():
 
 def test_a_cap_by_the_order_of_the_atoms_is_found():
     found = crowded(keep=7, by="first")
-    assert found.order_from == 8 and found.order_energy > 1e-3
+    assert found.order.start == 8 and found.order.energy > 1e-3 and found.order.by_number
 
 
 def test_a_crowd_that_is_not_supported_is_made_smaller():

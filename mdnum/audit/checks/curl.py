@@ -51,7 +51,7 @@ class Loop:
 class CurlCheck(AuditCheck):
     """Do the forces work around closed loops?"""
 
-    name, title, order, basic, calls = "curl", "Curl", 20, True, 600
+    name, title, order, basic, calls = "curl", "Curl", 20, True, 500
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -103,6 +103,7 @@ class CurlCheck(AuditCheck):
             findings=found,
             tables={"Work around closed loops": [_row(one) for one in loops]},
             numbers=numbers,
+            limits={"with_work": (0, ("CURL",))},
             **vars(ways),
         )
 

@@ -60,7 +60,7 @@ class DynamicsCheck(AuditCheck):
     quarter with half the time step, which a second run tests.
     """
 
-    name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 2700
+    name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 2200
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -216,6 +216,10 @@ class TwoRuns:
             tables=self._tables(shares, numbers),
             charts=[self._chart()],
             numbers=numbers,
+            limits={
+                "hidden_wander": (_WANDERS, ("HIDDEN_JUMPS", "STALE_DYNAMICS")),
+                "stale": (self.stale[1], ("STALE_DYNAMICS",)),
+            },
             skipped=skipped,
             recorded={"energies": self.energy_rows(), "crossings": self.crossing_rows()},
         )
@@ -235,6 +239,10 @@ class TwoRuns:
             "rest_swing": float(np.ptp(np.cumsum(balance.filled))) / atoms, "stale": self.stale[0],
             "mean_kinetic": float(np.mean(one.kinetic)) / atoms,
         }  # fmt: skip
+        # of kT, what the sum of jumps wanders by in a unit of time
+        for name, brought in (("flips", balance.jumps), ("hidden", balance.elsewhere)):
+            wander = np.sqrt(np.sum(brought**2) / numbers["time"]) / self.subject.kT
+            numbers[f"{name}_wander"] = float(wander)
         for name in ("integrator", "flips", "rest"):
             numbers |= {name: shares[name].slope, f"{name}_error": shares[name].error}
         return numbers
@@ -260,27 +268,27 @@ class TwoRuns:
             severity = "error" if large or old else "warning"
             yield finding("NOT_CONSERVED", severity, "old" if old else None, **values("rest", swing=swing))
 
-        def wander(jumps: np.ndarray) -> float:
-            return float(np.sqrt(np.sum(jumps**2)) / np.sqrt(numbers["time"]) / kT)
-
-        size = wander(self.balance.jumps)
+        size = numbers["flips_wander"]
         if numbers["largest_jump"] > 100 * self.noise.energy and size > _WANDERS:
             jump = 1e3 * numbers["largest_jump"]
             told = values("flips", crossings=numbers["crossings"], jump=jump, wander=size)
             severity = "error" if flips.significant and abs(flips.slope) > much else "warning"
             yield finding("FLIPS_CHANGE_ENERGY", severity, **told)
-        hidden, size = self.balance.hidden, wander(self.balance.elsewhere)
+        hidden, size = self.balance.hidden, numbers["hidden_wander"]
         # those that an old list makes are reported as such
         if hidden.jumps and not old and size > _WANDERS:
             one, (k, times) = shares["elsewhere"], hidden.rank or (0, 0)
             tie = times > 0.5 * len(hidden.jumps)
+            radius, passed = hidden.radius or (0.0, 0)
+            cutoff = passed > 0.5 * len(hidden.jumps)
             told = values(
                 "elsewhere", candidates=len(hidden.candidates), searched=len(hidden.steps), k=k, times=times,
                 share=hidden.share, jump=1e3 * numbers["largest_hidden_jump"], wander=size,
-                places=len(hidden.jumps),
+                places=len(hidden.jumps), at=radius, passed=passed,
             )  # fmt: skip
             severity = "error" if one.significant and abs(one.slope) > much else "warning"
-            yield finding("HIDDEN_JUMPS", severity, "tie" if tie else None, **told)
+            how = "cutoff" if cutoff else "tie" if tie else None
+            yield finding("HIDDEN_JUMPS", severity, how, **told)
         integrator = shares["integrator"]
         if integrator.significant and abs(integrator.slope) > much:
             halving = numbers["integrator_by_halving"]

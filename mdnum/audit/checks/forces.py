@@ -78,7 +78,7 @@ class ForcesCheck(AuditCheck):
     the energy, not a wrong force, and is reported as such.
     """
 
-    name, title, order, basic, calls = "forces", "Forces", 10, True, 600
+    name, title, order, basic, calls = "forces", "Forces", 10, True, 500
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -145,6 +145,7 @@ class ForcesCheck(AuditCheck):
             },
             charts=[_chart(slopes)],
             numbers=numbers,
+            limits={"disagree": (0, ("FORCES_NOT_GRADIENT", "ENERGY_STEP"))},
             **vars(ways),
         )
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
 from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
+from mdnum.audit.places import wrong_places
 from mdnum.audit.structures import group, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 
@@ -29,6 +30,13 @@ _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
+
+
+#: Tests that a way of writing a structure down makes by itself: one that mirrors has vectors of the same
+#: handedness, and a place was found by exchanging atoms in two orders, each answer by a new object.
+_SEPARATE = {
+    "LEFT_HANDED": ("determinant",), "MIRROR": ("determinant",), "PLACE_IN_LIST": ("repeat", "place"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -129,6 +137,13 @@ class InvarianceCheck(AuditCheck):
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
             numbers=numbers,
+            # of molecules by the order of atoms, what differs is another finding
+            limits={
+                "told_apart": (
+                    0,
+                    ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES", *(one.code for one in same)),
+                )
+            },
             skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
             asked=ways.asked,
             possible=ways.possible,
@@ -147,6 +162,11 @@ class InvarianceCheck(AuditCheck):
                 wrong.setdefault(one.same.code, []).append(one)
         if "ORDER" in wrong or any(same.code == "ORDER" for same, _ in refused):
             wrong = self._without_topology(wrong, judge)
+        variants: tuple[str, ...] = ()
+        more: dict[str, Any] = {}
+        if "ORDER" in wrong and (places := wrong_places(judge.subject, judge.atoms, judge.allowed)):
+            wrong["PLACE_IN_LIST"] = wrong.pop("ORDER")
+            variants, more = places.variants, places.values
         yield from judge.notes
         for code, cases in wrong.items():
             worst = max(cases, key=lambda one: one.excess)
@@ -161,9 +181,11 @@ class InvarianceCheck(AuditCheck):
                 code,
                 # of a narrow cell, the structure itself is answered for as it should be
                 "error" if large and code != "NARROW_CELL" else "warning",
+                *(variants if code == "PLACE_IN_LIST" else ()),
                 what=worst.same.what, energy=worst.energy, kT=kT, allowed=worst.allowed.energy,
                 force=worst.force, allowed_force=worst.allowed.force, differ=len(cases), slug=slug,
-                tried=sum(one.same.code == code for one in differences),
+                tried=sum(one.same.code == worst.same.code for one in differences),
+                tests=_SEPARATE.get(code, ()), **more if code == "PLACE_IN_LIST" else {},
             )  # fmt: skip
 
     def _without_topology(
@@ -203,6 +225,11 @@ class _Judge:
         self.notes: list[Observed] = []
         # by structures, which are kept so that their ids are theirs
         self._known: dict[tuple[int, int], tuple[Atoms, float, Forces, NoiseFloor]] = {}
+
+    @property
+    def allowed(self) -> NoiseFloor:
+        """What two orders of the atoms may differ by."""
+        return NoiseFloor(_ALLOWED * self.noise.energy, _ALLOWED * self.noise.force)
 
     def before(self, same: Same) -> Atoms:
         return self.atoms if same.before is None else same.before
@@ -443,9 +470,11 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
         ("c replaced by c - a + b", [[1, 0, 0], [0, 1, 0], [-1, 1, 1]]),
         ("a, b, c replaced by b, c, a", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
         ("a and b exchanged", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+        ("c replaced by -c", [[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
     ):
         there = _in_cell(atoms, np.array(matrix) @ atoms.cell.array)
-        yield _same("LATTICE", atoms, f"the same lattice, {what}", there)
+        code = "LATTICE" if np.linalg.det(matrix) > 0 else "LEFT_HANDED"
+        yield _same(code, atoms, f"the same lattice, {what}", there)
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -459,7 +488,11 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         ("x, y, z exchanged in a cycle", "ROTATION", cyclic),
         ("structure and cell mirrored", "MIRROR", np.diag([-1.0, 1.0, 1.0])),
     ):
-        there = _in_cell(atoms, atoms.cell.array @ turn.T)
+        cell = atoms.cell.array @ turn.T
+        if np.linalg.det(turn) < 0:
+            # the same lattice by vectors that are not left-handed for it, which is another question
+            cell[np.argmax(np.abs(cell[:, 0]))] *= -1
+        there = _in_cell(atoms, cell)
         there.positions = atoms.positions @ turn.T
         yield _same(code, atoms, what, there, factor=4, turn=turn)
 

@@ -29,10 +29,15 @@ _LARGE, _SMALL, _SMALL_FORCE = 1e-3, 1e-7, 1e-5
 _STEEP = 5.0
 
 
+#: Codes that report a jump of the energy, and of the force alone.
+_ENERGY = ("ENERGY_JUMP", "CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NEIGHBOR_CAP")
+_FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
+
+
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
-    name, title, order, calls = "smoothness", "Smoothness", 50, 5000
+    name, title, order, calls = "smoothness", "Smoothness", 50, 6800
     needed_to = ("differentiate",)
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2
@@ -44,17 +49,18 @@ class SmoothnessCheck(AuditCheck):
             raise TimeUp
         find_thresholds(subject)
         ways = deepcopy(walks.ways)
-        around = walk_surroundings(subject, progress, ways, routes=self.routes)
         left = len(ways.skipped)
         crowds = crowd(subject, progress, ways, self.neighbors)
         if not crowds and len(ways.skipped) == left:
             ways.skip("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
+        around = walk_surroundings(subject, progress, ways, routes=self.routes)
         kT = subject.kT
         says, numbers = figures(walks, around, crowds, kT)
         return CheckResult(
             says=says,
             findings=[
                 *_jumps(walks, around, kT),
+                *_at_cutoff(around, kT),
                 *_among_many(around, kT, walks.not_walked),
                 *(one for crowded in crowds for one in _caps(crowded, kT)),
                 *(one for walk in walks.walks for one in reach(walk, kT)),
@@ -62,6 +68,10 @@ class SmoothnessCheck(AuditCheck):
             tables=_tables(walks, around, crowds, kT),
             charts=_charts(walks, crowds, subject),
             numbers=numbers,
+            limits={
+                "largest_energy_jump": (_SMALL * kT, _ENERGY),
+                "largest_force_jump": (_SMALL_FORCE * kT, (*_ENERGY, *_FORCE)),
+            },
             **vars(ways),
         )
 
@@ -97,18 +107,20 @@ def figures(
         "cutoffs": {"-".join(walk.pair.species): walk.cutoff for walk in walks.walks},
         "order": min((order for order, *_ in seen), default=None), "largest_energy_jump": step,
         "largest_energy_jump_kT": step / kT if kT else None,
-        "largest_force_jump": max([force, *(max(one.force, one.order_force) for one in crowds)]),
+        "largest_force_jump": max([force, *(max(one.force, one.order.force) for one in crowds)]),
         "crossings_measured": around.measured,
         "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
         "routes": len(around.routes), "unexplained": sum(one.threshold is None for one in around.events),
         "neighbors_kept": min((one.kept for one in crowds if one.kept), default=None),
-        "order_matters_from": min((one.order_from for one in crowds if one.order_from), default=None),
+        "order_matters_from": min((one.order.start for one in crowds if one.order.start), default=None),
         "neighbors_tried": max((one.neighbors for one in crowds), default=0),
     }  # fmt: skip
     # what is smooth up to the fifth derivative is not said to jump
     order = min((order for order, *_ in seen if order <= 5), default=None)
     knots = max((walk.knots for walk in walks.walks), default=0)
-    capped = [one for one in crowds if one.kept or one.order_from]
+    capped = [one.kept for one in crowds if one.kept and one.by_number]
+    capped += [one.order.start - 1 for one in crowds if one.order.start and one.order.by_number]
+    dropped = any(one.kept or one.order.start for one in crowds)
     cutoffs = sorted({f"{walk.cutoff:.6g}" for walk in walks.walks if walk.cutoff})
     worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
     says = ["walked" if walks.walks else "not_walked"]
@@ -117,12 +129,12 @@ def figures(
         "energy": 1e3 * numbers["largest_energy_jump"], "kT": numbers["largest_energy_jump_kT"],
         "force": force, "derivative": ORDERS[order] if order is not None else "",
         "knots": knots, "not_walked": ", ".join(walks.not_walked), "neighbors": numbers["neighbors_tried"],
-        "kept": min((one.kept or (one.order_from or 1) - 1 for one in capped), default=0),
+        "kept": min(capped, default=0),
     }  # fmt: skip
     says += ["ends"] if cutoffs else []
     says.append(f"jumps_{worst}" if order is None or order <= SMOOTH else "jumps_at_an_end")
     says += ["knots"] if knots else []
-    says += ["capped"] if capped else ["crowded"] if crowds else []
+    says += ["capped"] if capped else ["crowded"] if crowds and not dropped else []
     says += ["missing"] if walks.walks and walks.not_walked else []
     # how small a step of the force can be that escapes
     if steps := [walk.steps for walk in walks.walks if walk.steps]:
@@ -169,6 +181,25 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
         yield finding(code, severity, *variants, **values)
 
 
+def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
+    """A finding where more jumps at a pair threshold among the others than for two atoms alone."""
+    if not around.lower:
+        return
+    worst = min(around.lower, key=lambda one: (one.jump.order, -one.force))
+    threshold = worst.threshold
+    assert threshold is not None
+    energy = abs(worst.jump.energy) if worst.jump.order == 0 else 0.0
+    large = energy > _SMALL * kT or worst.force > _SMALL_FORCE * kT
+    yield finding(
+        "CUTOFF_JUMP_AMONG_MANY",
+        "error" if energy > _LARGE * kT else "warning" if large else "info",
+        None if worst.jump.order == 0 else "force",
+        tests=("alone",), two=_two(threshold), at=place(threshold), route=worst.route, force=worst.force,
+        energy=1e3 * energy, kT=energy / kT, alone=ORDERS[threshold.order], measured=around.measured,
+        places=len(around.lower),
+    )  # fmt: skip
+
+
 def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
     if sharp := [one for one in around.unexplained if one.jump.order <= 1]:
         worst = max(sharp, key=lambda one: (one.force, abs(one.jump.energy)))
@@ -187,18 +218,25 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
+    """Findings of a crowd: caps where it is the number of neighbors that matters, otherwise what was seen."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
-        yield finding(
-            "NEIGHBOR_CAP", "error", "energy" if one.energy else None, **values, kept=one.kept,
-            neighbors=one.neighbors, distance=one.distance, force=one.force, energy=1e3 * one.energy,
-            kT=one.energy / kT,
-        )  # fmt: skip
-    if one.order_from:
-        yield finding(
-            "NEIGHBOR_CAP_BY_ORDER", "error", **values, neighbors=one.order_from, fewer=one.order_from - 1,
-            energy=1e3 * one.order_energy, kT=one.order_energy / kT, force=one.order_force,
-        )  # fmt: skip
+        values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
+        values |= {"energy": 1e3 * one.energy, "kT": one.energy / kT, "neighbors": one.neighbors}
+        energy = "energy" if one.energy else None
+        if one.by_number:
+            yield finding("NEIGHBOR_CAP", "error", energy, tests=("repeat", "in range"), **values)
+        else:
+            yield finding("JUMP_AMONG_MANY", "warning", "crowd", energy, **values)
+    if start := one.order.start:
+        values |= {"neighbors": start, "fewer": start - 1, "force": one.order.force, "slug": ""}
+        values |= {"energy": 1e3 * one.order.energy, "kT": one.order.energy / kT}
+        forces = None if one.order.energy else "forces"
+        if one.order.by_number:
+            tests = ("repeat", "place", "in range")
+            yield finding("NEIGHBOR_CAP_BY_ORDER", "error", forces, tests=tests, **values)
+        else:
+            yield finding("ORDER", "error", "crowd", forces and "crowd_forces", **values)
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
@@ -283,9 +321,9 @@ def _tables(
     crowded = [
         {
             "element": one.species, "neighbors given": one.neighbors, "within (Å)": one.radius,
-            "nearest that are kept": one.kept, "order of atoms matters from": one.order_from,
-            "energy (meV)": 1e3 * max(one.energy, one.order_energy),
-            "force (eV/Å)": max(one.force, one.order_force),
+            "nearest that are kept": one.kept, "order of atoms matters from": one.order.start,
+            "energy (meV)": 1e3 * max(one.energy, one.order.energy),
+            "force (eV/Å)": max(one.force, one.order.force),
         }
         for one in crowds
     ]  # fmt: skip

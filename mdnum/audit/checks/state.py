@@ -49,7 +49,7 @@ class StateCheck(AuditCheck):
     Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
     """
 
-    name, title, order, basic, calls = "state", "Memory", 60, True, 700
+    name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -111,6 +111,7 @@ class StateCheck(AuditCheck):
                 "The same question again": [repeats],
             },
             numbers=numbers,
+            limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
             skipped=[
                 *skipped,
                 *((row.what, row.why) for row in refused),
