@@ -102,7 +102,7 @@ CAUSES: dict[str, Cause] = {
     "CURVATURE_JUMP_AMONG_MANY": Cause(spares="run"),
     "DRIFT": Cause(spares="differentiate"),
     "TIMESTEP": Cause(spares="differentiate"),
-    "LOW_PRECISION": Cause(rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED")),
+    "LOW_PRECISION": Cause(rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)),
     # findings that explain no other
     **dict.fromkeys(
         (

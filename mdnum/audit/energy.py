@@ -267,9 +267,9 @@ def hidden_jumps(
         probe: another object than the run's.
         rest: energy that each step leaves unexplained; nan where that is not known.
         crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
-        noise: of the energy, eV.
+        noise: that an energy may differ by, eV.
     """
-    limit = max(40 * noise, _SMALL * probe.kT)
+    limit = max(noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
     candidates = np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")].tolist()
     began = probe.meter.calls
@@ -374,7 +374,7 @@ def balance(
         probe: another object than the run's.
         limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
-        noise: of the energy, eV.
+        noise: that an energy may differ by, eV.
     """
     crossed = crossings(run, limits)
     by_step: dict[int, list[int]] = {}

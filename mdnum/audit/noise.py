@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
+from scipy.special import stdtrit
 
 from mdnum.audit.base import CalculatorError, Observed, finding
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, no_rounding, rms
@@ -17,11 +18,18 @@ from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest,
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
 _SPACING = 1e-5
-_POINTS = 9
+_POINTS, _FEW_POINTS = 25, 9
+#: Of the standard deviation that differences over so many points give, the share of values that it rests on:
+#: neighboring differences share points, so that its square scatters like that of fewer.
+_INDEPENDENT = 0.28
+#: How many times the noise a difference may be, at least: the largest of some hundred forces is compared, and
+#: another order of summation scatters more than moving along a line. And how often a difference of two
+#: answers may be above by chance.
+_ALLOWED, _BY_CHANCE = 40.0, 1e-6
 #: Å by which atoms are moved from where they were given, so that no distance sits on a threshold by design.
 RATTLE = 0.03
 #: Structures of which the quietest is taken, and random moves of the size of rounding.
-_TRIES, _DRAWS = 5, 4
+_TRIES, _DRAWS = 5, 8
 #: Atoms below which symmetry may hide the noise.
 FEW = 8
 #: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
@@ -38,9 +46,8 @@ _QUIETER = 1e-3
 #: compared, and how many: far enough for the terms of a sum to be rounded anew.
 _ORDERS, _ORDER_SPACING, _ORDER_POINTS = 3, 1e-3, 9
 #: Of a difference between two orders: what scatters by more from point to point is no smooth function. Of the
-#: energy and of what the forces are worth over the structure: rounding of a sum is below the second. A
-#: difference of so many times the noise is one.
-_AT_RANDOM, _SUMMED, _SEEN = 0.05, 1e-5, 40.0
+#: energy and of what the forces are worth over the structure: rounding of a sum is below the second.
+_AT_RANDOM, _SUMMED = 0.05, 1e-5
 #: Decimals of a number that are taken for rounding, at most: a double of more is too near to its own.
 _MOST_DECIMALS = 9
 #: Different answers, 0 aside, from which is judged.
@@ -63,15 +70,31 @@ class NoiseFloor:
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
     typical: float = 0.0  # the same of the median component
+    freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """The larger of two, each part by itself."""
+        """The larger of two, each part by itself, as well known as the one that is known less well."""
         return NoiseFloor(
-            max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical)
-        )
+            max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
+            min(self.freedom, other.freedom),
+        )  # fmt: skip
+
+    @property
+    def allowed(self) -> NoiseFloor:
+        """What two answers may differ by: every comparison with noise is one with this.
+
+        A standard deviation that few values gave may be far too small by chance, which Student's t takes into
+        account.
+        """
+        student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
+        return replace(self, **{
+            name: max(_ALLOWED, student) * getattr(self, name) for name in ("energy", "force", "typical")
+        })  # fmt: skip
 
 
-def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
+def along_a_line(
+    subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
+) -> NoiseFloor:
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
     Args:
@@ -82,10 +105,10 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
     """
     line = direction(len(atoms), rng)
-    places = [displaced(atoms, (at - _POINTS // 2) * _SPACING * line) for at in range(_POINTS)]
+    places = [displaced(atoms, (at - points // 2) * _SPACING * line) for at in range(points)]
     answers = [subject.both(place) for place in places]
     energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
-    columns = np.array(forces).reshape(_POINTS, -1)
+    columns = np.array(forces).reshape(points, -1)
     energy = float(scatter(energies[:, None])[0])
     scatters = scatter(columns)
     force = float(np.max(scatters))
@@ -95,7 +118,10 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
             subject.again(places[at], *answers[at])
     # values that round to the same number at every point still carry the rounding of one operation
     floor, typical = np.finfo(float).eps, float(np.median(scatters))
-    return NoiseFloor(max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical)
+    return NoiseFloor(
+        max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical,
+        _INDEPENDENT * points,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -196,7 +222,8 @@ def order_change(
         return OrderChange()  # reported elsewhere
     changes = np.array([differences(base, answer) for answer in answers])
     energy, force = changes.max(axis=0)
-    if energy <= _SEEN * noise.energy and force <= _SEEN * noise.force:
+    quiet = energy <= _NOISY * np.spacing(abs(base[0]))
+    if quiet and energy <= noise.allowed.energy and force <= noise.allowed.force:
         return OrderChange(energy, force)
     size = largest(base[1]) * count * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
     if energy > _SUMMED * size or force > _SUMMED * count * largest(base[1]):
@@ -211,12 +238,13 @@ def order_change(
     drawn, sizes = scatter(values), np.sqrt(np.mean(values**2, axis=0))
     worst = 1 + int(np.argmax(sizes[1:]))
     # whatever is above the noise has to be drawn anew
-    smooth = (energy > _SEEN * noise.energy and drawn[0] < _AT_RANDOM * sizes[0]) or (
-        force > _SEEN * noise.force and drawn[worst] < _AT_RANDOM * sizes[worst]
+    smooth = (energy > noise.allowed.energy and drawn[0] < _AT_RANDOM * sizes[0]) or (
+        force > noise.allowed.force and drawn[worst] < _AT_RANDOM * sizes[worst]
     )
     if smooth:
         return OrderChange(energy, force)
-    return OrderChange(energy, force, NoiseFloor(float(sizes[0]), float(sizes[worst])))
+    floor = NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
+    return OrderChange(energy, force, floor)
 
 
 def in_order(
@@ -261,7 +289,7 @@ def under_jitter(
         # either answer may be the one that sticks out
         if no_rounding(change, force, base, subject.kT) and not subject.again(there, *moved):
             subject.again(atoms, *base)
-        worst = worst.louder(NoiseFloor(change, force))
+        worst = worst.louder(NoiseFloor(change, force, freedom=_DRAWS))
     return worst
 
 
@@ -287,7 +315,7 @@ def settled(
     tried: list[tuple[Atoms, NoiseFloor]] = []
     for _ in range(1 if brief else _TRIES):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
-        noise = along_a_line(subject, there, rng)
+        noise = along_a_line(subject, there, rng, _FEW_POINTS if brief else _POINTS)
         if not tried or noise.energy < _QUIETER * tried[-1][1].energy:
             tried.append((there, noise))
         # quiet enough to be rounding; where it is not, a threshold on the line looks like noise as well
@@ -396,7 +424,9 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
     whose = next((word for word, name in narrow.items() if name), None)
     loud, smooth = share > _NOISY * eps, not narrow["energies"] and ulps <= _NOISY
-    if whose is None and not loud:
+    order = subject.known.get("order", OrderChange())
+    summed = order.floor.energy > 0
+    if whose is None and not loud and not (ulps > _NOISY and summed):
         return
     severity = "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info"
     if loud and smooth:  # forces alone have lost what the energy they belong to still has
@@ -404,7 +434,10 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     yield finding(
         "LOW_PRECISION",
         severity,
-        "format" if whose else "forces" if smooth else None,
+        ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
+        "format" if whose else "forces" if smooth and not summed else None,
+        tests=("rounding",),
+        change=order.energy,
         whose=whose,
         format=narrow[whose] if whose else None,
         energy=noise.energy,

@@ -236,7 +236,9 @@ def test_what_is_said_and_nothing_else(name: str, make, atoms: Atoms, expected: 
         case("forces", planted.Entropy, TWO_ENERGIES="warning", FORCES_NOT_GRADIENT=None),
         case("forces", planted.OrderedEnergy, TWO_ENERGIES="error", FORCES_NOT_GRADIENT=None),
         case("forces", planted.SwappedEnergies, TWO_ENERGIES="warning", FORCES_NOT_GRADIENT="error"),
-        case("forces", planted.drops(0.3), NOISE_FLOOR="error"),
+        # 6 % of the forces, over many answers, and all of them
+        case("forces", planted.drops(0.3), NOISE_FLOOR="warning"),
+        case("forces", planted.hits(0.3), NOISE_FLOOR="error"),
         case("curl", planted.Whirl, chain(), CURL="error"),
         case("state", planted.OldPairs, STALE_STATE="error"),
         case("state", planted.FullSkin, STALE_STATE="error"),

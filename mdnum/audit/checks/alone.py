@@ -14,8 +14,6 @@ from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.structures import molecules, nearest_distance, whole
 from mdnum.audit.subject import CalculatorSubject, Forces, largest
 
-#: How many times the noise energies and forces may differ by.
-_ALLOWED = 40.0
 #: Å between two parts that cannot feel one another, and a cell that does not repeat around them: some lists
 #: take long over an empty one.
 _FAR, _BOX = 60.0, 75.0
@@ -134,11 +132,11 @@ class Alone:
             return None
         energy, force = answer[0], largest(felt(answer[1]))
         expected = energy if expected is None else expected
-        allowed = _ALLOWED * max(self._noise.energy, _EPS * abs(expected))
+        allowed = self._noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
         self.rows.append({
             "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(energy - expected) <= allowed,
-            "no force": force <= _ALLOWED * max(self._noise.force, _EPS),
+            "adds up": abs(energy - expected) <= allowed.energy,
+            "no force": force <= allowed.force,
         })  # fmt: skip
         return energy
 

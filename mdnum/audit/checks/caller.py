@@ -16,8 +16,6 @@ from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed,
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject, EnergyForces, differences, largest
 
-#: How many times the noise answers of two objects may differ by.
-_ALLOWED = 40.0
 #: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
 _SEEDS = (271828, 314159)
 #: What some calculators read from `Atoms.info`.
@@ -93,8 +91,9 @@ def _edited(
     with subject.trying():  # it may not take a charge, or a structure without periods
         old, new = asked()
         energy, force = differences(old, new)
-        floor = np.finfo(float).eps * max(1.0, abs(new[0]), largest(new[1]))
-        if energy <= _ALLOWED * max(noise.energy, floor) and force <= _ALLOWED * max(noise.force, floor):
+        eps = np.finfo(float).eps
+        allowed = noise.louder(NoiseFloor(eps * abs(new[0]), eps * max(1.0, largest(new[1])))).allowed
+        if energy <= allowed.energy and force <= allowed.force:
             return
         again = zip((old, new), asked(), strict=True)
     # what comes by chance does not come again

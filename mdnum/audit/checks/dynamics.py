@@ -109,7 +109,7 @@ class DynamicsCheck(AuditCheck):
         probe = subject.fresh()
         noise = along_a_line(probe, whole.at(start.positions), rng)
         progress(0, 0, {"phase": "accounting for the energy"})
-        found = balance(probe, whole, limits, rng, noise.energy)
+        found = balance(probe, whole, limits, rng, noise.allowed.energy)
         # the other run's flips count only where they bring energy
         finer = crossings(half, limits) if any(one.order == 0 for one in limits) else []
         stale = _aged(subject, whole, _COMPARED, noise)
@@ -121,8 +121,8 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
     """Largest difference of a run's energies from those of new objects, and what noise allows, eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
-    allowed = 40 * max(noise.energy, np.finfo(float).eps * largest(ran.potential))
-    return largest(np.array(again) - ran.potential[places]), allowed
+    rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
+    return largest(np.array(again) - ran.potential[places]), noise.louder(rounding).allowed.energy
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], timestep: float) -> CheckResult:
@@ -269,7 +269,7 @@ class TwoRuns:
             yield finding("NOT_CONSERVED", severity, "old" if old else None, **values("rest", swing=swing))
 
         size = numbers["flips_wander"]
-        if numbers["largest_jump"] > 100 * self.noise.energy and size > _WANDERS:
+        if numbers["largest_jump"] > 2 * self.noise.allowed.energy and size > _WANDERS:
             jump = 1e3 * numbers["largest_jump"]
             told = values("flips", crossings=numbers["crossings"], jump=jump, wander=size)
             severity = "error" if flips.significant and abs(flips.slope) > much else "warning"

@@ -35,8 +35,6 @@ _SMALL = 1e-4
 #: other is more than single precision explains.
 _DROWNED, _LOUD = 0.1, 1e-3
 _DIRECTIONS, _ATOMS = 3, 4
-#: How many times the noise the difference of two energies may change by.
-_ALLOWED = 40.0
 #: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
 #: between two ways of writing one structure down, above the other is an error.
 _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
@@ -214,7 +212,7 @@ def slope(
             subject.again(displaced(atoms, sign * _LADDER[rung] * line), float(energies[rung]))
     # a difference that grows like 1/h down to the smallest h shows a step of the energy
     sizes = 2 * _LADDER[-4:] * (central - force)[-4:]
-    steady = np.ptp(sizes) < 0.3 * abs(sizes[-1]) and abs(sizes[-1]) > 30 * noise.energy
+    steady = np.ptp(sizes) < 0.3 * abs(sizes[-1]) and abs(sizes[-1]) > noise.allowed.energy
     return Slope(
         what,
         float(better[best + 1]),
@@ -256,7 +254,7 @@ def _best(
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
     """Net force, and net torque where nothing repeats: by symmetry of space both are zero."""
     size = float(np.sum(np.abs(forces)))
-    allowed = 40 * (noise.force * np.sqrt(len(atoms)) + np.finfo(float).eps * size)
+    allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
     yield {"sum": "net force (eV/Å)", "found": net, "rounding explains": float(allowed)}
     if not atoms.pbc.any() and len(atoms) > 1:
@@ -366,7 +364,7 @@ def _two_energies(
     forward, back = (offset(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
     slope_of_offset = (forward - back) / (2 * _STEP)
     worst = max(subject.repeats.offsets.values(), key=lambda one: abs(one.change))
-    if abs(worst.change) <= max(_ALLOWED * noise.energy, _SMALL_OFFSET * subject.kT):
+    if abs(worst.change) <= max(noise.allowed.energy, _SMALL_OFFSET * subject.kT):
         return
     limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
     free = along.agrees

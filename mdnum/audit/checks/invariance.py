@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -12,14 +12,14 @@ from ase import Atoms
 from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
-from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, settled, under_jitter
+from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, order_change, settled, under_jitter
 from mdnum.audit.places import wrong_places
 from mdnum.audit.structures import group, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 
-#: How many times the measured noise a difference may be: the largest of some hundred forces is seen, noise is
-#: a standard deviation, and another order of summation scatters more than moving along a line.
-_ALLOWED = 40.0
+#: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
+#: are said to differ.
+_NEARLY = 30.0
 #: Of kT for the whole structure, and of the root mean square force: a difference below is one of precision.
 _SMALL = 1e-3
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
@@ -164,7 +164,7 @@ class InvarianceCheck(AuditCheck):
             wrong = self._without_topology(wrong, judge)
         variants: tuple[str, ...] = ()
         more: dict[str, Any] = {}
-        if "ORDER" in wrong and (places := wrong_places(judge.subject, judge.atoms, judge.allowed)):
+        if "ORDER" in wrong and (places := wrong_places(judge.subject, judge.atoms, judge.noise.allowed)):
             wrong["PLACE_IN_LIST"] = wrong.pop("ORDER")
             variants, more = places.variants, places.values
         yield from judge.notes
@@ -226,11 +226,6 @@ class _Judge:
         # by structures, which are kept so that their ids are theirs
         self._known: dict[tuple[int, int], tuple[Atoms, float, Forces, NoiseFloor]] = {}
 
-    @property
-    def allowed(self) -> NoiseFloor:
-        """What two orders of the atoms may differ by."""
-        return NoiseFloor(_ALLOWED * self.noise.energy, _ALLOWED * self.noise.force)
-
     def before(self, same: Same) -> Atoms:
         return self.atoms if same.before is None else same.before
 
@@ -241,6 +236,15 @@ class _Judge:
         if not found.agrees:
             # another object, which has seen nothing else: what it remembers is another question
             found, _ = self._compared(self.subject.fresh(), same, *reference)
+            if not found.agrees and found.excess < _NEARLY:
+                # noise may be larger in the other way of writing it down, that of a longer sum above all
+                noise = found.allowed
+                for there, copies in ((base, 1), (same.atoms, same.copies)):
+                    other = self.subject.fresh()
+                    line = along_a_line(other, there, self._rng)
+                    line = line.louder(order_change(other, there, line, self._rng).floor).allowed
+                    noise = noise.louder(replace(line, energy=line.energy / copies))
+                found = replace(found, allowed=noise)
             # who stands alone may have answered so by chance, and is asked again
             if found.agrees:
                 self.worker.again(same.atoms, *answer)
@@ -272,7 +276,7 @@ class _Judge:
                     noise = noise.louder(along_a_line(worker, base, self._rng))
                 if rounding:
                     noise = noise.louder(under_jitter(worker, base, 2.0**power, self._rng))
-                allowed = NoiseFloor(_ALLOWED * noise.energy, _ALLOWED * noise.force)
+                allowed = noise.allowed
             self._known[key] = base, *worker.both(base), allowed
         return self._known[key][1:]
 

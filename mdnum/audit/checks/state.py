@@ -28,9 +28,6 @@ from mdnum.audit.structures import pairs
 from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
-#: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
-#: terms in another order.
-_ALLOWED = 40.0
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
 #: and by new objects.
 _AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
@@ -227,8 +224,8 @@ def _through(
             # a larger energy has more noise than was measured
             share = max(1.0, abs(new[0]) / size) if size else 1.0
             row.energy, row.force = differences(old, new)
-            row.allowed = _ALLOWED * noise.energy * share
-            force = _ALLOWED * share * max(noise.force, _EPS * max(1.0, largest(new[1])))
+            row.allowed = noise.allowed.energy * share
+            force = share * noise.louder(NoiseFloor(0.0, _EPS * max(1.0, largest(new[1])))).allowed.force
             row.remembers = row.energy > row.allowed or row.force > force
         yield place + 1, row
 
