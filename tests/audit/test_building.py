@@ -121,7 +121,7 @@ def test_what_is_known_when_the_calls_are_spent_has_to_do(monkeypatch):
 
 
 def test_a_calculation_of_many_atoms_is_not_begun_where_one_of_few_takes_long(monkeypatch):
-    """Time goes with the third power of the number of atoms: no structure is asked about that takes minutes."""
+    """Time goes with the third power of the number of atoms: none is asked about that takes minutes."""
     asked, worked = [], [0.0]
 
     class Cubic(LennardJones):

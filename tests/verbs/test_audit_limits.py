@@ -85,6 +85,18 @@ def test_all_checks_together_have_a_limit_of_calls():
     assert all(needed_to(question) & basic for question in ("run", "differentiate"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind", [planted.Good, planted.ByAppearance, planted.HardEdge, planted.FirstSix, planted.drops(0.02, 0)]
+)
+def test_a_whole_audit_of_two_elements_stays_within_its_calls(kind, monkeypatch, tmp_path):
+    """Counted by the calculator itself, whatever is wrong with it, its structure included."""
+    timed = ByCalls(kind, monkeypatch)
+    outcome = mdnum.audit_calculator(timed.make, out=tmp_path / "a", report=False)
+    assert outcome.summary["status"] == "complete" and len(outcome.summary["parts"]) == len(list(CHECKS))
+    assert timed.calls <= MOST
+
+
 def test_a_check_whose_calls_are_used_up_is_not_fine(monkeypatch, tmp_path):
     monkeypatch.setattr(CHECKS["invariance"], "calls", 60)
     monkeypatch.setattr(CHECKS["dynamics"], "calls", 50)

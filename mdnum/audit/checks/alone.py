@@ -24,7 +24,7 @@ _EPS = np.finfo(float).eps
 class AloneCheck(AuditCheck):
     """Do atoms without neighbors feel nothing, and do energies of parts far apart add up?"""
 
-    name, title, order, calls = "alone", "Atoms alone", 48, 80
+    name, title, order, calls = "alone", "Atoms alone", 48, 240
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:

@@ -12,9 +12,18 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
+from mdnum.audit.base import (
+    AuditCheck,
+    CalculatorError,
+    CheckResult,
+    Observed,
+    Progress,
+    Severity,
+    Ways,
+    finding,
+)  # fmt: skip
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
-from mdnum.audit.subject import CalculatorSubject, EnergyForces, differences, largest
+from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest
 
 #: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
 _SEEDS = (271828, 314159)
@@ -29,7 +38,7 @@ class CallerCheck(AuditCheck):
     random numbers.
     """
 
-    name, title, order, calls = "caller", "Caller", 30, 120
+    name, title, order, calls = "caller", "Caller", 30, 280
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -81,7 +90,7 @@ def _edited(
 ) -> Iterator[Observed]:
     """One calculator and one `Atoms` object, before a change and after it, beside new ones."""
 
-    def asked() -> tuple[EnergyForces, EnergyForces]:
+    def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
         used, there = subject.used(), atoms.copy()
         used.copies = False
         used.both(there)
@@ -137,31 +146,36 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     }
     if torch := sys.modules.get("torch"):
         generators["torch"] = torch.get_rng_state, torch.set_rng_state, torch.manual_seed
-    kept = {name: get() for name, (get, _, _) in generators.items()}
-    states: dict[str, list[dict[str, bytes]]] = {"made": [], "asked": []}
-    drawn: dict[str, set[str]] = {"made": set(), "asked": set()}
+    kept = [(put, get()) for get, put, _ in generators.values()]
+    # by the call of an object, the first one or another: states before and after it, for each seed
+    states: dict[str, list[dict[str, tuple[bytes, bytes]]]] = {"made": [], "asked": []}
     try:
         for seed in _SEEDS:
             one = subject.fresh()
-            for when in states:
+            for seen in states.values():
                 for _, _, start in generators.values():
                     start(seed)
-                before = {name: pickle.dumps(get()) for name, (get, _, _) in generators.items()}
+                before = [pickle.dumps(get()) for get, _, _ in generators.values()]
                 one.forget()
                 one.both(atoms)
-                states[when].append({name: pickle.dumps(get()) for name, (get, _, _) in generators.items()})
-                drawn[when] |= {name for name in generators if states[when][-1][name] != before[name]}
+                after = [pickle.dumps(get()) for get, _, _ in generators.values()]
+                seen.append(dict(zip(generators, zip(before, after, strict=True), strict=True)))
     finally:
-        for name, (_, put, _) in generators.items():
-            put(kept[name])
-    for when, severity in (("asked", "error"), ("made", "warning")):
-        names = drawn[when]
-        seeded = sorted(name for name in names if states[when][0][name] == states[when][1][name])
-        if seeded:
-            yield finding("RANDOM_SEEDED", severity, when, which=" and ".join(seeded))
+        for put, state in kept:
+            put(state)
+    told: tuple[tuple[str, Severity, int], ...] = (
+        ("asked", "error", 1), ("made", "warning", 1), ("drawn", "info", 2),
+    )  # fmt: skip
+    for when, severity, wanted in told:
+        first, second = states["made" if when == "made" else "asked"]
+        names = [
+            name
+            for name in generators
+            if first[name][0] != first[name][1] and len({first[name][1], second[name][1]}) == wanted
+        ]
+        if names:
+            yield finding("RANDOM_SEEDED", severity, when, which=" and ".join(names))
             return
-    if drawn["asked"]:
-        yield finding("RANDOM_SEEDED", "info", "drawn", which=" and ".join(sorted(drawn["asked"])))
 
 
 def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
