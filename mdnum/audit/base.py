@@ -91,6 +91,16 @@ class Meter:
             raise CallsUp
 
     @contextmanager
+    def apart(self, calls: int) -> Iterator[None]:
+        """What several checks rest on is found here: it has calls of its own, and takes none from a check."""
+        most, before = self.most, self.calls
+        self.most = before + calls
+        try:
+            yield
+        finally:
+            self.most = most + self.calls - before
+
+    @contextmanager
     def limited(self) -> Iterator[None]:
         """One way of many is asked here: no call is made past a limit, which raises `TimeUp`."""
         self._check()
@@ -305,6 +315,8 @@ def needed_to(question: str) -> set[str]:
 
 #: Of the ways of a check: from here on it counts as asked.
 _NEARLY = 0.9
+#: Of the share of the forces that is wrong: a curl that would be seen of this is absent.
+_FAR_BELOW = 0.1
 _QUESTIONS = ("run", "differentiate")
 
 
@@ -340,3 +352,18 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
     begun, basic = {result.name for result in results}, {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
+
+
+def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
+    """Variants of sentences, by code, for what only several checks tell together.
+
+    Wrong forces that do no work around loops are the forces of another energy; those that do have none.
+    """
+    numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
+    curl, forces = numbers.get("curl"), numbers.get("forces")
+    if not curl or not forces:
+        return {}
+    # a curl would be seen that is far below the share of the forces that is wrong
+    seen = curl["unseen_share"] * forces["rms_force"] < _FAR_BELOW * forces["largest_difference"]
+    which = "no_energy" if curl["with_work"] else "another_energy" if seen else ""
+    return {"FORCES_NOT_GRADIENT": which}

@@ -76,9 +76,8 @@ CAUSES: dict[str, Cause] = {
         code: Cause((*_IMAGES[k + 1 :], "MIXED_PERIODICITY", *_AMONG_MANY, *_RUN))
         for k, code in enumerate(_IMAGES)
     },
-    "LEFT_HANDED": Cause(
-        ("EXTENSIVE", "MIRROR", *_RUN), rivals=("LATTICE", "MIRROR"), tests=("determinant",)
-    ),
+    # a structure is asked about with the vectors that it has, so that only other vectors show it
+    "LEFT_HANDED": Cause(rivals=("LATTICE", "MIRROR"), tests=("determinant",)),
     "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
     "DUMMY_CELL": Cause(("MIXED_PERIODICITY",), rivals=("MIXED_PERIODICITY",)),
     "MIXED_PERIODICITY": Cause(rivals=("DUMMY_CELL", "IMAGES", "EXTENSIVE")),
@@ -102,7 +101,9 @@ CAUSES: dict[str, Cause] = {
     "CURVATURE_JUMP_AMONG_MANY": Cause(spares="run"),
     "DRIFT": Cause(spares="differentiate"),
     "TIMESTEP": Cause(spares="differentiate"),
-    "LOW_PRECISION": Cause(rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)),
+    "LOW_PRECISION": Cause(
+        ("NOISE_FLOOR",), rivals=("ORDER", "NOT_REPEATABLE", "QUANTIZED"), tests=("rounding",)
+    ),
     # findings that explain no other
     **dict.fromkeys(
         (

@@ -218,12 +218,16 @@ def flips(
     format: str | None = typer.Option(
         None, "--format", metavar="WORD", help="The file's format, where its name does not tell."
     ),
+    drop_repeats: bool = typer.Option(
+        False, "--drop-repeats", help="Leave out frames that are earlier ones again, bit for bit."
+    ),
     how: Any = None,
 ) -> Any:  # fmt: skip
     """Find every pair that entered or left a cutoff between frames, and say what that tells and what not."""
     return mdnum.flips(
         trajectory, other, topology=topology, cutoffs=cutoffs or (), pairs=pairs or (),
-        nearest=nearest or (), most=most, between=between, window=window, format=format, **how,
+        nearest=nearest or (), most=most, between=between, window=window, format=format,
+        drop_repeats=drop_repeats, **how,
     )  # fmt: skip
 
 

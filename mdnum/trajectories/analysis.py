@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field
+from itertools import chain
 from multiprocessing import parent_process
 from shutil import rmtree
 from tempfile import mkdtemp, mkstemp
@@ -28,9 +29,11 @@ from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
 from mdnum.reading import FrameError, UnreadableFrame
+from mdnum.trajectories.collective import Collective
 from mdnum.trajectories.frame import FrameCheck
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
+from mdnum.trajectories.repeats import Repeats, digest
 from mdnum.trajectories.resolution import Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.topology import AtomTable, formats_of
@@ -168,7 +171,8 @@ class NeighborFlips(AnalysisBase):
 
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
-    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame.
+    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
+    `results.repeats` which frames repeat earlier ones (see `repeats.Repeats`).
     `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
@@ -328,6 +332,8 @@ class NeighborFlips(AnalysisBase):
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
         self._done = 0
+        # what it knows of earlier frames is of another part, or of another run
+        self._check.collective = Collective()
         self.results, failure = Results(failures=[None]), None
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
@@ -351,7 +357,7 @@ class NeighborFlips(AnalysisBase):
         # in the process that was asked, or sent to nobody knows where and how often it is read: in memory
         folder = None if parent_process() is None or "distributed" in sys.modules else self._folder
         self.results.parts = [[_ProcessPart(folder) for _ in self.rules]]
-        self.results.bounds = [[]]
+        self.results.bounds, self.results.digests = [[]], [[]]
         if self._at:
             # the frame before the first of this part
             self._done = -1
@@ -368,11 +374,13 @@ class NeighborFlips(AnalysisBase):
             part.first = tracker.members() if part.first is None else part.first
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
+        self.results.digests[0].append(self._digest)
         self._done += 1
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
+        self._digest = digest(frame)
         bound = self._bound or 0.0
         if self._bound is None and self._resolution is not None:
             bound = self._resolution.bound(frame, self._check.atoms)
@@ -386,7 +394,7 @@ class NeighborFlips(AnalysisBase):
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence
-        return ResultsGroup(lookup={"parts": flat, "bounds": flat, "failures": flat})
+        return ResultsGroup(lookup=dict.fromkeys(("parts", "bounds", "digests", "failures"), flat))
 
     def _conclude(self) -> None:
         results = self.results
@@ -400,7 +408,11 @@ class NeighborFlips(AnalysisBase):
             _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
         ]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
-        for name in ("parts", "bounds", "failures"):
+        repeats = Repeats()
+        for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):
+            repeats.see(int(number), digested)
+        results.repeats = repeats.stretches
+        for name in ("parts", "bounds", "digests", "failures"):
             del results[name]
         results.failure = failures[failed[0]] if failed else self._behind_the_last()
         results.rules, results.bound, results.resolution = found, bound, self._resolution

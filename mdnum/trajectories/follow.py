@@ -18,6 +18,7 @@ from mdnum.trajectories.frame import AtomIndices, Box, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.trajectories.repeats import Repeats
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.search import image_distances
@@ -54,8 +55,12 @@ def _usable(
     Raises:
         InputError: the first frame cannot be read or used: there is nothing to keep.
     """
-    radius = smallest_radius(rules)
-    streams = [map(FrameCheck(atoms, str(one.path), radius, one.bits), one.frames()) for one in files]
+    radius, species = smallest_radius(rules), any(rule.needs_species for rule in rules)
+    streams = []
+    for one in files:
+        one.check = FrameCheck(atoms, str(one.path), radius, one.bits, species=species)
+        one.repeats = Repeats(one.drop_repeats)
+        streams.append(one.repeats(map(one.check, one.frames())))
     while True:
         try:
             frames = [frame for one in streams if (frame := next(one, None)) is not None]

@@ -16,12 +16,15 @@ from jaxtyping import Bool, Float, Int
 
 from mdnum.reading import FrameError
 from mdnum.reading import UnreadableFrame as UnreadableFrame
+from mdnum.trajectories.collective import Collective
 
 # Sizes of the system from its middle at which nothing is any more: unwrapped coordinates of a liquid get
 # some thousand boxes far in a second; what flies off into empty space gets further.
 _FAR_BOXES, _FAR_SIZES = 1e5, 1e6
 # The same for the way between two frames.
 _LEAP_BOXES, _LEAP_SIZES = 100.0, 1e4
+# At least as many atoms, or all, stand for all of them in what they have in common.
+_SOME = 500
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 
 #: Indices of some atoms of a file; None for all.
@@ -49,6 +52,11 @@ class Box:
         return float(np.linalg.norm(self.matrix, axis=1).max())
 
     @cached_property
+    def shortest(self) -> float:
+        """The shortest lattice vector of those that repeat, length; 0 without any."""
+        return float(np.linalg.norm(self.matrix[self.pbc], axis=1).min()) if self.periodic else 0.0
+
+    @cached_property
     def broken(self) -> Int[np.ndarray, "axes"]:
         """Axes along which it repeats, but without a vector."""
         vectors = self.matrix.any(axis=1) & np.isfinite(self.matrix).all(axis=1)
@@ -69,6 +77,7 @@ class Frame:
     box: Box
     velocities: Float[np.ndarray, "atoms 3"] | None = None  # length per time, where the file has them
     labels: np.ndarray | None = None  # names, elements or types, where the file has them in every frame
+    identified: bool = False  # whether ids in the file say which atom is which, so that a label may change
 
     @cached_property
     def furthest(self) -> float:
@@ -86,9 +95,10 @@ class FrameCheck:
 
     Raises:
         FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
-            distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
-            axes than in the first frame (most often: there is none), or along one without a vector, or an
-            atom is labeled as another one than in the first frame.
+            distances of that length, more than one atom is at exactly 0, 0, 0, all atoms are where they do
+            not move together, the box repeats along other axes than in the first frame (most often: there is
+            none), or along one without a vector, or an atom is labeled as another one than in the first frame
+            and the file has no ids, or a rule needs species.
     """
 
     atoms: AtomIndices = None  # those that matter, ascending; None for all
@@ -97,6 +107,9 @@ class FrameCheck:
     bits: int = 64  # width of a coordinate as it was read
     pbc: Bool[np.ndarray, "3"] | None = None  # of the first frame, once there was one
     labels: np.ndarray | None = None
+    species: bool = True  # whether a rule asks for them
+    retyped: tuple[int, int] | None = None  # (frame, atom) of the first label that changed and may
+    collective: Collective = field(default_factory=Collective)
 
     def __call__(self, frame: Frame) -> Frame:
         atoms = self.atoms
@@ -121,12 +134,15 @@ class FrameCheck:
             others = others if atoms is None else np.intersect1d(others, atoms)
             if others.size:
                 atom = int(others[0])
-                raise refused(
-                    f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one looked at"
-                    f"{_and_others(others.size)}",
-                    "Write all frames in one order of atoms, or leave out those that differ with @START:STOP:"
-                    " pairs are followed by the place of their atoms in the file",
-                )
+                self.retyped = self.retyped or (frame.index, atom)
+                remedy = "Write all frames in one order of atoms, or leave out those that differ with"
+                remedy += " @START:STOP: pairs are followed by the place of their atoms in the file"
+                if frame.identified:
+                    remedy = "Use --cutoff or --nearest, which need no species, or leave out others"
+                    remedy += " with @START:STOP: by its id it is the same atom, of another type there"
+                if self.species or not frame.identified:
+                    message = f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one"
+                    raise refused(f"{message} looked at{_and_others(others.size)}", remedy)
         if (frame.box.pbc != pbc).any():
             raise refused(
                 f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
@@ -159,6 +175,9 @@ class FrameCheck:
                 f": {some}, as where coordinates were never written",
                 "Leave the frame out with @START:STOP, or the atoms with --between",
             )
+        some, far = x[:: max(1, len(x) // _SOME)], _LEAP_BOXES * frame.box.longest
+        if (why := self.collective.refuse(some, len(x), frame.box.shortest, far)) is not None:
+            raise refused(f": {why}", failed)
         return frame
 
 

@@ -19,26 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.errors import InputError
 from mdnum.reading import CHECK, reading
 from mdnum.trajectories.binary import head_of, opened
-from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.rules import CutoffRule
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
 from mdnum.trajectories.topology import (
     NARROWED,
     AtomTable,
     Boxes,
-    box_of,
     file_of,
     formats_of,
     topology_universe,
 )
-from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
 
-# a distance that bonded atoms have, and others do not come to, Å
-_CLOSE = 1.4
 # of trr: magic, length of the word with its end, length of the word, the word; then thirteen numbers
 _TRR = struct.Struct(">3i12s13i")
 _TRR_MAGIC = 1993
@@ -124,12 +118,16 @@ class MDAnalysisTrajectory(Trajectory):
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
             self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-            boxes = Boxes(trajectory)
-            self.notes = (NARROWED, *self.table.notes, *boxes.notes, *differing_box(trajectory, boxes))
+            self._boxes = Boxes(trajectory)
+            self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
     @property
     def universe(self) -> Any:
         return self._universe
+
+    def other_box(self, number: int) -> tuple[str, Box] | None:
+        with reading(self.path, number):
+            return self._boxes.other(self._universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
         """A Universe of the trajectory, and the warnings that opening it gave."""
@@ -244,42 +242,6 @@ def _has_no_times(trajectory: Any, said: list[str]) -> bool:
     return "time" not in trajectory.ts.data and any(
         "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
     )
-
-
-def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
-    """A sentence on where MDAnalysis takes a box for another one than the file has, from two frames."""
-    if not boxes.own:
-        return
-    worst, said = -1, ""
-    for number in (0, trajectory.n_frames - 1):
-        try:
-            with reading(file_of(trajectory) or "the trajectory", number):
-                ts = trajectory[number]
-                ours, theirs = boxes.box(ts, number), box_of(ts.dimensions)
-                apart = float(np.abs(ours.matrix - theirs.matrix)[ours.pbc].max(initial=0.0))
-                # float32, and angles from cosines
-                if not apart > 1e-4 * float(np.abs(ours.matrix).max()):
-                    continue
-                counts = []
-                for box in (theirs, ours):
-                    tracker = Tracker(CutoffRule(_CLOSE))
-                    tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
-                    counts.append(len(tracker.members()))
-        except InputError:
-            # a frame that cannot be used is told in its turn
-            continue
-        if counts[0] - counts[1] > worst:
-            worst = counts[0] - counts[1]
-            said = (
-                "The file's box is not the one that MDAnalysis makes of its lengths and angles: its vectors "
-                f"differ by up to {apart:.3g} Å, so that images stand elsewhere. mdnum takes the file's. In "
-                f"frame {number} MDAnalysis puts {counts[0]:,} pairs of atoms closer than {_CLOSE:g} Å, "
-                f"the file's {counts[1]:,}."
-            )
-    # selections by place are made at the frame where the reader stands
-    trajectory[0]
-    if said:
-        yield said
 
 
 # ---- behind the last frame

@@ -54,7 +54,8 @@ class AseFrames(Trajectory):
         units = _units(self.path)
         self.length, self.time = units.length, units.time if self._timed else "frame"
         self._per_time = units.time_factor
-        return AtomTable.plain(first.get_chemical_symbols())
+        order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
+        return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
@@ -62,14 +63,26 @@ class AseFrames(Trajectory):
         if momenta is not None and np.any(momenta):
             velocities = np.asarray(momenta, np.float64) / atoms.get_masses()[:, None] * self._per_time
         timed = self._timed and "time" in atoms.info
+        labels, identified = np.array(atoms.get_chemical_symbols()), _ids(atoms) is not None
+        if identified:
+            order = self._by_id(number, atoms.arrays["id"])
+            atoms, labels = atoms[order], labels[order]
+            velocities = None if velocities is None else velocities[order]
         return Frame(
             index=number,
             time=float(atoms.info["time"]) if timed else float(number),
             positions=np.array(atoms.positions, np.float64),
             box=Box(np.array(atoms.cell.array, np.float64), np.array(atoms.pbc, bool)),
             velocities=velocities,
-            labels=np.array(atoms.get_chemical_symbols()),
+            labels=labels,
+            identified=identified,
         )
+
+
+def _ids(atoms: Any) -> np.ndarray | None:
+    """Ids that say which atom is which; None where there are none, or not one for each."""
+    ids = atoms.arrays.get("id")
+    return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
 
 class AseTrajectory(AseFrames):
@@ -296,7 +309,6 @@ class LammpsDump(TextTrajectory):
     """A text dump of LAMMPS. Atoms are in the order of their ids."""
 
     format = "lammpstrj"
-    _ids: np.ndarray | None = None
 
     def _described(self, block: list[str]) -> AtomTable:
         items = _items(block)
@@ -333,7 +345,8 @@ class LammpsDump(TextTrajectory):
         velocities = numbers(_VELOCITIES) if timed and set(_VELOCITIES) <= set(columns) else None
         step = _whole_number(items["TIMESTEP"][0], "the time step")
         time = float(items["TIME"][0]) if timed else float(step)
-        return Frame(number, time, positions, Box(matrix, pbc), velocities, _labels(columns, rows))
+        labels = _labels(columns, rows)
+        return Frame(number, time, positions, Box(matrix, pbc), velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
@@ -342,18 +355,7 @@ class LammpsDump(TextTrajectory):
                 "the dump has no ids, and LAMMPS changes the order of atoms as they move",
                 "Dump the column id",
             )
-        ids = rows[:, columns.index("id")].astype(np.int64)
-        order = np.argsort(ids, kind="stable")
-        known = self._ids = ids[order] if self._ids is None else self._ids
-        if not np.array_equal(known, ids[order]):
-            lost = np.setdiff1d(known, ids)
-            seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise self._odd(
-                number,
-                f"{seen} of the first frame: {len(rows):,} atoms, and {len(known):,} there",
-                "Dump one group of atoms that stays the same",
-            )
-        return order
+        return self._by_id(number, rows[:, columns.index("id")].astype(np.int64))
 
     def _block(self, lines: Any) -> list[str] | None:
         block: list[str] = []

@@ -4,7 +4,7 @@ MDAnalysis keeps three lengths and three angles, from which a box has its first 
 in the xy plane. Most programs turn their boxes like that; where one does not, its coordinates are turned
 otherwise too, and images would be put into wrong places without a word:
 
-- CHARMM's are symmetric matrices (since version 22, in dcd files);
+- CHARMM's are symmetric matrices (since version 22, in dcd files, which do not say so: see dcd_boxes);
 - HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
 - those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
 
@@ -174,12 +174,24 @@ class Boxes:
             words = formats_of(trajectory)
             if make := next((_MATRICES[word] for word in words if word in _MATRICES), None):
                 self._matrix = make(str(path), trajectory)
+                self.notes = getattr(self._matrix, "notes", ())
             if _PDB & set(words) and trajectory.n_frames > 1 and path.is_file():
                 stat = path.stat()
                 self._models, records = _models(str(path), stat.st_size, stat.st_mtime_ns)
                 self.notes = (_ONCE,) if self._models and records == 1 else ()
         self._changed = bool(getattr(trajectory, "transformations", ()))
         self.own = self._matrix is not None or bool(self._models)
+
+    def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
+        """As `Trajectory.other_box`, for a timestep that is this frame of the file."""
+        instead = getattr(self._matrix, "instead", None)
+        if instead is not None and (matrix := instead(number)) is not None:
+            return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))
+        ours, theirs = self.box(ts, number), box_of(ts.dimensions)
+        apart = float(np.abs(ours.matrix - theirs.matrix)[ours.pbc].max(initial=0.0))
+        # float32, and angles from cosines
+        differs = self.own and apart > 1e-4 * float(np.abs(ours.matrix).max())
+        return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
@@ -213,23 +225,11 @@ def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
     return Box(matrix if matrix.any() else np.full((3, 3), np.nan), np.ones(3, bool))
 
 
-def _charmm(path: str, trajectory: Any) -> Matrices:
-    from MDAnalysis.lib.formats.libdcd import DCDFile
+def _dcd(path: str, trajectory: Any) -> Matrices:
+    # it looks for pairs of atoms, which needs what is above this module
+    from mdnum.trajectories.dcd_boxes import DcdBoxes
 
-    file = DCDFile(path)
-
-    def matrix(number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        if (np.asarray(ts.dimensions[3:]) == 90).all():
-            return None
-        file.seek(number)
-        xx, xy, yy, xz, yz, zz = np.array(file.read().unitcell, np.float64)
-        symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        # in these places stand cosines otherwise, or angles, which give other lengths
-        lengths = np.sqrt((symmetric**2).sum(axis=1))
-        cosines = max(abs(xy), abs(xz), abs(yz)) <= 1
-        return symmetric if not cosines and np.allclose(lengths, ts.dimensions[:3], rtol=1e-5) else None
-
-    return matrix
+    return DcdBoxes(path, trajectory)
 
 
 def _hoomd(path: str, trajectory: Any) -> Matrices:
@@ -280,7 +280,7 @@ def _dlpoly(path: str, trajectory: Any) -> Matrices:
     return matrix
 
 
-_MATRICES = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
+_MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 
 @lru_cache(maxsize=4)

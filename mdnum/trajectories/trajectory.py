@@ -27,7 +27,8 @@ from jaxtyping import Int
 
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
-from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.frame import Box, Frame, FrameCheck
+from mdnum.trajectories.repeats import Repeats
 from mdnum.trajectories.topology import AtomTable, topology_universe
 
 #: Frames from which the resolution of a file is read.
@@ -72,6 +73,12 @@ class Trajectory(ABC):
     notes: tuple[str, ...] = ()  # what a reader of the results should know about the reading, each a sentence
     # frames in the file, where they are known
     _count: int | None = None
+    # ids of the atoms in ascending order, where the file has them
+    _ids: np.ndarray | None = None
+    # whether frames that repeat earlier ones are left out; which did, and what was found of frames, when read
+    drop_repeats = False
+    repeats: Repeats
+    check: FrameCheck
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):
         self.path, self.slice = path, slice
@@ -104,6 +111,10 @@ class Trajectory(ABC):
     def species(self) -> np.ndarray:
         """Species of every atom, words, shape (atoms,)."""
         return self.table.species
+
+    def other_box(self, number: int) -> tuple[str, Box] | None:
+        """(code of a finding, another box that a frame may be taken to have); None without one."""
+        return None
 
     @property
     def name(self) -> str:
@@ -198,6 +209,20 @@ class Trajectory(ABC):
     def _behind(self) -> str | None:
         """What is left in the file behind its last frame, in words."""
         return None
+
+    def _by_id(self, number: int, ids: np.ndarray) -> np.ndarray:
+        """The order of a frame's atoms by their ids, which are those of the first frame."""
+        order = np.argsort(ids, kind="stable")
+        known = self._ids = ids[order] if self._ids is None else self._ids
+        if not np.array_equal(known, ids[order]):
+            lost = np.setdiff1d(known, ids)
+            seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
+            raise self._odd(
+                number,
+                f"{seen} of the first frame: {len(ids):,} atoms, and {len(known):,} there",
+                "Dump one group of atoms that stays the same",
+            )
+        return order
 
     @contextmanager
     def _opened(self) -> Iterator[Callable[[int], Any]]:

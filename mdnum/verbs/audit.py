@@ -452,12 +452,18 @@ class AuditView(View):
 
 def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
+    from mdnum.audit.base import concluded
+
     state = view.state
-    given, titles = units.get(state.units), {}
+    given, titles, more = units.get(state.units), {}, concluded(state.shown)
+    observed = []
     for result in state.shown:
-        titles |= {id(one): result.title for one in result.findings}
+        # what a check has said by itself goes before what several say together
+        told = [replace(one, variants=[*one.variants, more.get(one.code, "")]) for one in result.findings]
+        titles |= {id(one): result.title for one in told}
+        observed += told
     found = []
-    groups = _by_cause([one for each in state.shown for one in each.findings])
+    groups = _by_cause(observed)
     for head, below in groups:
         found.append(_finding(head, titles[id(head)], ""))
         found += [_finding(one, titles[id(one)], head.code) for one in below]
@@ -506,6 +512,9 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         titles[2:] = [TEXTS("more_findings", n=len(titles) - 2)]
     if titles:
         head = TEXTS("found", head=head, titles="; ".join(titles))
+        if "with care" in said.values():
+            remedy = next((one.remedy for one in severe if one.severity == "warning" and one.remedy), "")
+            head = TEXTS("what_to_do", head=head, remedy=remedy).rstrip()
     elif state.shown:
         head = TEXTS("found_nothing", head=head, checks=len(state.shown))
     else:

@@ -6,7 +6,7 @@ import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -55,6 +55,7 @@ def flips(
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
     format: str | None = None,
+    drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
@@ -73,6 +74,8 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
+        drop_repeats: leave out every frame that is an earlier one again, bit for bit; the others keep their
+            numbers. Such frames are reported either way.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
@@ -92,8 +95,10 @@ def flips(
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
+        a.drop_repeats = b.drop_repeats = drop_repeats
         return compare(a, b, asked or _default_rules(a), between, **keep)
     opened = open_trajectory(trajectory, topology, format=format)
+    opened.drop_repeats = drop_repeats
     asked = asked or _default_rules(opened)
     groups = selected(opened, between)
     sample = opened.sample()
@@ -126,6 +131,9 @@ def flips(
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
+            "alternative_box": _with_other_box(opened, sample[0], found, groups),
+            "repeats": opened.repeats.plain(),
+            "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
@@ -222,6 +230,19 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 
 
 # ---- the ledger, and what is counted from it
+
+
+def _with_other_box(trajectory: Trajectory, frame: Any, found: Pass, groups: Groups) -> dict[str, Any] | None:
+    """The pairs of each rule in a frame with another box that it may be taken to have; None without one."""
+    from mdnum.trajectories.tracker import Tracker
+
+    if (other := trajectory.other_box(frame.index)) is None:
+        return None
+    trackers = [Tracker(one.rule, *groups, list(map(str, trajectory.species))) for one in found.rules]
+    for one in trackers:
+        one.step(replace(frame, box=other[1]))
+    pairs = [one.pairs for one in trackers]
+    return {"code": other[0], "frame": frame.index, "box": other[1].plain(), "pairs": pairs}
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:

@@ -89,6 +89,7 @@ def compare(
                 "resolution": resolutions[0],
                 "other_resolution": resolutions[1],
                 **{name: value for name, value in vars(found).items() if name != "stopped"},
+                "repeats": [one.repeats.plain() for one in (a, b)],
                 # steps, units and numbers of frames are not compared with one another
                 "times_differ": found.times_differ if a.time == b.time else 0,
                 **ending(found.stopped, interrupted),
@@ -281,6 +282,8 @@ def _findings(view: ComparisonView) -> Iterator[Finding]:
         yield TEXTS.finding("STOPPED", frames=frames, error=summary["stopped"])
     if summary["interrupted"]:
         yield TEXTS.finding("INTERRUPTED", frames=frames)
+    for name, repeats in zip((view.name, summary["other"]), summary.get("repeats", ()), strict=False):
+        yield from view.repeated(repeats, name)
     unsure = [one for one in summary["rules"] if one["first"] and one["certain"] != one["first"]["frame"]]
     if unsure:
         made = []

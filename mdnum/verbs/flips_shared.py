@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.report.finding import Texts
+from mdnum.report.finding import Finding, Texts
 from mdnum.report.words import listed, number, plain
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Progress, View, asked_to_stop
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 # rows that wait to be handed over together: a call costs more than many rows
 _ROWS_HELD = 100_000
+# stretches of repeated frames that are named
+_RANGES = 6
+# share of the frames without motion that does not matter much
+_SHARE = 0.02
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
@@ -171,6 +175,23 @@ class FlipsView(View):
         if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
             text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
         return f"{text}, repeating along {listed(axes)}"
+
+    def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
+        """The finding on frames that repeat earlier ones, if any do; of one of two files by its name."""
+        if not repeats or not repeats["frames"]:
+            return
+        ranges, examined = repeats["ranges"], self.summary["frames"]
+        still, told = all(one["still"] for one in ranges), []
+        for one in ranges[:_RANGES]:
+            kind = "one" if one["first"] == one["last"] else "still" if one["still"] else "copy"
+            told.append(TEXTS(f"repeats_{kind}", **one))
+        if (more := repeats["stretches"] - len(told)) > 0:
+            told.append(TEXTS("repeats_more", stretches=more))
+        few = repeats["frames"] < _SHARE * examined or (repeats["to_the_end"] and len(ranges) == 1)
+        kept = "dropped" if repeats["dropped"] else "unmoved" if still else "kept"
+        variants = ["still"] * still + ["few"] * (still and few) + [kept]
+        values = {"frames": repeats["frames"], "file": f"{file}: " if file else ""}
+        yield TEXTS.finding("REPEATED_FRAMES", *variants, ranges=listed(told), **values)
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
         """(label, values) of an axis along the trajectory."""

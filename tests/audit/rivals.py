@@ -241,15 +241,6 @@ class LastLost(Potential):
         return (i != last) & (j != last)
 
 
-class EighthHeavier(Potential):
-    """Every fourth atom is counted twice in what it feels of others."""
-
-    def extra(self, atoms, energy, forces):
-        energy, forces = super().extra(atoms, energy, forces)
-        there = atoms[::4]
-        return energy + 1e-3 * float(np.sum(forces[::4, 0] ** 2)) * (len(there) > 1), forces
-
-
 class LeftHanded(Potential):
     """Wraps by an inverse whose determinant has lost its sign."""
 
@@ -296,11 +287,11 @@ class Scaled(Potential):
 
 
 class TermMissing(Potential):
-    """A wall in the energy alone, or rather a harmonic bond between neighbors in the list that forces lack."""
+    """A repulsion that the energy alone has."""
 
     def extra(self, atoms, energy, forces):
         energy, forces = super().extra(atoms, energy, forces)
-        i, _, v = self.neighbors(atoms)
+        _, _, v = self.neighbors(atoms)
         r = np.linalg.norm(v, axis=1)
         return energy + 0.01 * float(np.sum((1 - (r / self.cut) ** 2) ** 5)), forces
 
@@ -310,7 +301,7 @@ class Predicted(Potential):
 
     def extra(self, atoms, energy, forces):
         energy, forces = super().extra(atoms, energy, forces)
-        i, j, v = self.neighbors(atoms)
+        i, _, v = self.neighbors(atoms)
         w = (1 - (np.linalg.norm(v, axis=1) / self.cut) ** 2) ** 4
         size = np.bincount(i, w, len(atoms))
         return energy, forces + 0.05 * (size * forces.T).T
@@ -440,6 +431,7 @@ def subject(make: Any, atoms: Atoms | None = None) -> CalculatorSubject:
     return CalculatorSubject("planted", make, liquid() if atoms is None else atoms, kT=KT)
 
 
+BY_ORDER = ("NEIGHBOR_CAP_BY_ORDER",)
 #: What is planted, in which structure, and the codes under which it is listed: all of them and no other.
 RIGHT = {
     **{f"{one.__name__} in a crystal": (one, liquid(), ()) for one in POTENTIALS},
@@ -447,12 +439,11 @@ RIGHT = {
     "Potential as a slab": (Potential, slab(), ()),
     "Morse of two elements": (Morse, liquid(1, 4), ()),
 }
-LOW = ("LOW_PRECISION",)
 WRONG = {
-    "cap by order of 9": (planted(ByOrder), liquid(), ("NEIGHBOR_CAP_BY_ORDER",)),
-    "cap by order of 20": (planted(ByOrder, most=20, on=Switched), liquid(), ("NEIGHBOR_CAP_BY_ORDER",)),
-    "cap by order of 12, embedded": (planted(ByOrder, most=12, on=Embedded), liquid(), ("NEIGHBOR_CAP_BY_ORDER",)),
-    "cap by order of 60, not reached": (planted(ByOrder, most=60, on=Morse), liquid(), ("NEIGHBOR_CAP_BY_ORDER",)),
+    "cap by order of 9": (planted(ByOrder), liquid(), BY_ORDER),
+    "cap by order of 20": (planted(ByOrder, most=20, on=Switched), liquid(), BY_ORDER),
+    "cap by order of 12, embedded": (planted(ByOrder, most=12, on=Embedded), liquid(), BY_ORDER),
+    "cap by order of 60, not reached": (planted(ByOrder, most=60, on=Morse), liquid(), BY_ORDER),
     "cap of the nearest 9": (planted(Nearest), liquid(), ("NEIGHBOR_CAP",)),
     "cap of the nearest 32": (planted(Nearest, most=32, on=Switched), liquid(), ("NEIGHBOR_CAP",)),
     "cap of the nearest 12, embedded": (planted(Nearest, most=12, on=Embedded), liquid(), ("NEIGHBOR_CAP",)),
@@ -467,7 +458,7 @@ WRONG = {
     "every eighth force": (planted(EighthForce), liquid().repeat((1, 2, 1)), ("PLACE_IN_LIST",)),
     "every fourth force 10 % too large": (planted(FourthForce, on=Morse), liquid(), ("PLACE_IN_LIST",)),
     "last atom lost": (planted(LastLost), liquid(), ("PLACE_IN_LIST",)),
-    "left-handed wrap": (planted(LeftHanded, NoWrap), liquid(), None),
+    "left-handed wrap": (planted(LeftHanded, on=Switched), liquid(), ("LEFT_HANDED",)),
     "left-handed cells": (planted(LeftVolume, on=Switched), liquid(), ("LEFT_HANDED",)),
     "left-handed images": (planted(LeftHanded, on=Embedded), liquid(), ("LEFT_HANDED",)),
     "mirror images": (planted(Chiral), liquid(), ("MIRROR", "FORCES_NOT_GRADIENT")),
@@ -482,17 +473,19 @@ WRONG = {
     "hard cutoff": (planted(Cut), liquid(), ("ENERGY_JUMP",)),
     "kinked cutoff": (planted(Kink, on=Embedded), liquid(), ("FORCE_JUMP",)),
     "no wrap": (planted(NoWrap, on=Switched), liquid(), ("IMAGES",)),
-    "forces of ghosts": (planted(GhostForces), liquid(), None),
+    "forces of ghosts": (planted(GhostForces), liquid(), ("IMAGES",)),
     "pairs at random": (planted(Random), liquid(), ("NOT_REPEATABLE",)),
     "forces at random": (planted(RandomForce, on=Switched), liquid(), ("NOT_REPEATABLE",)),
     "parameters by appearance": (planted(Appearance), liquid(1, 4), ("ORDER",)),
     # two at once: both by name, and what follows from them below
-    "cap by order and scaled forces": (planted(ByOrder, Scaled), liquid(), ("NEIGHBOR_CAP_BY_ORDER",)),
+    "cap by order and scaled forces": (planted(ByOrder, Scaled), liquid(), BY_ORDER),
     "last force and a hard cutoff": (planted(WrongForce, Cut), liquid(), ("ENERGY_JUMP", "PLACE_IN_LIST")),
     "no wrap and a hard cutoff": (planted(NoWrap, Cut), liquid(), ("ENERGY_JUMP", "IMAGES")),
     "left-handed and a kink": (planted(LeftVolume, Kink), liquid(), ("FORCE_JUMP", "LEFT_HANDED")),
     "last force at random pairs": (planted(WrongForce, Random), liquid(), ("NOT_REPEATABLE",)),
     "single sum and last force": (planted(SingleSum, WrongForce), liquid(), ("PLACE_IN_LIST",)),
     "single sum and a cap": (planted(SingleSum, Nearest), liquid(), ("NEIGHBOR_CAP",)),
-    "left-handed and mirror": (planted(LeftVolume, Chiral), liquid(), ("FORCES_NOT_GRADIENT", "LEFT_HANDED", "MIRROR")),
+    "left-handed and mirror": (
+        planted(LeftVolume, Chiral), liquid(), ("FORCES_NOT_GRADIENT", "LEFT_HANDED", "MIRROR")
+    ),
 }  # fmt: skip

@@ -216,3 +216,47 @@ def test_curl_of_a_known_field():
     assert found.curl == pytest.approx(matrix[1, 0] - matrix[0, 1], rel=1e-12)
     assert found.work == pytest.approx(np.pi * 0.02**2 * found.curl, rel=1e-12)
     assert found.error < 1e-11 and not found.conservative
+
+
+# -- what noise explains ----------------------------------------------------------------------------
+
+
+class Scattering(CalculatorSubject):
+    """A smooth energy and force with noise of one size on either."""
+
+    def __init__(self, seed: int, size: float):
+        super().__init__("scatters", Good, crystal())
+        self.rng, self.size = np.random.default_rng(seed), size
+
+    def energy(self, atoms: Atoms) -> float:
+        return float(np.cos(atoms.positions).sum()) + self.size * self.rng.standard_normal()
+
+    def forces(self, atoms: Atoms) -> np.ndarray:
+        return np.sin(atoms.positions) + self.size * self.rng.standard_normal((len(atoms), 3))
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-5])
+def test_equal_answers_that_scatter_are_hardly_ever_taken_for_different(size: float):
+    """The floor is an estimate from few values, and far too small now and then: 60,000 comparisons."""
+    rng, atoms = np.random.default_rng(8), crystal()
+    above = lucky = 0
+    for seed in range(600):
+        floor = along_a_line(Scattering(seed, size), atoms, rng)
+        changes = np.abs(size * np.sqrt(2) * rng.standard_normal(100))
+        above += int((changes > floor.allowed.energy).sum())
+        lucky += floor.energy < 0.2 * size
+        # and it is no more than a margin: what is a hundred times the noise is seen
+        assert floor.allowed.energy < 100 * size
+    assert above == 0 and lucky <= 2
+
+
+def test_a_floor_from_few_values_allows_for_more():
+    known, few = (NoiseFloor(1e-9, 1e-9, freedom=freedom) for freedom in (np.inf, 1.8))
+    assert known.allowed.energy == pytest.approx(40e-9)
+    assert few.allowed.energy > 1e3 * few.energy and known.louder(few).freedom == 1.8
+    # Student's distribution: how often a difference of two answers is above what they allow
+    rng = np.random.default_rng(1)
+    draws = rng.standard_normal((200_000, 4))
+    estimates = np.sqrt(np.mean(draws[:, 1:] ** 2, axis=1))
+    allowed = NoiseFloor(1.0, 1.0, freedom=3).allowed.energy * estimates
+    assert np.mean(np.sqrt(2) * np.abs(draws[:, 0]) > allowed) < 3e-5

@@ -16,6 +16,7 @@ from MDAnalysis.lib.mdamath import triclinic_vectors
 from MDAnalysisTests import datafiles
 from trajectories.files import water
 
+import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.trajectory import open_trajectory
@@ -98,12 +99,15 @@ def test_boxes_of_dl_poly_are_turned_as_its_atoms_are():
     np.testing.assert_array_equal(last.box.matrix, cells[2])
 
 
-def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pairs_that_tell():
+def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pairs_that_tell(tmp_path):
     opened = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC)
     # the reader was left where it was: "around 5 protein" means the first frame
     assert opened.universe.trajectory.frame == 0
-    notes = opened.notes
-    (said,) = [note for note in notes if "box" in note]
+    found = mdnum.flips(
+        f"{datafiles.DCD_TRICLINIC}@9:", topology=datafiles.PSF_TRICLINIC, cutoffs=[1.4, 1.2],
+        out=tmp_path / "a", report=False,
+    ).summary  # fmt: skip
+    (said,) = [one for one in found["findings"] if one["code"] == "BOX_NOT_MDANALYSIS"]
     universe = MDAnalysis.Universe(datafiles.PSF_TRICLINIC, datafiles.DCD_TRICLINIC)
     universe.trajectory[-1]
     x, counts = universe.atoms.positions.astype(float), []
@@ -115,11 +119,14 @@ def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pair
         for n in range(len(x)):
             apart = np.linalg.norm(wrapped[n] - wrapped[n + 1 :, None] + shifts @ matrix, axis=2)
             close += int((apart < 1.4).sum())
-        counts.append(f"{close:,}")
+        counts.append(close)
     assert counts[0] != counts[1]
-    assert f"puts {counts[0]} pairs" in said and f"the file's {counts[1]}." in said
+    assert [found["alternative_box"]["pairs"][0], found["rules"][0]["pairs_first"]] == counts
+    assert f"r < 1.4 Å: {counts[1]:,} pairs with the first, {counts[0]:,} with the other" in said["text"]
     # where both are one, there is nothing to say
-    assert not any("box" in note for note in water().notes)
+    assert water().other_box(0) is None
+    namd = open_trajectory(datafiles.DCD_NAMD_TRICLINIC, datafiles.PSF_NAMD_TRICLINIC).other_box(0)
+    assert namd is None or namd[0] == "BOX_UNDECIDED"
 
 
 def box(side):
@@ -174,3 +181,156 @@ def test_the_analysis_sees_it_too_and_keeps_what_somebody_set(tmp_path, parts):
     dimensions = np.array([30.0, 30.0, 30.0, 90.0, 90.0, 90.0])
     universe.trajectory.add_transformations(MDAnalysis.transformations.set_dimensions(dimensions))
     assert NeighborFlips(universe, 2.0).run(n_parts=parts).results.pairs.tolist() == [0, 0, 0, 0]
+
+
+# ---- what the six numbers of a DCD file mean
+
+
+def dcd(path: Path, cells, positions, version: int = 24) -> Path:
+    """A DCD file with these six numbers as they stand, written by this version of CHARMM."""
+    with DCDFile(str(path), "w") as file:
+        file.write_header(remarks="", natoms=len(positions[0]), istart=0, nsavc=1, delta=1.0, is_periodic=1)
+        for cell, x in zip(cells, positions, strict=True):
+            file.write(xyz=np.asarray(x, np.float32), box=np.array(cell, np.float64))
+    data = bytearray(path.read_bytes())
+    data[84:88] = version.to_bytes(4, "little")
+    path.write_bytes(bytes(data))
+    return path
+
+
+def numbers(matrix, convention: str) -> list[float]:
+    """The six numbers for a box: of a symmetric matrix, or its lengths and angles."""
+    sizes = np.linalg.norm(matrix, axis=1)
+    a, b, c = matrix / sizes[:, None]
+    angles = np.array([a @ b, a @ c, b @ c])
+    if convention == "matrix":
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrix
+        return [xx, xy, yy, xz, yz, zz]
+    angles = np.degrees(np.arccos(angles)) if convention == "degrees" else angles
+    return [sizes[0], angles[0], sizes[1], angles[1], angles[2], sizes[2]]
+
+
+def lattice(convention: str, large: float, tilt: float = 0.55) -> np.ndarray:
+    """A box that is written by this convention and could be one by another."""
+    if convention == "matrix":
+        return (
+            np.array([[0.0, -tilt, 0.28], [-tilt, 0.0, -0.27], [0.28, -0.27, 0.0]])
+            + np.diag([1.0, 1.1, 1.3]) * large
+        )
+    if convention == "degrees":
+        # as a matrix its elements would be large, but no box is as large
+        return triclinic_vectors(np.array([large, large, 1.2 * large, 75, 80, 70]), dtype=np.float64)
+    return triclinic_vectors(np.array([large, 1.1 * large, 1.3 * large, 95, 105, 78]), dtype=np.float64)
+
+
+def packed(matrix, apart: float, atoms: int, seed: int = 0) -> np.ndarray:
+    """Atoms anywhere in a box, no two of them closer than that, through its boundary too."""
+    rng, found = np.random.default_rng(seed), np.empty((0, 3))
+    shifts = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3) @ matrix
+    while len(found) < atoms:
+        one = rng.uniform(0, 1, 3) @ matrix
+        if not len(found) or np.linalg.norm(found[:, None] - one + shifts, axis=2).min() > apart:
+            found = np.vstack([found, one])
+    return found
+
+
+def boxes_agree(opened) -> bool:
+    """Whether it is known which box a file means."""
+    other = opened.other_box(0)
+    return other is None or other[0] != "BOX_UNDECIDED"
+
+
+def read(path, **options):
+    """(trajectory, its frames)."""
+    opened = open_trajectory(path, **options)
+    return opened, list(opened.frames())
+
+
+@pytest.mark.parametrize("large", [9.0, 13.0])
+@pytest.mark.parametrize("convention", ["matrix", "cosines"])
+def test_atoms_tell_which_box_a_dcd_file_means(tmp_path, convention, large):
+    matrix = lattice(convention, large)
+    # as dense as can be with little time
+    x = packed(matrix, 2.4, int(0.055 * large**3))
+    path = dcd(tmp_path / "a.dcd", [numbers(matrix, convention)] * 3, [x, x + 0.01, x + 0.02])
+    opened, frames = read(path)
+    np.testing.assert_allclose(frames[0].box.matrix, matrix, atol=1e-4)
+    assert boxes_agree(opened) and any("neither overlap" in note for note in opened.notes)
+    # whatever the head says
+    lying = dcd(
+        tmp_path / "b.dcd", [numbers(matrix, convention)], [x], version=46 if convention == "cosines" else 24
+    )
+    np.testing.assert_allclose(read(lying)[1][0].box.matrix, matrix, atol=1e-4)
+    # and as the analysis sees it
+    universe = MDAnalysis.Universe.empty(len(x), trajectory=True)
+    universe.load_new(str(path))
+    expected = len(all_inside(x, matrix, 3.0))
+    assert NeighborFlips(universe, 3.0).run().results.pairs[0] == expected
+
+
+def all_inside(x, matrix, radius: float) -> list[tuple[int, int]]:
+    """All pairs inside, images counted one by one."""
+    shifts = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3) @ matrix
+    x = np.asarray(x, np.float32).astype(float)
+    apart = np.linalg.norm(x[:, None, None] - x[None, :, None] + shifts, axis=3)
+    i, j, _ = np.nonzero(apart < radius)
+    own = [(a, b) for a, b in zip(i, j, strict=True) if a <= b]
+    # an atom is inside of its own radius, and meets each image of itself from both sides
+    return [pair for pair in own if pair[0] < pair[1]] + [(a, a) for a, b in own if a == b][len(x) :: 2]
+
+
+@pytest.mark.parametrize("convention", ["matrix", "cosines"])
+def test_atoms_that_are_wrapped_tell_it_where_few_are_near_the_boundary(tmp_path, convention):
+    matrix = lattice(convention, 20.0)
+    rng, thin = np.random.default_rng(3), packed(matrix, 4.0, 20)
+    moving = [thin + k * np.array([0.9, 0.8, 1.1]) + rng.normal(0, 0.1, thin.shape) for k in range(8)]
+    positions = [one - np.floor(one @ np.linalg.inv(matrix)) @ matrix for one in moving]
+    opened, frames = read(dcd(tmp_path / "a.dcd", [numbers(matrix, convention)] * 8, positions))
+    np.testing.assert_allclose(frames[3].box.matrix, matrix, atol=1e-4)
+    assert boxes_agree(opened)
+
+
+@pytest.mark.parametrize("convention", ["matrix", "cosines"])
+def test_a_barostat_that_keeps_the_shape_tells_it(tmp_path, convention):
+    matrix, x = lattice(convention, 20.0), np.array([[9.0, 9, 9], [10.0, 9, 9], [9.0, 10, 9]])
+    cells = [numbers(matrix * (1 + 0.002 * k), convention) for k in range(5)]
+    opened, frames = read(dcd(tmp_path / "a.dcd", cells, [x] * 5))
+    np.testing.assert_allclose(frames[4].box.matrix, matrix * 1.008, atol=1e-3)
+    assert boxes_agree(opened)
+
+
+def test_small_positive_elements_of_a_matrix_are_no_degrees(tmp_path):
+    matrix = np.array([[30.0, 9.0, 6.0], [9.0, 31.0, 5.0], [6.0, 5.0, 33.0]])
+    x = packed(matrix, 4.0, 200)
+    _, frames = read(dcd(tmp_path / "a.dcd", [numbers(matrix, "matrix")], [x]))
+    np.testing.assert_allclose(frames[0].box.matrix, matrix, atol=1e-4)
+    # and degrees are
+    matrix = lattice("degrees", 200.0)
+    _, frames = read(dcd(tmp_path / "b.dcd", [numbers(matrix, "degrees")], [packed(matrix, 25.0, 200)]))
+    np.testing.assert_allclose(frames[0].box.matrix, matrix, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("version", [24, 46, 21])
+def test_where_nothing_tells_the_head_decides_or_both_counts_are_given(tmp_path, version):
+    """A few atoms of a molecular crystal, none of them through the boundary with either box."""
+    matrix = np.array([[4.11, -0.58, 0.28], [-0.58, 4.71, -0.27], [0.28, -0.27, 10.99]])
+    x = np.array([[1.4, 0.4, 5.0], [2.1, 1.4, 4.0], [0.4, 1.6, 4.2]])
+    path = dcd(tmp_path / "a.dcd", [numbers(matrix, "matrix")] * 2, [x, x], version)
+    found = mdnum.flips(path, cutoffs=[3.7], out=tmp_path / "f", report=False).summary
+    counts = [found["rules"][0]["pairs_first"], (found["alternative_box"] or {}).get("pairs")]
+    cosines = triclinic_vectors(
+        np.array([4.11, 4.71, 10.99, *np.degrees(np.arccos([-0.27, 0.28, -0.58]))]), dtype=np.float64
+    )
+    expected = {"matrix": len(all_inside(x, matrix, 3.7)), "cosines": len(all_inside(x, cosines, 3.7))}
+    assert expected["matrix"] != expected["cosines"]
+    undecided = [one for one in found["findings"] if one["code"] == "BOX_UNDECIDED"]
+    if version == 24:
+        assert counts == [expected["cosines"], [expected["matrix"]]]
+        (said,) = undecided
+        assert said["severity"] == "warning"
+        assert (
+            f"{expected['cosines']} pairs with the first, {expected['matrix']} with the other" in said["text"]
+        )
+    else:
+        assert counts[0] == expected["matrix" if version == 46 else "cosines"] and not undecided
+        assert any(f"version {version}" in note for note in found["notes"])

@@ -88,6 +88,10 @@ class CurlCheck(AuditCheck):
             "largest_curl": max(abs(one.curl) for one in loops),
             "largest_share": max((one.share for one in wrong), default=0.0),
             "largest_error": max(one.error for one in loops),
+            # antisymmetric over symmetric part that may be there and is not seen, at the median loop
+            "unseen_share": float(
+                np.median([(abs(one.curl) + one.error) / max(one.stiffness, 1e-300) for one in loops])
+            ),
         }  # fmt: skip
         values = {"loops": len(loops), "wrong": len(wrong)}
         values |= {"limit": abs(limit.curl) + limit.error, "stiffness": limit.stiffness}

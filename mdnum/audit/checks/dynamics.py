@@ -60,7 +60,7 @@ class DynamicsCheck(AuditCheck):
     quarter with half the time step, which a second run tests.
     """
 
-    name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 2000
+    name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:

@@ -92,7 +92,7 @@ class InvarianceCheck(AuditCheck):
     is left out. `structures` holds both ways of writing down wherever their answers differ.
     """
 
-    name, title, order, calls = "invariance", "Invariance", 40, 500
+    name, title, order, calls = "invariance", "Invariance", 40, 450
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:

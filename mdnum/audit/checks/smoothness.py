@@ -37,7 +37,7 @@ _FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
-    name, title, order, calls = "smoothness", "Smoothness", 50, 6650
+    name, title, order, calls = "smoothness", "Smoothness", 50, 2500
     needed_to = ("differentiate",)
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2
@@ -185,7 +185,10 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
     """A finding where more jumps at a pair threshold among the others than for two atoms alone."""
     if not around.lower:
         return
-    worst = min(around.lower, key=lambda one: (one.jump.order, -one.force))
+    worst = min(
+        around.lower,
+        key=lambda one: (one.jump.order, -abs(one.jump.energy) * (not one.jump.order), -one.force),
+    )
     threshold = worst.threshold
     assert threshold is not None
     energy = abs(worst.jump.energy) if worst.jump.order == 0 else 0.0
