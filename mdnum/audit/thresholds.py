@@ -151,7 +151,7 @@ def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Walk every pair of species through its distances, within calls of its own; remembered for the subject."""
+    """Walk every pair of species through its distances, by calls of their own; remembered for the subject."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)

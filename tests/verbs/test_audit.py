@@ -320,7 +320,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
 
 def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch):
     class Spent:
-        looks = 450
+        looks = 600
 
         def __init__(self, minutes=None):
             self.limited = minutes is not None
