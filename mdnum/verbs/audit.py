@@ -64,7 +64,8 @@ def audit(
     """Ask a calculator whether it is safe to run and to differentiate.
 
     How much is asked is counted in calls of the calculator and does not depend on how fast it answers: some
-    6,000 calls for one element, and 12,000 at most. What leads to a verdict is asked first. Whatever ends an audit, the checks that were done are in its folder.
+    6,000 calls for one element, and 12,000 at most. What leads to a verdict is asked first. Whatever ends an
+    audit, the checks that were done are in its folder.
 
     Args:
         calculator: as the command line names one, or a function that makes a new ASE calculator; may be left

@@ -23,6 +23,7 @@ from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, direction, displace
 from mdnum.audit.structures import group
 from mdnum.audit.subject import CalculatorSubject, largest, rms
 from mdnum.audit.thresholds import PairThreshold, find_thresholds
+from mdnum.units import Units
 
 #: Of a run where nobody says how many. A step takes some six calls: two in the run of half the time step,
 #: warming up, work on the way.
@@ -102,9 +103,7 @@ class DynamicsCheck(AuditCheck):
             )
         if self.brief:
             noise = settled(subject.fresh(), np.random.default_rng(self.seed), FEW, brief=True)[1]
-            return _brief(
-                whole, _aged(subject, whole, _FEW_COMPARED, noise), step / subject.units.time_factor
-            )
+            return _brief(whole, _aged(subject, whole, _FEW_COMPARED, noise), subject.units)
         half, _ = run(subject.fresh(), start, step / 2, 2 * count, each(count + count // 4))
         probe = subject.fresh()
         noise = along_a_line(probe, whole.at(start.positions), rng)
@@ -125,12 +124,13 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
     return largest(np.array(again) - ran.potential[places]), noise.louder(rounding).allowed.energy
 
 
-def _brief(ran: NveRun, stale: tuple[float, float], timestep: float) -> CheckResult:
+def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
     """What a few steps tell: that they were answered, and by what does not depend on the steps before."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     old = [finding("STALE_DYNAMICS", "error", differs=differs, allowed=allowed)] if differs > allowed else []
-    values = {"steps": steps, "change": change, "timestep": timestep, "stale": differs}
+    values: dict[str, Any] = {"steps": steps, "change": change, "stale": differs}
+    values |= {"timestep": ran.timestep / units.time_factor, "time_unit": units.time}
     return CheckResult(says=(["dynamics_brief"], values), findings=old, numbers=values, possible=2)
 
 
