@@ -182,36 +182,23 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
     return np.median(found, axis=0)
 
 
-@dataclass(frozen=True)
-class OrderChange:
-    """What other orders of the atoms of one structure change."""
-
-    energy: float = 0.0  # the largest change, eV
-    force: float = 0.0  # of a force component, eV/Å
-    # what rounding makes of it: standard deviations; 0 where the change is no rounding
-    floor: NoiseFloor = NoiseFloor(0.0, 0.0)
-
-    @property
-    def rounding(self) -> bool:
-        """Whether rounding of sums in another order explains the change."""
-        return self.floor.energy > 0 or self.floor.force > 0
-
-
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
-) -> OrderChange:
-    """Compare a few orders; where they differ, tell rounding from what is smooth along a line.
+) -> tuple[float, NoiseFloor]:
+    """The largest change of the energy in other orders of the atoms, eV, and what rounding makes of it.
+
+    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise.
 
     The rounding of a sum is drawn anew wherever its terms are others, while terms that are missing in another
-    order change smoothly with the positions.
+    order change smoothly along a line.
 
     Args:
         atoms: a structure away from thresholds.
         noise: along a line there, in one order.
     """
-    count = len(atoms)
+    count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
-        return OrderChange()
+        return 0.0, none
     orders = [np.arange(count)[::-1], *(rng.permutation(count) for _ in range(_ORDERS - 1))]
     there = subject.fresh()
     base = there.both(atoms)
@@ -219,15 +206,13 @@ def order_change(
         with subject.trying():
             answers = [in_order(there, atoms, order) for order in orders]
     except CalculatorError:
-        return OrderChange()  # reported elsewhere
-    changes = np.array([differences(base, answer) for answer in answers])
-    energy, force = changes.max(axis=0)
-    quiet = energy <= _NOISY * np.spacing(abs(base[0]))
-    if quiet and energy <= noise.allowed.energy and force <= noise.allowed.force:
-        return OrderChange(energy, force)
-    size = largest(base[1]) * count * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
-    if energy > _SUMMED * size or force > _SUMMED * count * largest(base[1]):
-        return OrderChange(energy, force)
+        return 0.0, none  # reported elsewhere
+    energy, force = np.max([differences(base, answer) for answer in answers], axis=0)
+    allowed, total = noise.allowed, count * largest(base[1])
+    quiet = energy <= min(allowed.energy, _NOISY * np.spacing(abs(base[0]))) and force <= allowed.force
+    size = total * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
+    if quiet or energy > _SUMMED * size or force > _SUMMED * total:
+        return energy, none
     line = _ORDER_SPACING * direction(count, rng)
     rows = []
     for at in range(_ORDER_POINTS):
@@ -238,13 +223,10 @@ def order_change(
     drawn, sizes = scatter(values), np.sqrt(np.mean(values**2, axis=0))
     worst = 1 + int(np.argmax(sizes[1:]))
     # whatever is above the noise has to be drawn anew
-    smooth = (energy > noise.allowed.energy and drawn[0] < _AT_RANDOM * sizes[0]) or (
-        force > noise.allowed.force and drawn[worst] < _AT_RANDOM * sizes[worst]
-    )
-    if smooth:
-        return OrderChange(energy, force)
-    floor = NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
-    return OrderChange(energy, force, floor)
+    smooth = drawn < _AT_RANDOM * sizes
+    if (energy > allowed.energy and smooth[0]) or (force > allowed.force and smooth[worst]):
+        return energy, none
+    return energy, NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
 
 
 def in_order(
@@ -336,7 +318,7 @@ def settled(
         noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
         # another order of the same sum is rounded otherwise, which no line shows
         subject.known["order"] = order_change(subject, there, noise, rng)
-        noise = noise.louder(subject.known["order"].floor)
+        noise = noise.louder(subject.known["order"][1])
     subject.known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 
@@ -424,8 +406,8 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
     whose = next((word for word, name in narrow.items() if name), None)
     loud, smooth = share > _NOISY * eps, not narrow["energies"] and ulps <= _NOISY
-    order = subject.known.get("order", OrderChange())
-    summed = order.floor.energy > 0
+    change, floor = subject.known.get("order", (0.0, NoiseFloor(0.0, 0.0)))
+    summed = floor.energy > 0
     if whose is None and not loud and not (ulps > _NOISY and summed):
         return
     severity = "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info"
@@ -437,7 +419,7 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
         ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
         "format" if whose else "forces" if smooth and not summed else None,
         tests=("rounding",),
-        change=order.energy,
+        change=change,
         whose=whose,
         format=narrow[whose] if whose else None,
         energy=noise.energy,

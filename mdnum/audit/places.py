@@ -28,22 +28,16 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """ "first", "last", "every" so many, or "some"."""
-        if self.places in ((0,), (self.count - 1,)):
-            return "first" if self.places == (0,) else "last"
-        steps = set(np.diff(self.places).tolist())
-        return "every" if len(steps) == 1 else "some"
-
-    @property
-    def variants(self) -> tuple[str, str]:
-        """Of the sentences of a finding."""
-        return f"forces_{self.pattern}" if not self.energy else self.pattern, self.pattern
+        """One of "first", "last", "every" (so many) and "some"."""
+        if len(self.places) == 1:
+            return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
+        return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
         """Of a finding."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
-        every = self.places[1] - self.places[0] if self.pattern == "every" else 0
+        every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 

@@ -198,7 +198,7 @@ def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -
     there.positions += 1.0 - there.positions.min(axis=0)
     there.set_cell([_BOX] * 3)
     noise = along_a_line(subject, there, rng)
-    return there, noise.louder(order_change(subject, there, noise, rng).floor)
+    return there, noise.louder(order_change(subject, there, noise, rng)[1])
 
 
 def _worst(slopes: list[Slope]) -> Slope:

@@ -25,7 +25,8 @@ _SMALL = 1e-3
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
 #: rectangular cells alone, or molecules by the order of their atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
-
+#: Findings of what differs, beside the codes of the ways.
+_REPORTS = ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES")
 
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
@@ -137,13 +138,7 @@ class InvarianceCheck(AuditCheck):
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},
             numbers=numbers,
-            # of molecules by the order of atoms, what differs is another finding
-            limits={
-                "told_apart": (
-                    0,
-                    ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES", *(one.code for one in same)),
-                )
-            },
+            limits={"told_apart": (0, (*_REPORTS, *(one.code for one in same)))},
             skipped=[*((one.what, error.message) for one, error in refused), *ways.skipped],
             asked=ways.asked,
             possible=ways.possible,
@@ -166,7 +161,8 @@ class InvarianceCheck(AuditCheck):
         more: dict[str, Any] = {}
         if "ORDER" in wrong and (places := wrong_places(judge.subject, judge.atoms, judge.noise.allowed)):
             wrong["PLACE_IN_LIST"] = wrong.pop("ORDER")
-            variants, more = places.variants, places.values
+            forces = () if places.energy else (f"forces_{places.pattern}",)
+            variants, more = (*forces, places.pattern), places.values
         yield from judge.notes
         for code, cases in wrong.items():
             worst = max(cases, key=lambda one: one.excess)
@@ -242,7 +238,7 @@ class _Judge:
                 for there, copies in ((base, 1), (same.atoms, same.copies)):
                     other = self.subject.fresh()
                     line = along_a_line(other, there, self._rng)
-                    line = line.louder(order_change(other, there, line, self._rng).floor).allowed
+                    line = line.louder(order_change(other, there, line, self._rng)[1]).allowed
                     noise = noise.louder(replace(line, energy=line.energy / copies))
                 found = replace(found, allowed=noise)
             # who stands alone may have answered so by chance, and is asked again
