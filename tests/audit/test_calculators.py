@@ -284,7 +284,7 @@ def test_evidence_is_the_same_on_a_machine_a_million_times_slower(name: str, mon
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("alone", "dynamics")])
 def test_a_deadline_leaves_ways_unasked_and_says_which(name: str):
-    asked = three({"forces": 100, "curl": 100, "state": 100, "caller": 42, "periodicity": 20}.get(name, 40))
+    asked = three({"forces": 100, "curl": 100, "state": 100, "caller": 62, "periodicity": 50}.get(name, 40))
     if name == "smoothness":
         asked.known["walks"] = walk_pairs(three())
     result = check(name)(asked)
