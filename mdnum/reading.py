@@ -7,9 +7,10 @@ lines, or none. `reading` turns each into one line with the file and the frame.
 from __future__ import annotations
 
 import io
+import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,8 @@ CHECK_STRUCTURE = "Check that `ase.io.read` opens it; extxyz is the safest forma
 _ENDS = "buffer is smaller than requested size"
 # what MDAnalysis puts around the message of one of its parsers
 _WRAPPED = ("Failed to construct topology", "Failed to load from the topology")
+# names of columns that are velocities or momenta
+_VELOCITY = re.compile(r"(v|vel\w*|v_?[xyz]|mom|momentum|momenta\w+)", re.IGNORECASE)
 # calls at the end of a file after which a reader is taken to count and not to read
 _PATIENCE = 10_000
 
@@ -167,3 +170,12 @@ def with_elements(atoms: Any) -> Atoms:
         most = len(chemical_symbols) - 1
         raise ValueError(f"atom {bad[0]} has the atomic number {numbers[bad[0]]}; expected 0 to {most}")
     return atoms
+
+
+def ignored_velocities(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    """Names of columns that look like velocities or momenta, which no reader takes for some.
+
+    Extended XYZ names momenta alone, in ASE's units: what others are in, a file does not say.
+    """
+    shapes = {name: array.shape[1:] for name, array in arrays.items() if _VELOCITY.fullmatch(name)}
+    return sorted(name for name, shape in shapes.items() if shape in ((3,), ()) and name != "momenta")

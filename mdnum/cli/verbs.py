@@ -432,8 +432,21 @@ def check_system(
 ) -> int:
     """Read a system file and its structure, and say whether it can be run."""
     loaded = _load(system, settings)
-    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path}
-    return output.print_document(document, f"{loaded.name}: fine, {_sized(document)}", as_json)
+    from mdnum.verbs.check import structure_findings
+
+    found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
+    document = {
+        "system": loaded.name,
+        "ok": True,
+        **_size(loaded),
+        "path": loaded.path,
+        "findings": found,
+    }
+    words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
+    output.print_document(document, words, as_json)
+    if not as_json:
+        output.print_findings(found)
+    return output.exit_code(found)
 
 
 @systems.command()

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from mdnum.errors import InputError
-from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
+from mdnum.reading import CHECK_STRUCTURE, ase_images, ignored_velocities, reading
 from mdnum.registry import nearest
 from mdnum.systems import schema
 
@@ -63,6 +63,13 @@ def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, 
         # momenta and not velocities: dividing by the mass once keeps what is written and read the same bits
         atoms.set_momenta(np.asarray(source.get_momenta(), dtype=np.float64))
     return atoms
+
+
+def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
+    """Columns of a structure's file that look like velocities and are not read as such."""
+    if isinstance(structure, schema.BuilderStructure):
+        return []
+    return ignored_velocities(_read(folder / structure.file, structure.index).arrays)
 
 
 def _read(path: Path, index: int) -> Atoms:

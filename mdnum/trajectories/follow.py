@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import AtomIndices, Box, Frame, FrameCheck, leap
+from mdnum.trajectories.frame import AtomIndices, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
@@ -22,6 +22,18 @@ from mdnum.trajectories.repeats import Repeats
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.search import image_distances
+from mdnum.trajectories.separation import (
+    Flight,
+    Separation,
+    explained,
+    flight_of,
+    growth,
+    odd_flight,
+    same_lattice,
+    separation,
+    velocities_differ,
+    velocities_of,
+)
 from mdnum.trajectories.tracker import Groups, Tracker, atoms_of
 from mdnum.trajectories.trajectory import Trajectory
 
@@ -36,6 +48,11 @@ _FIRST = 8
 _FLUX_FRAMES = 12
 # displacement for that, as a share of the usual distance of neighbors: small beside the way to a turn
 _FLUX_MOVE = 2e-3
+# frames whose displacements are compared with velocities
+_FLIGHTS = 12
+# share of the spread of displacements that a common shift explains: of one within the resolution of the
+# files, and of one beside another difference; atoms that are examined first for it
+_SHIFT_ALONE, _SHIFT_MOSTLY, _SOME = 0.5, 0.99, 200
 # times that differ by less than this, relative, are the same
 _SAME_TIME = 1e-6
 
@@ -137,9 +154,14 @@ class Pass:
     rules: list[Followed]
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
-    moved: float = float("nan")  # root mean square displacement over what velocities say; nan without
+    flights: list[Flight] = field(default_factory=list)  # from one to the next of the first frames
     # (number of the frame, atom, how far) of what no atom does between two frames
     leaps: list[tuple[int, int, float]] = field(default_factory=list)
+
+    @property
+    def odd(self) -> dict[str, Any] | None:
+        """How displacements contradict velocities and times; see `separation.odd_flight`."""
+        return odd_flight(self.flights)
 
 
 def follow(
@@ -169,7 +191,11 @@ def follow(
 
     for (frame,), stepped in _usable([trajectory], atoms, rules, step, found):
         if last is not None:
-            found.moved = _moved(last, frame) if found.frames == 1 else found.moved
+            if (
+                found.frames < _FLIGHTS
+                and (flight := flight_of(last, frame, resolution.usual_step(frame))) is not None
+            ):
+                found.flights.append(flight)
             if (far := leap(last, frame, atoms)) is not None:
                 found.leaps.append((frame.index, *far))
         last = frame
@@ -232,84 +258,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
         one.flux.append(found)
 
 
-def _moved(start: Frame, end: Frame) -> float:
-    """Root mean square displacement over what the velocities of the first frame say; nan without them.
-
-    Near 1 where frames are so close that atoms fly straight, below it where they turn around in between.
-    Above it the velocities do not belong to the positions, or are in another unit.
-    """
-    if start.velocities is None or not end.time > start.time:
-        return float("nan")
-    expected = float(np.sqrt(np.mean(start.velocities**2))) * (end.time - start.time)
-    moved = float(np.sqrt(np.mean(displacements(start, end) ** 2)))
-    return moved / expected if expected > 0 else float("nan")
-
-
 # ---- two trajectories
-
-
-@dataclass(frozen=True)
-class Separation:
-    """How far atoms are from where they are in another frame."""
-
-    furthest: float  # largest displacement, length
-    typical: float  # root mean square displacement, length
-    atom: int  # the one that is displaced furthest
-    # most lattice vectors of one kind between an atom and its nearest image: 0 where none was wrapped in one
-    # of the frames only
-    periods: int = 0
-
-
-def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
-    """From one frame to another, up to lattice vectors of the second's box.
-
-    The nearest image is found along reduced lattice vectors: for an atom that moved by less than half the
-    width of the box it is the nearest of all. Where the frames repeat along different axes, only those along
-    which both do have images.
-    """
-    return _displaced(start, end)[0]
-
-
-def _displaced(start: Frame, end: Frame) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """(displacements, whole lattice vectors taken off)."""
-    moved = end.positions - start.positions
-    shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
-    if not shared.periodic:
-        return moved, np.zeros_like(moved)
-    lattice = lattice_of(shared)
-    whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
-    return moved - whole @ lattice.vectors, whole
-
-
-def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
-    """Whether two boxes tile space in the same way, whichever lattice vectors they name.
-
-    A component of a lattice vector may be off by the tolerance, length.
-    """
-    if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
-        return False
-    rows = np.asarray(one.pbc, bool)
-    a, b = np.asarray(one.matrix, np.float64)[rows], np.asarray(other.matrix, np.float64)[rows]
-    if np.array_equal(a, b):
-        return True
-    # the vectors of one are whole combinations of the other's, and as many to a cell
-    whole = np.rint(np.linalg.lstsq(a.T, b.T, rcond=None)[0].T)
-    return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
-
-
-def separation(one: Frame, other: Frame, atoms: AtomIndices = None) -> Separation:
-    """The separation of two frames; only of these atoms, where they are given."""
-    moved, whole = _displaced(one, other)
-    if atoms is not None:
-        moved, whole = moved[atoms], whole[atoms]
-    square = np.sum(moved**2, axis=1)
-    at = int(np.argmax(square))
-    return Separation(
-        float(np.sqrt(square[at])),
-        float(np.sqrt(square.mean())),
-        at if atoms is None else int(atoms[at]),
-        int(np.abs(whole).max()),
-    )
 
 
 @dataclass
@@ -358,26 +307,6 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
 
 
-def growth(
-    time: Float[np.ndarray, "frames"], length: Float[np.ndarray, "frames"], limit: float
-) -> tuple[float, float, int] | None:
-    """Rate at which a separation grows, from a straight line through its logarithm.
-
-    Lengths of 0, and those above the limit, which are no small differences any more, are left out.
-
-    Returns:
-        (rate per time, r² of the line, frames used); None with fewer than five.
-    """
-    use = (length > 0) & (length < limit) & np.isfinite(length)
-    if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
-        return None
-    x, y = time[use], np.log(length[use])
-    slope, offset = np.polyfit(x, y, 1)
-    spread = float(np.sum((y - y.mean()) ** 2))
-    left = float(np.sum((y - slope * x - offset) ** 2))
-    return float(slope), 1.0 - left / spread if spread > 0 else 1.0, int(np.count_nonzero(use))
-
-
 @dataclass
 class ComparedSide:
     """One of the two trajectories."""
@@ -385,6 +314,7 @@ class ComparedSide:
     trajectory: Trajectory
     tracker: Tracker
     resolution: Resolution
+    speeds: Resolution | None = None  # of velocities, where the file has them in a unit that both have
     distance_bound: float = 0.0  # how far a distance can be off at the last frame, length
     box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
     bound: float = 0.0  # how far a margin can be off
@@ -401,6 +331,12 @@ class ComparedSide:
         """How far one atom, seen through so many periods of the box, can be off at the last frame, length."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
+
+    def speed_bound(self, frame: Frame) -> float:
+        """How far the velocity of an atom can be off, length per time."""
+        if self.speeds is None or frame.velocities is None:
+            return 0.0
+        return self.speeds.bound(velocities_of(frame)) / 2
 
 
 def differing_rows(
@@ -465,6 +401,13 @@ class Compared:
     beyond: int | None = None  # first frame with an atom further apart than the resolution of both explains
     other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
     times_differ: int = 0
+    # the first frame at which all atoms are shifted alike
+    shift: int | None = None
+    other: bool = False  # whether atoms were apart before then beyond what any shift explains
+    # how velocities differ at the first frame at which they do while positions agree, and the last frame
+    # at which both agree
+    velocities: dict[str, Any] | None = None
+    velocities_same: int | None = None
     last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))  # at the last frame
     stopped: InputError | None = None
 
@@ -481,12 +424,21 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 
     files, rules = [side.trajectory for side in sides], [one.rule for one in sets]
     for (a, b), flips in _usable(files, atoms, rules, step, found):
-        at, before, now = found.frames, found.last, separation(a, b, atoms)
+        at, before = found.frames, found.last
+        now, allowed = _apart(found, a, b, atoms, sides)
         if found.seed is None and now.furthest > 0:
             found.seed = at
-        allowed = sum(side.position_bound(now.periods) for side in sides)
         if found.beyond is None and now.furthest > allowed:
             found.beyond = at
+        # what a file writes less often is not missing; before its first step there may be none
+        written = a.velocities is not None and b.velocities is not None
+        if found.beyond is None and found.velocities is None and (written or not at):
+            expected = [side.speeds is not None for side in sides]
+            kind = velocities_differ(a, b, atoms, sum(map(ComparedSide.speed_bound, sides, (a, b))), expected)
+            if kind is not None:
+                found.velocities = {"frame": at, **kind}
+            elif all(expected):
+                found.velocities_same = at
         # formats that round positions may round the box as much
         tolerance = sum(side.distance_bound for side in sides)
         if found.other_box is None and not same_lattice(a.box, b.box, tolerance):
@@ -504,6 +456,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
         row = {
             "frame": at, "number_a": a.index, "number_b": b.index, "time": a.time, "time_b": b.time,
             "furthest": now.furthest, "bound": allowed, "typical": now.typical, "atom": now.atom,
+            **dict(zip(("shift_x", "shift_y", "shift_z"), now.shift, strict=True)),
             "pairs_a": tracked[0], "pairs_b": tracked[1],
             "only_a": len(only.only_a), "only_b": len(only.only_b),
         }  # fmt: skip
@@ -511,6 +464,36 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
         found.last = now
         found.frames += 1
         yield found
+
+
+def _apart(
+    found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
+) -> tuple[Separation, float]:
+    """(separation, how much of it the resolution of both files explains), less a shift of all atoms alike.
+
+    There is one where it explains nearly all: files of one run have other origins, or the motion of the
+    center of mass was removed in one of them.
+    """
+    now = separation(a, b, atoms)
+    allowed = sum(side.position_bound(now.periods) for side in sides)
+    chosen = np.arange(len(a.positions)) if atoms is None else atoms
+    if now.furthest <= allowed or len(chosen) < 4:
+        return now, allowed
+    some = chosen[:: max(len(chosen) // _SOME, 1)]
+    if found.shift is None:
+        share, rest = explained(a, b, some)
+        found.other |= rest.furthest > 2 * allowed
+        if share < _SHIFT_ALONE:
+            return now, allowed
+    share, rest = explained(a, b, chosen)
+    # the shift is off by as much as a position
+    allowed_rest = 2 * sum(side.position_bound(rest.periods) for side in sides)
+    if found.shift is None:
+        if share < (_SHIFT_ALONE if rest.furthest <= allowed_rest else _SHIFT_MOSTLY):
+            return now, allowed
+        # before, rounding may have hidden that it is one
+        found.shift, found.beyond = found.frames, found.beyond if found.other else None
+    return rest, allowed_rest
 
 
 def _sets_at(
@@ -556,8 +539,12 @@ def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -
     cut = frames if one.first is None else one.first["frame"]
     # up to its bound a separation may be made of rounding
     length = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
+    time = table["time"]
+    seed = int(np.flatnonzero(length > 0)[0]) if length.any() else 0
+    # what differs in the first frame began to before the file did
+    began = float(time[0] if seed else 2 * time[0] - time[-1]), float(time[seed])
     parts = {}
     for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
-        line = growth(table["time"][part], length[part], limit)
-        parts[name] = None if line is None else dict(zip(("rate", "r2", "frames"), line, strict=True))
+        law = growth(time[part], length[part], limit, began)
+        parts[name] = None if law is None else vars(law)
     return parts

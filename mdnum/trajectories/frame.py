@@ -38,6 +38,9 @@ class Box:
     # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     pbc: Bool[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, bool))
+    # the corner from which the file gives fractions of the vectors, length
+    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    step: float = 0.0  # what the last digit of a box that is written as text is worth, length; 0 if unknown
 
     @property
     def periodic(self) -> bool:

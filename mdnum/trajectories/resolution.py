@@ -147,7 +147,7 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
     values, fractions = numbers(lambda frame: frame.positions), None
     if all(np.isfinite(one.box.matrix).all() and np.linalg.det(one.box.matrix) != 0 for one in frames):
         fractions = numbers(_fractions_of)
-    box = _BOX_STEPS.get(format, (0.0, 0.0))
+    box = _BOX_STEPS.get(format, (max(one.box.step for one in sample), 0.0))
     if not values.any():
         usual = _USUAL_STEPS.get(format, 0.0)
         kind = "grid" if usual else "unknown"
@@ -169,7 +169,7 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 
 def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
     """Positions in fractions of the box."""
-    return np.linalg.solve(frame.box.matrix.T, frame.positions.T).T
+    return np.linalg.solve(frame.box.matrix.T, (frame.positions - frame.box.origin).T).T
 
 
 # ---- which decimals numbers were written with

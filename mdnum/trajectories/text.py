@@ -18,6 +18,7 @@ import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from itertools import islice
 from pathlib import Path
 from statistics import median
@@ -26,16 +27,18 @@ from typing import Any
 import numpy as np
 from ase.io.formats import UnknownFileTypeError, filetype, get_ioformat
 from ase.io.trajectory import TrajectoryReader
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, reading, with_elements
+from mdnum.reading import ase_images, ignored_velocities, reading, with_elements
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
+_NOT_READ = "Columns {} are not read as velocities, which are taken from {} alone."
+_MOMENTA = "a column momenta in ASE's units"
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -54,13 +57,15 @@ class AseFrames(Trajectory):
         units = _units(self.path)
         self.length, self.time = units.length, units.time if self._timed else "frame"
         self._per_time = units.time_factor
+        if names := ignored_velocities(first.arrays):
+            self.notes += (_NOT_READ.format(", ".join(f"“{name}”" for name in names), _MOMENTA),)
         order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
         return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
         momenta, velocities = atoms.arrays.get("momenta"), None
-        if momenta is not None and np.any(momenta):
+        if momenta is not None:
             velocities = np.asarray(momenta, np.float64) / atoms.get_masses()[:, None] * self._per_time
         timed = self._timed and "time" in atoms.info
         labels, identified = np.array(atoms.get_chemical_symbols()), _ids(atoms) is not None
@@ -303,6 +308,8 @@ _UNITS = {
 # columns of positions, first choice first; the last two are fractions of the box
 _COLUMNS = (("x", "y", "z"), ("xu", "yu", "zu"), ("xs", "ys", "zs"), ("xsu", "ysu", "zsu"))
 _VELOCITIES = ("vx", "vy", "vz")
+# worth of the last digit of a box from which on it is taken for a rounded one
+_ROUNDED = 1e-4
 
 
 class LammpsDump(TextTrajectory):
@@ -318,6 +325,8 @@ class LammpsDump(TextTrajectory):
         self.time = time if "TIME" in items else "step"
         if units is None:
             self.notes = ("The dump does not say its units (LAMMPS's dump_modify units yes writes them).",)
+        if set(_VELOCITIES) <= set(columns) and "TIME" not in items:
+            self.notes += (_NOT_READ.format(", ".join(_VELOCITIES), "dumps with dump_modify time yes"),)
         labels = _labels(columns, rows[self._order(0, columns, rows)])
         return AtomTable.plain(["X"] * len(rows) if labels is None else labels.tolist(), labels is not None)
 
@@ -325,7 +334,7 @@ class LammpsDump(TextTrajectory):
         items = _items(raw)
         columns, rows = _atoms(items)
         rows = rows[self._order(number, columns, rows)]
-        matrix, pbc = _bounds(items)
+        box = _bounds(items)
 
         def numbers(names: tuple[str, ...]) -> Float[np.ndarray, "atoms 3"]:
             return rows[:, [columns.index(one) for one in names]].astype(np.float64)
@@ -339,14 +348,13 @@ class LammpsDump(TextTrajectory):
             )
         positions = numbers(names)
         if names[0].startswith("xs"):
-            # from the box's corner: it moves as the box breathes, and would hide the digits
-            positions = positions @ matrix
+            positions = box.origin + positions @ box.matrix
         timed = "TIME" in items
         velocities = numbers(_VELOCITIES) if timed and set(_VELOCITIES) <= set(columns) else None
         step = _whole_number(items["TIMESTEP"][0], "the time step")
         time = float(items["TIME"][0]) if timed else float(step)
         labels = _labels(columns, rows)
-        return Frame(number, time, positions, Box(matrix, pbc), velocities, labels, identified=True)
+        return Frame(number, time, positions, box, velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
@@ -412,20 +420,24 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
     return columns, words.reshape(len(rows), len(columns))
 
 
-def _bounds(items: dict[str, list[str]]) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, "3"]]:
-    """Lattice vectors, and which directions repeat."""
+def _bounds(items: dict[str, list[str]]) -> Box:
+    """Lattice vectors, which directions repeat, and the corner, which moves as the box breathes."""
     head, *rows = items["BOX BOUNDS"]
-    words = head.split()
-    pbc = np.array([word == "pp" for word in words[-3:]], bool)
-    values = np.array([row.split() for row in rows[:3]], np.float64)
-    if "abc" in words:
+    names, words = head.split(), [row.split() for row in rows[:3]]
+    pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
+    step = 0.0
+    if np.isfinite(values).all():
+        step = 10.0 ** min(int(Decimal(word).as_tuple().exponent) for row in words for word in row)
+    # a box of few digits is not a rounded one, but was written by hand or never changes
+    step = step if step <= _ROUNDED else 0.0
+    if "abc" in names:
         # vectors in any direction; the corner is the fourth column
-        return values[:, :3], pbc
+        return Box(values[:, :3], pbc, values[:, 3], step)
     xy, xz, yz = values[:, 2] if values.shape[1] > 2 else np.zeros(3)
     # the bounds of a tilted box are those of the box around it
     low = values[:, 0] - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
     size = values[:, 1] - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0] - low
-    return np.array([[size[0], 0, 0], [xy, size[1], 0], [xz, yz, size[2]]]), pbc
+    return Box(np.array([[size[0], 0, 0], [xy, size[1], 0], [xz, yz, size[2]]]), pbc, low, step)
 
 
 # ---- GROMACS

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed
+from mdnum.systems import structures
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
     from mdnum.references.pair_check import PairsReport
     from mdnum.systems import System
 
-TEXTS = Texts(__file__)
+TEXTS, RUN_TEXTS = Texts(__file__), Texts(Path(__file__).with_name("run.py"))
+# ratio of temperatures from which on the one of a structure is another than the one requested
+_OTHER = 3.0
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,37 @@ def check(question: str, system: System) -> Checked:
     report: Any = compare(system)
     headline = TEXTS("agrees" if report.ok else "differs", system=system.name)
     return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
+
+
+def structure_findings(system: System) -> Iterator[Finding]:
+    """What a run would not make of a structure as its author may think: its temperature, its velocities."""
+    structure, dynamics = system.spec.structure, system.spec.dynamics
+    if (velocities := system.velocities) is not None:
+        masses = system.atoms.get_masses()
+        if dynamics.remove_drift and len(masses) > 1:
+            velocities = velocities - masses @ velocities / masses.sum()
+        twice = float((masses[:, None] * velocities**2).sum())
+        temperature = twice / (3 * len(masses) * system.units.k_B)
+        yield from temperature_findings(
+            temperature, dynamics.temperature, len(masses), system.units.temperature
+        )
+    elif structure.velocities == "file" and (names := structures.ignored(structure, system.folder)):
+        yield TEXTS.finding("VELOCITIES_IGNORED", names=listed([f"“{name}”" for name in names]))
+
+
+def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
+    """A warning where velocities are those of quite another temperature than the one requested.
+
+    A crystal that begins to move takes half of its kinetic energy back, and few atoms scatter: both are fine.
+    """
+    ratio = start / requested if requested > 0 else 1.0
+    if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):
+        return
+    values = {"start": start, "requested": requested, "unit": unit}
+    more = ["factor"] if start > 0 else []
+    yield RUN_TEXTS.finding(
+        "OTHER_TEMPERATURE", *more, factor=(1 / ratio) ** 0.5 if start > 0 else 0.0, **values
+    )
 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:

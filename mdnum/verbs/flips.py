@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
 
 #: Frames within which a flip that is reversed is chatter, unless another number is asked for.
 WINDOW = 5
-# displacement between frames over what velocities say, above which they cannot belong to the positions
-_TOO_FAR = 1.1
+# seconds in units of time, and how far apart in seconds no simulation of atoms has its frames
+_SECONDS = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "μs": 1e-6, "s": 1.0}
+_SHORTEST, _LONGEST = 1e-19, 1e-2
 # rows of the ledger that are worked on at once, and such parts that are held, at 22 bytes a row
 _PART_ROWS, _PARTS_HELD = 1_500_000, 10
 # an odd number, so that the parts of a crystal's regular labels are alike
@@ -112,7 +114,7 @@ def flips(
         interrupted = rows.drain(folder, passes, found, opened.count or 0, log)
         read = time.perf_counter()
         frames = folder.read("frames")
-        steps = _steps(frames, opened.time != "frame")
+        steps = _steps(frames, opened)
         told = [
             _rule_told(folder, number, one, found, frames, steps, opened, groups, window, log)
             | {"grid": _grid(sample, resolution, one, groups)}
@@ -127,7 +129,7 @@ def flips(
             "window": window,
             "resolution": resolution,
             "rules": told,
-            "velocities_odd": bool(found.moved > _TOO_FAR),
+            "flight": found.odd,
             "leaps": None if not leaps else {
                 "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
             },
@@ -256,15 +258,20 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     return trajectory.in_file is not None and error.frame >= trajectory.in_file - 1
 
 
-def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
-    """Times of the frames: how far apart, evenly or not."""
+def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str, Any]:
+    """Times of the frames: how far apart, evenly or not, and whether a simulation can have them."""
+    timed = trajectory.time != "frame"
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
     interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else math.nan
     backward = int(np.count_nonzero(steps <= 0))
+    seconds = abs(interval) * _SECONDS.get(trajectory.time, math.nan)
+    absurd = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST)
     return {
         # frames are counted where their times do not go forward
-        "timed": timed and not backward,
+        "timed": timed and not backward and not absurd,
+        "absurd": absurd,
+        "swapped": _swapped(trajectory, interval) if absurd else None,
         "has_times": timed and not (len(steps) and (steps == 0).all()),
         "first_time": float(times[0]),
         "last_time": float(times[-1]),
@@ -272,6 +279,18 @@ def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
         "even": bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True,
         "backward": backward,
     }
+
+
+def _swapped(trajectory: Trajectory, interval: float) -> float | None:
+    """The time between frames if the step in a DCD's head has its bytes in the other order; None for none."""
+    with trajectory.path.open("rb") as file:
+        head = file.read(48)
+    if trajectory.format != "DCD" or head[4:8] != b"CORD":
+        return None
+    orders = "<>" if head[:4] == struct.pack("<i", 84) else "><"
+    (step,), (other,) = (struct.unpack(f"{order}f", head[44:48]) for order in orders)
+    found = interval * other / step
+    return found if _SHORTEST < found * _SECONDS["ps"] < _LONGEST else None
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
@@ -357,10 +376,12 @@ def _rule_told(
         "pairs_first": int(rows["pairs"][0]),
         "pairs_last": int(rows["pairs"][-1]),
         "pairs_mean": float(rows["pairs"].mean()),
+        "pairs_least": int(rows["pairs"].min()),
+        "pairs_most": int(rows["pairs"].max()),
         "entered": entered,
         "left": left,
         "flips": entered + left,
-        "flips_per_frame": (entered + left) / (count - 1) if count > 1 else 0.0,
+        "flips_per_frame": (entered + left) / (count - 1) if count > 1 else None,
         "ambiguous": int(rows["ambiguous"].sum()),
         "near_mean": float(rows["near"].mean()),
         "min_margin": float(np.nanmin(np.abs(margins))) if np.isfinite(margins).any() else None,
@@ -430,11 +451,11 @@ def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups)
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
     """Crossings by the velocities, which a run would show that looked at every instant, against the flips."""
     duration = steps["last_time"] - steps["first_time"]
-    if not one.flux or not steps["timed"] or not duration > 0 or found.moved > _TOO_FAR:
+    if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None
     crossed, moments = sum(flips for flips, _ in one.flux), sum(moment for _, moment in one.flux)
     rate, seen = crossed / moments, flips / duration
     return {
         "rate": rate, "error": rate / max(crossed, 1) ** 0.5, "seen": seen, "crossed": crossed,
-        "frames": len(one.flux), "moved": found.moved, "lost": 1.0 - seen / rate if rate > 0 else None,
+        "frames": len(one.flux), "lost": 1.0 - seen / rate if rate > 0 else None,
     }  # fmt: skip

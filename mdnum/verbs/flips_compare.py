@@ -15,6 +15,7 @@ from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs,
 from mdnum.report.words import count, many, number
 from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
+from mdnum.trajectories.separation import velocities_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
 from mdnum.verbs.frame import Keep, Outcome, Verb, answering
@@ -49,11 +50,19 @@ def compare(
             remedy="Compare trajectories of the same atoms",
         )
     groups = selected(a, between)
-    resolutions = [infer(one.sample(), one.bits, one.format) for one in (a, b)]
+    samples = [one.sample() for one in (a, b)]
+    resolutions = [infer(some, one.bits, one.format) for some, one in zip(samples, (a, b), strict=True)]
+    moving = [[velocities_of(frame) for frame in some if frame.velocities is not None] for some in samples]
+    # MDAnalysis has velocities per ps where a file has no times
+    clocks = {"ps" if one.time == "frame" else one.time for one in (a, b)}
+    comparable = a.length == b.length and len(clocks) == 1
+    speeds = [
+        infer(moving[k], one.bits) if moving[k] and comparable else None for k, one in enumerate((a, b))
+    ]
     sets = [
         NeighborSets(rule, [
-            ComparedSide(one, Tracker(rule, *groups, [str(word) for word in one.species]), kept)
-            for one, kept in zip((a, b), resolutions, strict=True)
+            ComparedSide(one, Tracker(rule, *groups, [str(word) for word in one.species]), kept, speed)
+            for one, kept, speed in zip((a, b), resolutions, speeds, strict=True)
         ])
         for rule in asked
     ]  # fmt: skip
@@ -88,7 +97,7 @@ def compare(
                 "interval": 1.0,
                 "resolution": resolutions[0],
                 "other_resolution": resolutions[1],
-                **{name: value for name, value in vars(found).items() if name != "stopped"},
+                **{name: value for name, value in vars(found).items() if name not in ("stopped", "other")},
                 "repeats": [one.repeats.plain() for one in (a, b)],
                 # steps, units and numbers of frames are not compared with one another
                 "times_differ": found.times_differ if a.time == b.time else 0,
@@ -144,6 +153,20 @@ class ComparisonView(FlipsView):
             return f"frame {count(at)} ({count(a)} in both files)"
         return f"frame {count(at)} ({count(a)} in A’s file, {count(b)} in B’s)"
 
+    @property
+    def shift(self) -> dict[str, Any]:
+        """Of the shift of all atoms alike: size and vector where it begins, smallest and largest size."""
+        table, at = self.table("apart"), self.summary["shift"]
+        vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
+        sizes = np.sqrt((vectors**2).sum(axis=1))
+        low, high = float(sizes[at:].min()), float(sizes.max())
+        same = high - low <= 2 * float(table["bound"].max())
+        vector = ", ".join(number(float(one)) for one in vectors[at])
+        return {
+            "first": self.frame(at), "size": self.length(float(sizes[at])), "vector": f"({vector})",
+            "same": same, "low": self.length(low), "high": self.length(high),
+        }  # fmt: skip
+
     def by_boxes(self, first: Mapping[str, Any]) -> bool:
         """Whether the boxes differ when the sets come to, and positions not beyond the resolution."""
         boxes, beyond = self.summary["other_box"], self.summary["beyond"]
@@ -174,6 +197,9 @@ def _headline(view: ComparisonView) -> str:
     """The verdict on the first rule, and where there are several a sentence on each other."""
     first, *others = view.summary["rules"]
     text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
+    if view.summary["shift"] is not None:
+        shift = view.shift
+        text += " " + TEXTS("shift_constant" if shift["same"] else "shift_varies", **shift)
     if view.summary["seed"] is None and not any(one["first"] for one in view.summary["rules"]):
         return text
     return " ".join([text, *(_in_short(view, one) for one in others)])
@@ -210,6 +236,9 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
             yield TEXTS("positions_before")
     elif first is not None:
         yield TEXTS("positions_same")
+    same = summary["velocities_same"]
+    if same is not None and beyond is not None and same == beyond - 1:
+        yield TEXTS("velocities_agree", frame=view.frame(same))
     if first is not None:
         yield TEXTS(f"certain_{_certain(one)}", **values)
         yield TEXTS(f"order_{_order(view, one)}", **values)
@@ -217,6 +246,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
         yield from _rates(view, one["growth"])
     elif beyond is not None:
         yield TEXTS("order_none", **values)
+        yield from _rates(view, {"whole": one["growth"]["before"]})
     for other in others:
         yield _in_short(view, other)
         if other["first"] is not None:
@@ -263,13 +293,14 @@ def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
 
 def _rates(view: ComparisonView, grown: Mapping[str, Any]) -> Iterator[str]:
     rates = {}
-    for name in ("before", "after"):
-        line = grown[name]
-        if line is not None and line["r2"] >= _FITS and line["rate"] > 0:
-            rates[name] = line["rate"]
-            text = number(1 / line["rate"])
-            length = view.time(text) if view.summary["timed"] else f"{text} frames"
-            yield TEXTS(f"growth_{name}", time=length, frames=line["frames"])
+    for name, law in grown.items():
+        if law is None or law["rate"] <= 0 or max(law["r2"], law["power_r2"]) < _FITS:
+            continue
+        text, part = number(1 / law["rate"]), TEXTS(f"part_{name}")
+        length = view.time(text) if view.summary["timed"] else f"{text} frames"
+        yield TEXTS(f"growth_{law['law']}", part=part, time=length, **law)
+        if law["law"] == "exponential":
+            rates[name] = law["rate"]
     if len(rates) == 2:
         ratio = rates["after"] / rates["before"]
         code = "faster" if ratio > _ALIKE else "slower" if ratio < 1 / _ALIKE else "alike"
@@ -284,6 +315,11 @@ def _findings(view: ComparisonView) -> Iterator[Finding]:
         yield TEXTS.finding("INTERRUPTED", frames=frames)
     for name, repeats in zip((view.name, summary["other"]), summary.get("repeats", ()), strict=False):
         yield from view.repeated(repeats, name)
+    if summary["shift"] is not None:
+        shift = view.shift
+        yield TEXTS.finding("SHIFT", *["varies"] * (not shift["same"]), **shift)
+    if (how := summary["velocities"]) is not None and how["frame"] != summary["beyond"]:
+        yield TEXTS.finding("VELOCITIES", how["kind"], **{**how, "frame": view.frame(how["frame"])})
     unsure = [one for one in summary["rules"] if one["first"] and one["certain"] != one["first"]["frame"]]
     if unsure:
         made = []
@@ -350,6 +386,8 @@ def _keys(view: ComparisonView) -> Iterator[Key]:
         yield Key("Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution")
         yield Key("Separation then", view.length(first["furthest"]), "furthest atom")
     yield Key("Separation at the end", view.length(summary["last"]["furthest"]), "furthest atom")
+    if summary["shift"] is not None:
+        yield Key("Common shift", view.shift["size"], f"of all atoms at {view.shift['first']}, taken off")
 
 
 def _rules(view: ComparisonView) -> Table:

@@ -12,7 +12,7 @@ from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, many, number, percent, plain
-from mdnum.verbs.flips_shared import TEXTS, FlipsView, repeating, resolution
+from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02
@@ -48,7 +48,8 @@ def _headline(view: FlipsView) -> str:
         return TEXTS("one_frame", pairs=every[0]["pairs_first"], rule=view.rule(every[0]))
     one = next((one for one in every if one["flips"]), None)
     if one is None:
-        return TEXTS("no_flips", frames=summary["frames"])
+        code = "no_flips" if any(one["pairs_most"] for one in every) else "no_contact"
+        return TEXTS(code, frames=summary["frames"], rule=view.rule(every[0]))
     frames, rule = summary["frames"], view.rule(one)
     parts = [TEXTS("flips", flips=one["flips"], pairs=one["pairs_flipped"], frames=frames, rule=rule)]
     if one["flips"] >= FEW:
@@ -69,8 +70,8 @@ def _evidence(view: FlipsView) -> Iterator[str]:
             yield TEXTS("algebra", rule=view.rule(one), **numbers)
         life = one["lifetime"]
         if life["followed"] and life["leaves"]:
-            mean = view.duration(life["mean_by_rate"])
-            yield TEXTS("life", rule=view.rule(one), median=view.life(life), mean=mean)
+            values = {"median": view.life(one), "mean": view.life(one, "mean_by_rate")}
+            yield TEXTS("life", rule=view.rule(one), **values)
 
 
 def _ended(view: FlipsView) -> Iterator[Finding]:
@@ -110,7 +111,7 @@ def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
     """(code, variants, values) of what one rule's flips do not show."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
-    flips, frames, life = one["flips"], view.summary["frames"], one["lifetime"]
+    flips, frames = one["flips"], view.summary["frames"]
     if flips:
         yield from _undecided(one)
         yield from _between(view, one)
@@ -121,8 +122,8 @@ def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
         chatter = one["chatter"]
         if flips >= FEW and chatter["share"] >= CHATTER and not _far_apart(one):
             values = {name: chatter[name] for name in ("share", "window", "undone")}
-            loose = view.life(one["intermittent"])
-            yield "CHATTER", (), {**values, "flips": flips, "life": view.life(life), "loose": loose}
+            loose = view.life(one, of="intermittent")
+            yield "CHATTER", (), {**values, "flips": flips, "life": view.life(one), "loose": loose}
     total = sum(one["contacts"].values())
     cut = total - one["contacts"]["seen"]
     if total and cut > CENSORED * total and frames > 1:
@@ -134,6 +135,8 @@ def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
 def _undecided(one: Rule) -> Iterator[Limit]:
     missed, invented = (one["grid"][name] if one["grid"] else 0.0 for name in ("missed", "invented"))
     share = one["ambiguous"] / one["flips"]
+    # an estimate can exceed what no rounding at all can have made up
+    invented = min(invented, share)
     if not one["ambiguous"] and max(missed, invented) <= UNDECIDED:
         return
     grave = one["flips"] >= FEW and max(share, missed, invented) > UNDECIDED
@@ -196,17 +199,29 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         others = leaps["frames"] - 1
         values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": view.length(leaps["distance"])}
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
+    if (flight := summary["flight"]) is not None:
+        factor, lower = flight["factor"], flight["at_least"]
+        known = (
+            []
+            if lower
+            else [word for word, one in TEXTS.entries["odd_units"].items() if abs(factor / one - 1) < 0.05]
+        )
+        code = "at_least" if lower else "large" if factor > 1 else "small"
+        values = {"factor": factor, "inverse": 1 / factor, "units": " or ".join(known)}
+        yield TEXTS.finding("VELOCITIES_ODD", code, *["known"] * bool(known), **values)
     if summary["frames"] > 1:
         if not summary["has_times"]:
             yield TEXTS.finding("NO_TIMES")
+        elif summary["absurd"]:
+            swapped = summary["swapped"]
+            values = {"interval": view.time(number(summary["interval"])), "swapped": swapped}
+            yield TEXTS.finding("TIMES_ODD", *["swapped"] * bool(swapped), **values)
         elif summary["backward"]:
             yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
         elif not summary["even"]:
             yield TEXTS.finding("UNEVEN_FRAMES", interval=view.duration(1))
     axes = repeating(summary["box"])
-    more = (
-        ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes) + ["velocities"] * summary["velocities_odd"]
-    )
+    more = ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes)
     if summary["notes"] or more:
         yield TEXTS.finding("READING", *more, notes=" ".join(summary["notes"]), axes=", ".join(axes))
     if any(one["min_margin"] == 0 for one in summary["rules"]):
@@ -238,12 +253,12 @@ def page(view: FlipsView, verdict: Verdict) -> Page:
 
 
 def _keys(view: FlipsView, one: Rule) -> Iterator[Key]:
-    yield Key("Pairs inside", number(one["pairs_mean"], 4), f"on average, {view.rule(one)}")
+    yield Key("Pairs inside", average(one["pairs_mean"]), f"on average, {view.rule(one)}")
     yield Key("Flips", count(one["flips"]), view.rate(one["flips_per_frame"]))
     share = percent(one["ambiguous"] / one["flips"]) if one["flips"] else ""
     yield Key("Undecidable", count(one["ambiguous"]), share)
-    yield Key("Median contact", view.life(one["lifetime"]), "of those seen to begin")
-    yield Key("Mean by rate", view.duration(one["lifetime"]["mean_by_rate"]), "all of them")
+    yield Key("Median contact", view.life(one), "of those seen to begin")
+    yield Key("Mean by rate", view.life(one, "mean_by_rate"), "all of them")
 
 
 def _input(view: FlipsView, size: str) -> Iterator[tuple[str, str]]:
@@ -261,10 +276,9 @@ def _input(view: FlipsView, size: str) -> Iterator[tuple[str, str]]:
 def _rules(view: FlipsView) -> Table:
     return table_of(view.summary["rules"], {
         "rule": view.rule,
-        "pairs": lambda one: f"{count(one['pairs_first'])} to {count(one['pairs_last'])}",
+        "pairs inside": lambda one: f"{count(one['pairs_least'])} to {count(one['pairs_most'])}",
         "flips": "flips", "per frame": "flips_per_frame", "undecidable": "ambiguous",
-        "median life": lambda one: view.life(one["lifetime"]),
-        "mean life by rate": lambda one: view.duration(one["lifetime"]["mean_by_rate"]),
+        "median life": view.life, "mean life by rate": lambda one: view.life(one, "mean_by_rate"),
         "chatter": lambda one: percent(one["chatter"]["share"]),
     })  # fmt: skip
 
@@ -297,7 +311,8 @@ def _numbers(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     around, chatter = one["neighbors"], one["chatter"]
     yield "Pairs inside at the first frame", count(one["pairs_first"])
     yield "Pairs inside at the last", count(one["pairs_last"])
-    yield "Pairs inside on average", number(one["pairs_mean"], 5)
+    span = f"{count(one['pairs_least'])} to {count(one['pairs_most'])}"
+    yield "Pairs inside at any frame", f"{span}, {average(one['pairs_mean'])} on average"
     yield "Flips", f"{count(one['flips'])}: {count(one['entered'])} entered, {count(one['left'])} left"
     yield "Flips from frame to frame", number(one["flips_per_frame"], 4)
     yield "Pairs that flip", count(one["pairs_flipped"])
@@ -306,7 +321,7 @@ def _numbers(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     if one["min_margin"] is not None:
         yield "Closest decision", f"{view.length(one['min_margin'])} from its threshold"
     span = f"{count(around['fewest'])} to {count(around['most'])}"
-    yield "Neighbors of an atom", f"{span}, {number(around['mean'], 4)} on average"
+    yield "Neighbors of an atom", f"{span}, {average(around['mean'])} on average"
     back = f"{many(chatter['undone'], 'flip')} ({percent(chatter['share'])})"
     yield f"Reversed within {many(chatter['window'], 'frame')}", back
 
@@ -319,23 +334,20 @@ def _lifetimes(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     yield "Throughout", count(seen["throughout"])
     if not life["followed"]:
         return
-    yield "Median life", view.life(life)
+    yield "Median life", view.life(one)
     if life["quarter_gone"] is not None:
-        ends = [view.duration(life[name]) for name in ("quarter_gone", "three_quarters_gone")]
+        ends = [view.life(one, name) for name in ("quarter_gone", "three_quarters_gone")]
         yield "Quartiles", " and ".join(ends)
     if life["mean"] is not None:
-        at_least = "" if life["mean_is_whole"] else "at least "
-        yield "Mean life (product-limit)", at_least + view.duration(life["mean"])
+        yield "Mean life (product-limit)", view.life(one, "mean")
     if life["leaves"]:
         error = view.duration(life["mean_by_rate_error"], 2)
-        yield (
-            "Mean life (by rate)",
-            f"{view.duration(life['mean_by_rate'])} ± {error}, if leaves are independent",
-        )
+        mean = f"{view.life(one, 'mean_by_rate')} ± {error}, if leaves are independent"
+        yield "Mean life (by rate)", mean
     gaps = f"gaps up to {many(one['chatter']['window'], 'frame')} overlooked"
-    yield f"Median life, {gaps}", view.life(loose)
+    yield f"Median life, {gaps}", view.life(one, of="intermittent")
     if loose["leaves"]:
-        yield f"Mean life by rate, {gaps}", view.duration(loose["mean_by_rate"])
+        yield f"Mean life by rate, {gaps}", view.life(one, "mean_by_rate", "intermittent")
 
 
 def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
@@ -366,7 +378,7 @@ def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Tabl
         title: lambda one: f"{one['first']}–{one['second']}",
         "pairs inside": lambda one: one["inside"] / frames,
         "flips": lambda one: one["entered"] + one["left"],
-        "rate": lambda one: view.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
+        "rate": lambda one: view.rate((one["entered"] + one["left"]) / (frames - 1) if frames > 1 else None),
         "mean stay by rate": lambda one: view.duration(one["stay"], beyond="–"),
     })  # fmt: skip
 

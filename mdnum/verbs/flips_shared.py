@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.report.finding import Finding, Texts
-from mdnum.report.words import listed, number, plain
+from mdnum.report.words import count, listed, number, plain
 from mdnum.store import RunFolder
 from mdnum.verbs.frame import Progress, View, asked_to_stop
 
@@ -142,13 +142,27 @@ class FlipsView(View):
             return self.time(number(frames * self.summary["interval"], digits))
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
-    def life(self, lifetime: Mapping[str, Any]) -> str:
-        """The median of a lifetime; no shorter than the distance of two frames."""
-        median = lifetime["median"]
-        return f"{'at most ' if median == 1 else ''}{self.duration(median)}"
+    def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
+        """A lifetime of a rule: its value, of which side it is a bound, or why there is none.
 
-    def rate(self, per_frame: float) -> str:
-        """A rate per frame as one per time, where the file has times."""
+        Where half of the contacts are over by the next frame, all lifetimes are upper bounds: pairs came and
+        went between the frames.
+        """
+        life = one[of]
+        if not one["pairs_most"]:
+            return "no contact"
+        if self.summary["frames"] < 2:
+            return "one frame"
+        if not life["leaves" if "rate" in name else "followed"]:
+            return "none seen to end" if "rate" in name else "none seen to begin"
+        cut = name == "mean" and not life["mean_is_whole"]
+        bound = ("about " if cut else "at most ") if life["median"] == 1 else "at least " if cut else ""
+        return bound * (life[name] is not None) + self.duration(life[name])
+
+    def rate(self, per_frame: float | None) -> str:
+        """A rate per frame as one per time, where the file has times; a dash where there is none."""
+        if per_frame is None:
+            return "–"
         if self.timed:
             return f"{number(per_frame / self.summary['interval'])} per {self.summary['time']}"
         return f"{number(per_frame)} per frame"
@@ -198,6 +212,11 @@ class FlipsView(View):
         if self.timed:
             return f"time ({self.summary['time']})", rows["time"]
         return "frame", rows["frame"]
+
+
+def average(mean: float) -> str:
+    """A mean of whole numbers, with so many digits that rounding does not take it out of their range."""
+    return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 
 def repeating(box: Mapping[str, Any]) -> list[str]:

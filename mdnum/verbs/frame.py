@@ -39,7 +39,8 @@ from mdnum.store.files import default_folder
 if TYPE_CHECKING:
     from mdnum.units import Units
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]

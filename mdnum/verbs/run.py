@@ -21,6 +21,7 @@ from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
+from mdnum.verbs.check import temperature_findings
 from mdnum.verbs.frame import Outcome, Progress, Verb, finish, keywords_checked, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
@@ -208,7 +209,7 @@ def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
         *_status(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
-        *_decisions(run), *_drift(run), *_cutoff(run),
+        *_decisions(run), *_drift(run), *_cutoff(run), *_start(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
     severities = {finding.severity for finding in found}
@@ -317,6 +318,13 @@ def _decisions(run: RunView) -> Iterator[Finding]:
             flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
             pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
         )  # fmt: skip
+
+
+def _start(run: RunView) -> Iterator[Finding]:
+    requested = float((run.system.get("dynamics") or {}).get("temperature") or 0.0)
+    if run.summary.get("atoms") and len(run.series["step"]) and run.series["step"][0] == 0:
+        start = float(run.series["temperature"][0])
+        yield from temperature_findings(start, requested, run.summary["atoms"], run.units.temperature)
 
 
 def _drift(run: RunView) -> Iterator[Finding]:

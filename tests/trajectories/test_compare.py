@@ -8,16 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.follow import (
-    SetDifference,
-    displacements,
-    distances,
-    growth,
-    same_lattice,
-    separation,
-)
+from mdnum.trajectories.follow import SetDifference, distances
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.ledger import Members
+from mdnum.trajectories.separation import displacements, growth, same_lattice, separation
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30))
@@ -76,9 +70,11 @@ def test_distances_through_the_image_that_a_rank_names() -> None:
 
 def test_growth_is_the_rate_of_an_exponential() -> None:
     time = np.linspace(0, 10, 50)
-    rate, fit, frames = growth(time, 1e-9 * np.exp(1.7 * time), limit=1e-4) or (0, 0, 0)
-    assert rate == pytest.approx(1.7) and fit == pytest.approx(1.0) and frames < 50
-    assert growth(time[:4], time[:4], 1.0) is None and growth(time, np.zeros(50), 1.0) is None
+    found = growth(time, 1e-9 * np.exp(1.7 * time), 1e-4, (-10.0, 0.0))
+    assert found is not None and found.law == "exponential" and found.frames < 50
+    assert found.rate == pytest.approx(1.7) and found.r2 == pytest.approx(1.0)
+    began = (0.0, 0.0)
+    assert growth(time[:4], time[:4], 1.0, began) is None and growth(time, np.zeros(50), 1.0, began) is None
 
 
 def test_a_lattice_is_the_same_whichever_vectors_name_it() -> None:

@@ -129,7 +129,7 @@ ITEM: ATOMS id element {columns}
 
 
 def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path):
-    # bounds are those around the tilted box: x from 0 to 8, y from 3 to 10, z from 0 to 8
+    # bounds are those around the tilted box, whose corner is at 0, 2, 0
     matrix = np.array([[8.0, 0, 0], [1.5, 7.75, 0], [-1.0, 0.25, 8.0]])
     scaled = np.array([[0.1, 0.2, 0.3], [0.5, -0.25, 1.5], [0.0, 0.0, 0.0]])
     text = ""
@@ -145,7 +145,7 @@ def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path
     for frame in frames:
         np.testing.assert_allclose(frame.box.matrix, matrix, atol=1e-15)
         assert frame.box.pbc.tolist() == [True, True, False]
-        np.testing.assert_allclose(frame.positions, scaled @ matrix, atol=1e-15)
+        np.testing.assert_allclose(frame.positions, np.array([0.0, 2.0, 0.0]) + scaled @ matrix, atol=1e-15)
         np.testing.assert_array_equal(frame.velocities, [[1, 2, 3]] * 3)
 
 

@@ -1,0 +1,261 @@
+"""Two frames of the same atoms: how far apart, by which shift, with which velocities, and how that grows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.trajectories.frame import AtomIndices, Box, Frame
+from mdnum.trajectories.lattice import lattice_of
+
+# displacements over what velocities say above which they contradict; correlations above which velocities keep
+# their directions from frame to frame, and displacements lie along them
+_TOO_FAR, _KEPT, _ALONG = 1.1, 0.8, 0.9
+# last digits that a displacement has to have for its size to say something
+_STEPS = 3.0
+# velocities that differ by less than this share of their root mean square may have been rounded otherwise
+_SAME_SPEED = 1e-4
+# correlation from which on velocities are parallel; standard errors up to which there is none
+_PARALLEL, _UNRELATED = 0.99, 4.0
+# the steepest power law that is told from an exponential; how much smaller squares are of what fits better
+_STEEPEST, _BETTER = 4.0, 2.0
+
+
+# ---- positions
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far atoms are from where they are in another frame."""
+
+    furthest: float  # largest displacement, length
+    typical: float  # root mean square displacement, length
+    atom: int  # the one that is displaced furthest
+    # most lattice vectors of one kind between an atom and its nearest image: 0 where none was wrapped in one
+    # of the frames only
+    periods: int = 0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all atoms alike, taken off before, length
+
+
+def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
+    """From one frame to another, up to lattice vectors of the second's box.
+
+    The nearest image is found along reduced lattice vectors: for an atom that moved by less than half the
+    width of the box it is the nearest of all. Where the frames repeat along different axes, only those along
+    which both do have images.
+    """
+    return _displaced(start, end)[0]
+
+
+def _displaced(
+    start: Frame, end: Frame, shift: Float[np.ndarray, "3"] | float = 0.0, atoms: AtomIndices = None
+) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+    """(displacements less a shift, whole lattice vectors taken off)."""
+    x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
+    moved = y - x - shift
+    shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
+    if not shared.periodic:
+        return moved, np.zeros_like(moved)
+    lattice = lattice_of(shared)
+    whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
+    return moved - whole @ lattice.vectors, whole
+
+
+def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
+    """Whether two boxes tile space in the same way, whichever lattice vectors they name.
+
+    A component of a lattice vector may be off by the tolerance, length.
+    """
+    if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
+        return False
+    rows = np.asarray(one.pbc, bool)
+    a, b = np.asarray(one.matrix, np.float64)[rows], np.asarray(other.matrix, np.float64)[rows]
+    if np.array_equal(a, b):
+        return True
+    # the vectors of one are whole combinations of the other's, and as many to a cell
+    whole = np.rint(np.linalg.lstsq(a.T, b.T, rcond=None)[0].T)
+    return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
+
+
+def separation(
+    one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
+) -> Separation:
+    """The separation of two frames, less a shift; only of these atoms, where they are given."""
+    moved, whole = _displaced(one, other, 0.0 if shift is None else shift, atoms)
+    square = np.sum(moved**2, axis=1)
+    at = int(np.argmax(square))
+    return Separation(
+        float(np.sqrt(square[at])),
+        float(np.sqrt(square.mean())),
+        at if atoms is None else int(atoms[at]),
+        int(np.abs(whole).max()),
+        (0.0, 0.0, 0.0) if shift is None else (float(shift[0]), float(shift[1]), float(shift[2])),
+    )
+
+
+def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
+    """The displacement that most atoms have in common, up to lattice vectors, length."""
+    shift = _displaced(one, other, atoms=atoms)[0][0]
+    for _ in range(2):
+        # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
+        # median they do not
+        shift = shift + np.median(_displaced(one, other, shift, atoms)[0], axis=0)
+    return shift
+
+
+def velocities_differ(
+    a: Frame, b: Frame, atoms: AtomIndices, bound: float, expected: Sequence[bool]
+) -> dict[str, Any] | None:
+    """How velocities of two frames differ; None where either has none, or they agree within the bound.
+
+    Args:
+        bound: how far the difference of two velocities can be off, length per time.
+        expected: whether the file of each has velocities at all.
+
+    Returns:
+        the kind: "zero" (none in one, or not written yet), "common" (one vector for all atoms), "scaled",
+        "drawn" (uncorrelated) or "other"; which side has none; the factor from A to B and the correlation.
+    """
+    rows = slice(None) if atoms is None else atoms
+    u, v = (None if one.velocities is None else one.velocities[rows] for one in (a, b))
+    still = [one is None or not one.any() for one in (u, v)]
+    if all(still) or not all(expected):
+        return None
+    if any(still) or u is None or v is None:
+        return {"kind": "zero", "side": "AB"[still.index(True)]}
+    apart = v - u
+    bound = bound + _SAME_SPEED * float(np.sqrt((u**2).sum(axis=1).mean()))
+    if np.sqrt((apart**2).sum(axis=1)).max() <= bound:
+        return None
+    factor = float(np.vdot(u, v) / np.vdot(u, u))
+    alike = float(np.vdot(u, v) / np.sqrt(np.vdot(u, u) * np.vdot(v, v)))
+    rest = np.sqrt(((apart - np.median(apart, axis=0)) ** 2).sum(axis=1))
+    kind = "scaled" if abs(alike) > _PARALLEL and abs(factor - 1) > 1 - _PARALLEL else "other"
+    kind = "drawn" if abs(alike) * np.sqrt(u.size) < _UNRELATED else kind
+    kind = "common" if len(u) > 2 and rest.max() <= 2 * bound else kind
+    return {"kind": kind, "factor": factor, "correlation": alike}
+
+
+def explained(a: Frame, b: Frame, atoms: AtomIndices) -> tuple[float, Separation]:
+    """(share of the squares of displacements that a common shift explains, separation without it)."""
+    rest = separation(a, b, atoms, common_shift(a, b, atoms))
+    return 1.0 - (rest.typical / max(separation(a, b, atoms).typical, np.finfo(float).tiny)) ** 2, rest
+
+
+# ---- velocities
+
+
+def velocities_of(frame: Frame) -> Frame:
+    """A frame whose positions are the velocities of another, which has them."""
+    assert frame.velocities is not None
+    return Frame(frame.index, frame.time, frame.velocities, Box())
+
+
+class Flight(NamedTuple):
+    """Displacements between two frames next to what velocities say."""
+
+    moved: float  # root mean square displacement over that of velocities times time
+    factor: float  # displacements over the mean of both velocities times time, by least squares
+    parallel: float  # correlation of the two
+    kept: float  # correlation of the velocities with those of the frame before
+
+
+def flight_of(start: Frame, end: Frame, step: float = 0.0) -> Flight | None:
+    """How displacements between two frames compare with velocities; None without either, or without motion.
+
+    `moved` is near 1 where atoms fly straight and below it where they turn around in between: never far
+    above. `factor` is near 1 as long as velocities keep their direction, whichever units they have.
+    """
+    if start.velocities is None or end.velocities is None or not end.time > start.time:
+        return None
+    u, v, moved = start.velocities, end.velocities, displacements(start, end)
+    mean = (u + v) / 2 * (end.time - start.time)
+    if len(u) > 3:
+        # a file may have been centered since
+        mean, moved = mean - np.median(mean, axis=0), moved - np.median(moved, axis=0)
+    expected, size, uu, vv = (float(np.vdot(one, one)) for one in (mean, moved, u, v))
+    if not min(expected, size, uu, vv) > 0:
+        return None
+    resolved = size > moved.size * (_STEPS * step) ** 2
+    return Flight(
+        resolved * float(np.sqrt(size / uu)) / (end.time - start.time),
+        float(np.vdot(mean, moved)) / expected,
+        float(np.vdot(mean, moved)) / float(np.sqrt(expected * size)),
+        float(np.vdot(u, v)) / float(np.sqrt(uu * vv)),
+    )
+
+
+def odd_flight(flights: Sequence[Flight]) -> dict[str, Any] | None:
+    """Whether displacements contradict velocities and times, from their medians over some frames.
+
+    That atoms move less than their velocities say is no contradiction where they turn around between two
+    frames: it is one only where velocities have kept their directions, and displacements lie along them.
+
+    Returns:
+        the factor by which they are too large (or small, below 1), and whether it is a lower bound of it;
+        None where there is no contradiction.
+    """
+    if not flights:
+        return None
+    moved, factor, parallel, kept = np.median(np.array(flights), axis=0).tolist()
+    if kept > _KEPT and parallel > _ALONG:
+        return None if 1 / _TOO_FAR < factor < _TOO_FAR else {"factor": factor, "at_least": False}
+    return {"factor": moved, "at_least": True} if moved > _TOO_FAR else None
+
+
+# ---- over time
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How a separation grows: lines through its logarithm over time, and over the logarithm of time."""
+
+    frames: int  # used
+    rate: float  # of an exponential, per time
+    r2: float  # of its line
+    exponent: float | None  # of the power law that fits best; None where none is slow enough
+    power_r2: float
+    law: str  # "exponential" or "power", whichever leaves much less of the spread; else "either"
+
+
+def growth(
+    time: Float[np.ndarray, "frames"],
+    length: Float[np.ndarray, "frames"],
+    limit: float,
+    began: tuple[float, float],
+) -> Growth | None:
+    """The law by which a separation grows.
+
+    A force or a velocity that is wrong by a constant separates two runs as a low power of the time since
+    then; chaos does exponentially. Lengths of 0, and those above the limit, which are no small differences
+    any more, are left out.
+
+    Args:
+        began: times between which the two began to separate, where a power law begins.
+
+    Returns:
+        None with fewer than five frames.
+    """
+    use = (length > 0) & (length < limit) & np.isfinite(length)
+    if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
+        return None
+    x, y = time[use], np.log(length[use])
+    spread = max(float(np.sum((y - y.mean()) ** 2)), np.finfo(float).tiny)
+
+    def line(x: np.ndarray) -> tuple[float, float]:
+        slope, offset = np.polyfit(x, y, 1)
+        return float(np.sum((y - slope * x - offset) ** 2)) / spread, float(slope)
+
+    left, rate = line(x)
+    # where a power law begins is not seen if a file has rounded it away
+    longest = max(x[0] - began[0], np.finfo(float).tiny)
+    ahead = longest * np.geomspace(min(max((x[0] - began[1]) / longest, 1e-3), 1.0), 1.0, 40)
+    laws = [line(np.log(x - x[0] + one)) for one in ahead if x.min() == x[0] > began[0]]
+    slow, exponent = min((one for one in laws if 0 < one[1] <= _STEEPEST), default=(1.0, None))
+    law = "power" if slow * _BETTER < left else "either"
+    law = "exponential" if exponent is None or left * _BETTER < slow else law
+    return Growth(len(x), rate, 1.0 - left, exponent, 1.0 - slow, law)
