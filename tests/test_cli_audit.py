@@ -84,8 +84,8 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     arguments = ("audit", EMT, "-s", "cu.extxyz", "-o", "out", "--checks")
     assert call(*arguments, "forces,curl,state") == 130
     lines = printed(capsys)
-    expected = f"Stopped during curl. {EMT} (as far as asked: curl not asked, state not asked)"
-    assert lines[0].startswith(expected)
+    left = "1 of 15 ways of forces, curl not asked, state not asked"
+    assert lines[0].startswith(f"Stopped during curl. {EMT} on Cu4: nothing can be said yet ({left}).")
     assert any("mdnum audit --resume out" in line for line in lines)
     summary = json.loads((copper / "out/summary.json").read_text())
     assert {"what": "the check of state", "why": "stopped", "part": "state"} in summary["left_out"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,7 @@ Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 #: (what, why) of what was not asked, and why something was not that would have been.
 Skipped = tuple[str, str]
 TIME_UP = "the time was up"
+CALLS_UP = "the calls of this check were used up"
 
 
 def idle(done: int, total: int, info: dict[str, Any]) -> None:
@@ -35,6 +37,14 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 class TimeUp(Exception):
     """The time that a person gave has passed: what is in progress is left."""
+
+    why = TIME_UP
+
+
+class CallsUp(TimeUp):
+    """The calls that a check or a search may make have been made: what is in progress is left."""
+
+    why = CALLS_UP
 
 
 class CalculatorError(MdnumError):
@@ -54,30 +64,46 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Calls of a calculator by all of its objects, and the time that is left for more.
+    """Calls of a calculator by all of its objects, and the calls and the time that are left for more.
 
     Evidence is counted in calls, whatever the load of a machine; a deadline cuts it short.
     """
 
     calls: int = 0
     deadline: Deadline = field(default_factory=Deadline)
+    most: float = math.inf  # calls, after which what may be left is left
     _limited: int = 0
 
     def count(self) -> None:
         """Count a call.
 
         Raises:
-            TimeUp: the deadline has passed, and what is in progress may be left.
+            TimeUp: the deadline has passed, or the calls are used up, and what is in progress may be left.
         """
-        if self._limited and self.deadline.passed:
-            raise TimeUp
+        if self._limited:
+            self._check()
         self.calls += 1
+
+    def _check(self) -> None:
+        if self.deadline.passed:
+            raise TimeUp
+        if self.calls >= self.most:
+            raise CallsUp
+
+    @contextmanager
+    def apart(self, calls: int) -> Iterator[None]:
+        """What several checks rest on is found here: it has calls of its own, and takes none from a check."""
+        most, before = self.most, self.calls
+        self.most = before + calls
+        try:
+            yield
+        finally:
+            self.most = most + self.calls - before
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """One way of many is asked here: no call is made after the deadline, which raises `TimeUp`."""
-        if self.deadline.passed:
-            raise TimeUp
+        """One way of many is asked here: no call is made past a limit, which raises `TimeUp`."""
+        self._check()
         self._limited += 1
         try:
             yield
@@ -160,6 +186,10 @@ class AuditCheck:
 
     Attributes:
         order: checks with a lower one are asked before: what tells most by a call first.
+        basic: whether it has a brief form of a few dozen calls. The brief forms are asked before any check is
+            asked in full: with them there is an answer.
+        calls: that it may make at most.
+        brief: whether this is the brief form.
         needed_to: answers that are not known without this check, "run" or "differentiate".
         seed: of all that it draws.
         structures: that show a finding, by name; those of a pair end in -before and -after.
@@ -168,6 +198,9 @@ class AuditCheck:
     name: ClassVar[str]
     title: ClassVar[str]
     order: ClassVar[int] = 100
+    basic: ClassVar[bool] = False
+    calls: ClassVar[int] = 1000
+    brief = False
     needed_to: ClassVar[tuple[str, ...]] = ()
     seed = 0
 
@@ -187,6 +220,7 @@ class AuditCheck:
     def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
         """Ask it, with name, title and the time that it took."""
         began = perf_counter()
+        subject.meter.most = subject.meter.calls + self.calls
         found = self.ask(subject, progress or idle)
         found = replace(found, findings=[*found.findings, *_above_limits(found)])
         return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
@@ -228,6 +262,7 @@ class Ways:
         required: bool = False,
         failed: Callable[[Item, CalculatorError], None] | None = None,
         tolerant: bool = False,
+        most: int | None = None,
     ) -> dict[int, T]:
         """The answers about many items, by their place; those that come after the deadline are skipped.
 
@@ -239,18 +274,19 @@ class Ways:
             required: raise `TimeUp` where none could be asked.
             failed: called where the calculator fails; otherwise that is raised.
             tolerant: skip those on which it fails instead.
+            most: ask so many at most; the others are possible.
         """
         found: dict[int, T] = {}
         stride = 4 if spread else 1
         self.possible += len(items)
-        for done, place in enumerate(k for n in range(stride) for k in range(n, len(items), stride)):
+        for done, place in enumerate([k for n in range(stride) for k in range(n, len(items), stride)][:most]):
             item = items[place]
             progress(done, len(items), {"phase": phase, "unit": unit})
             try:
                 with subject.meter.limited():
                     found[place] = ask(item)
-            except TimeUp:
-                self.skip(name(item), TIME_UP)
+            except TimeUp as up:
+                self.skip(name(item), up.why)
                 continue
             except CalculatorError as error:
                 if tolerant:
@@ -261,7 +297,7 @@ class Ways:
                     failed(item, error)
             self.asked += 1
         if required and not self.asked:
-            raise TimeUp
+            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
         return dict(sorted(found.items()))
 
 
@@ -301,7 +337,7 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
     if "warning" in severities:
         return "with care"
     needed, begun = needed_to(question), {result.name for result in results}
-    if not needed <= set(wanted) or not needed <= begun:
+    if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
     return "yes" if needed <= asked else "as far as asked"
@@ -313,9 +349,9 @@ def largely_unasked(result: CheckResult) -> bool:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Whether a check is left of those that make up an answer; of others, none is to come."""
-    left = set(wanted) - {result.name for result in results}
-    return any(needed <= set(wanted) and left & needed for needed in map(needed_to, _QUESTIONS))
+    """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
+    begun, basic = {result.name for result in results}, {name for name in wanted if CHECKS[name].basic}
+    return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:

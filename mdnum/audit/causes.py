@@ -45,13 +45,14 @@ _REWRITTEN = (*_IMAGES, *_AMONG_MANY, *_RUN)
 CAUSES: dict[str, Cause] = {
     "NOT_REPEATABLE": Cause(
         ("STALE_STATE", "STALE_DYNAMICS", "PLACE_IN_LIST", "NEIGHBOR_CAP_BY_ORDER", "NEIGHBOR_CAP", "ORDER",
-         "TOPOLOGY_BY_ORDER", *_REWRITTEN, "MIRROR", "DUMMY_CELL", "ENERGY_STEP", "NOISE_FLOOR",
-         "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL", "STEEP_SWITCH", "LONELY_FORCE", "LONELY_ENERGY"),
+         "TOPOLOGY_BY_ORDER", *_REWRITTEN, "MIXED_PERIODICITY", "CHANGE_NOT_SEEN", "MIRROR", "DUMMY_CELL",
+         "ENERGY_STEP", "NOISE_FLOOR", "LOW_PRECISION", "QUANTIZED", "NOT_BIT_IDENTICAL", "STEEP_SWITCH",
+         "LONELY_FORCE", "LONELY_ENERGY"),
         rivals=("STALE_STATE", "LOW_PRECISION", "ORDER"), tests=("repeat",),
     ),
     "STALE_STATE": Cause(
-        ("STALE_DYNAMICS", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT"),
-        rivals=("NOT_REPEATABLE", "KEPT_ANSWER"), tests=("repeat", "fresh"),
+        ("STALE_DYNAMICS", "CHANGE_NOT_SEEN", "NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT"),
+        rivals=("NOT_REPEATABLE", "KEPT_ANSWER", "CHANGE_NOT_SEEN"), tests=("repeat", "fresh"),
     ),
     "PLACE_IN_LIST": Cause(
         ("ORDER", *_REWRITTEN, "LONELY_FORCE", "LONELY_ENERGY"),
@@ -67,12 +68,24 @@ CAUSES: dict[str, Cause] = {
         ("ORDER", *_REWRITTEN), rivals=("CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NOT_REPEATABLE"),
         tests=("repeat", "in range"),
     ),
-    "ORDER": Cause(_REWRITTEN, rivals=("NOT_REPEATABLE", "LOW_PRECISION")),
-    **{code: Cause((*_IMAGES[k + 1 :], *_AMONG_MANY, *_RUN)) for k, code in enumerate(_IMAGES)},
+    # parameters by order of appearance are others for parts that hold fewer species
+    "ORDER": Cause(
+        (*_REWRITTEN, "MIXED_PERIODICITY", "LONELY_ENERGY"), rivals=("NOT_REPEATABLE", "LOW_PRECISION")
+    ),
+    **{
+        code: Cause((*_IMAGES[k + 1 :], "MIXED_PERIODICITY", *_AMONG_MANY, *_RUN))
+        for k, code in enumerate(_IMAGES)
+    },
     # a structure is asked about with the vectors that it has, so that only other vectors show it
     "LEFT_HANDED": Cause(rivals=("LATTICE", "MIRROR"), tests=("determinant",)),
     "MIRROR": Cause(rivals=("LEFT_HANDED", "ROTATION"), tests=("determinant",)),
-    "DUMMY_CELL": Cause(),
+    "DUMMY_CELL": Cause(("MIXED_PERIODICITY",), rivals=("MIXED_PERIODICITY",)),
+    "MIXED_PERIODICITY": Cause(rivals=("DUMMY_CELL", "IMAGES", "EXTENSIVE")),
+    "CHANGE_NOT_SEEN": Cause(
+        rivals=("STALE_STATE", "KEPT_ANSWER", "NOT_REPEATABLE"), tests=("repeat", "fresh")
+    ),
+    "REUSED_BUFFER": Cause(rivals=("CHANGED_INPUT",)),
+    "RANDOM_SEEDED": Cause(rivals=("NOT_REPEATABLE",)),
     "TOPOLOGY_BY_ORDER": Cause(rivals=("ORDER", "PLACE_IN_LIST")),
     "WHOLE_MOLECULES": Cause(rivals=("IMAGES",)),
     "FORCES_NOT_GRADIENT": Cause(_FORCES, rivals=("PLACE_IN_LIST", "TWO_ENERGIES", "ENERGY_STEP")),

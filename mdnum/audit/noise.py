@@ -18,7 +18,7 @@ from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest,
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
 _SPACING = 1e-5
-_POINTS = 25
+_POINTS, _FEW_POINTS = 25, 9
 #: Of the standard deviation that differences over so many points give, the share of values that it rests on:
 #: neighboring differences share points, so that its square scatters like that of fewer.
 _INDEPENDENT = 0.28
@@ -92,7 +92,9 @@ class NoiseFloor:
         })  # fmt: skip
 
 
-def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
+def along_a_line(
+    subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
+) -> NoiseFloor:
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
     Args:
@@ -103,10 +105,10 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
     """
     line = direction(len(atoms), rng)
-    places = [displaced(atoms, (at - _POINTS // 2) * _SPACING * line) for at in range(_POINTS)]
+    places = [displaced(atoms, (at - points // 2) * _SPACING * line) for at in range(points)]
     answers = [subject.both(place) for place in places]
     energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
-    columns = np.array(forces).reshape(_POINTS, -1)
+    columns = np.array(forces).reshape(points, -1)
     energy = float(scatter(energies[:, None])[0])
     scatters = scatter(columns)
     force = float(np.max(scatters))
@@ -118,7 +120,7 @@ def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Genera
     floor, typical = np.finfo(float).eps, float(np.median(scatters))
     return NoiseFloor(
         max(energy, floor * largest(energies)), max(force, floor * largest(columns)), typical,
-        _INDEPENDENT * _POINTS,
+        _INDEPENDENT * points,
     )  # fmt: skip
 
 
@@ -274,7 +276,7 @@ def under_jitter(
 
 
 def settled(
-    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = 1
+    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = 1, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
     """The structure with its atoms moved a little, away from any threshold, and the noise there.
 
@@ -284,17 +286,18 @@ def settled(
 
     Args:
         at_least: atoms; a smaller cell is repeated, where it repeats.
+        brief: take the first draw, and do not look for steps.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
-    key = ("settled", len(given), str(rng.bit_generator.state))
+    key = ("settled", len(given), brief, str(rng.bit_generator.state))
     if key in subject.known:
         there, noise, rng.bit_generator.state = subject.known[key]
         return there.copy(), noise
     tried: list[tuple[Atoms, NoiseFloor]] = []
-    for _ in range(_TRIES):
+    for _ in range(1 if brief else _TRIES):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
-        noise = along_a_line(subject, there, rng)
+        noise = along_a_line(subject, there, rng, _FEW_POINTS if brief else _POINTS)
         if not tried or noise.energy < _QUIETER * tried[-1][1].energy:
             tried.append((there, noise))
         # quiet enough to be rounding; where it is not, a threshold on the line looks like noise as well
@@ -310,11 +313,12 @@ def settled(
         with contextlib.suppress(CalculatorError):
             noise = noise.louder(along_a_line(subject, many, rng))
     # what goes in steps may not move at all on so short a line
-    stairs = steps(subject, there)
-    noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
-    # another order of the same sum is rounded otherwise, which no line shows
-    subject.known["order"] = order_change(subject, there, noise, rng)
-    noise = noise.louder(subject.known["order"][1])
+    if not brief:
+        stairs = steps(subject, there)
+        noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
+        # another order of the same sum is rounded otherwise, which no line shows
+        subject.known["order"] = order_change(subject, there, noise, rng)
+        noise = noise.louder(subject.known["order"][1])
     subject.known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 
@@ -401,15 +405,19 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     both = Digits(None, max(one.bits for one in read.values())).format
     narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
     whose = next((word for word, name in narrow.items() if name), None)
+    loud, smooth = share > _NOISY * eps, not narrow["energies"] and ulps <= _NOISY
     change, floor = subject.known.get("order", (0.0, NoiseFloor(0.0, 0.0)))
     summed = floor.energy > 0
-    if whose is None and not (ulps > _NOISY and (share > _NOISY * eps or summed)):
+    if whose is None and not loud and not (ulps > _NOISY and summed):
         return
+    severity = "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info"
+    if loud and smooth:  # forces alone have lost what the energy they belong to still has
+        severity = "error" if share > _SMALL else "warning"
     yield finding(
         "LOW_PRECISION",
-        "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info",
+        severity,
         ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
-        "format" if whose else None,
+        "format" if whose else "forces" if smooth and not summed else None,
         tests=("rounding",),
         change=change,
         whose=whose,

@@ -123,8 +123,8 @@ class AuditState:
     timestep: float | None
     steps: int | None
     results: list[CheckResult] = field(default_factory=list)  # of the checks that are done
-    # of the check that a deadline cut short and that is asked again, as far as it was asked
-    cut: CheckResult | None = None
+    # by name: of checks that are not done, the brief form, or as far as a deadline let one be asked
+    cut: dict[str, CheckResult] = field(default_factory=dict)
     during: str | None = None  # check that was not finished, None if all are done
     why: str = ""  # it was not: "stopped", or the time was up; empty for an audit that goes on, or was killed
     failed: list[str] = field(default_factory=list)  # files of structures on which the calculator failed
@@ -139,8 +139,8 @@ class AuditState:
 
     @property
     def shown(self) -> list[CheckResult]:
-        """What is known: of checks that are done, and of one that was cut short."""
-        return [*self.results, *([self.cut] if self.cut is not None else [])]
+        """What is known: of checks that are done, and of those that were asked in brief or cut short."""
+        return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property
     def atoms(self) -> Atoms:

@@ -1,10 +1,7 @@
-"""What is asked about: a structure from a file or built for the calculator, two particles on a line."""
+"""What is asked about: a structure from a file, two particles on a line."""
 
 from __future__ import annotations
 
-import os
-import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
@@ -17,27 +14,9 @@ from jaxtyping import Float
 
 from mdnum.audit.base import CalculatorError, Skipped
 from mdnum.audit.curve import Curve
-from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
+from mdnum.audit.subject import CalculatorSubject
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
-
-#: Tried in this order, and then every other element: argon where anything goes.
-_FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
-_LAST_ELEMENT = 95
-_MOST_ATOMS, _FEWEST_ATOMS = 500, 32
-#: Å between molecules of water, as in the liquid.
-_SPACING = 3.1
-#: Molecules along an edge: some calculators want a box of two cutoffs.
-_WATER_EDGES = (4, 5, 6, 8)
-#: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
-_DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
-#: A nearest distance above the first part of the cutoff is made to be the second part of it.
-_BARELY, _PRESSED = 0.9, 0.6
-#: Seconds of processor time of a calculation above which the crystal is made smaller.
-_SLOW = 0.15
-#: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
-_RATTLE = 0.02
-
 
 #: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
 _SURROUNDINGS = ((False, False), (True, False), (True, True))
@@ -81,227 +60,8 @@ def read_structure(words: str | Path) -> Atoms:
         raise InputError(
             f"{what} has a number that is not finite", where=text, remedy="Correct the structure"
         )
-    return _labeled(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
-
-
-def default_structure(loaded: LoadedCalculator) -> Atoms:
-    """A structure for a calculator: its own, or a crystal of an element it takes, or rigid water.
-
-    The crystal is the element's, with the lattice at the calculator's own least energy, repeated until two
-    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` describes it. For a
-    calculator that fails on atoms without neighbors a denser crystal is built: that it fails is a finding,
-    and no reason to stop.
-
-    Raises:
-        InputError: the calculator answers for no element and not for water; where it was asked about water,
-            that is saved.
-    """
-    if loaded.atoms is not None:
-        return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
-    calculator = loaded.make()
-
-    def about(atoms: Atoms) -> CalculatorSubject:
-        return CalculatorSubject(loaded.name, lambda: calculator, atoms, kT=1.0)
-
-    likely, others = _symbols(calculator)
-    made = _first_crystal(about, likely)
-    why, saved = "", None
-    for edge in _WATER_EDGES if made is None else ():
-        subject = about(water(edge))
-        subject.saving = edge == _WATER_EDGES[-1]
-        try:
-            subject.energy(subject.atoms)
-        except CalculatorError as error:
-            why, saved = error.message, error.structure
-        else:
-            return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
-    # after water, since a calculator of molecules may take any atoms in threes for them
-    made = made or _first_crystal(about, others) or _first_crystal(about, likely, paired=False)
-    if made is None:
-        raise InputError(
-            "the calculator answers neither for atoms of any element nor for water "
-            f"({why}; saved in {saved})",
-            where=loaded.name,
-            remedy="Give a structure that it is made for: --structure FILE",
-        )
-    return made
-
-
-def _first_crystal(
-    about: Callable[[Atoms], CalculatorSubject], symbols: Sequence[str], paired: bool = True
-) -> Atoms | None:
-    """The crystal of the first element that is answered for, two atoms of it first where they are asked."""
-    for symbol in symbols:
-        subject = about(Atoms(symbol, [(0, 0, 0)]))
-        with subject.trying():
-            for pair in pairs(subject)[0][:1] if paired else [None]:
-                if (made := _crystal(subject, pair, symbol)) is not None:
-                    return made
-    return None
-
-
-def _labeled(atoms: Atoms, origin: str) -> Atoms:
-    copy = atoms.copy()
-    copy.info["origin"] = origin
-    return copy
-
-
-def water(edge: int = 4) -> Atoms:
-    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H."""
-    from ase.calculators.tip3p import angleHOH, rOH
-    from scipy.spatial.transform import Rotation
-
-    half = np.radians(angleHOH) / 2
-    flat = rOH * np.array([[0, 0, 0], [np.cos(half), np.sin(half), 0], [np.cos(half), -np.sin(half), 0]])
-    turns = Rotation.random(edge**3, rng=np.random.default_rng(0)).as_matrix()
-    corners = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    positions = np.concatenate([flat @ turn.T for turn in turns])
-    positions += np.repeat((corners + 0.5) * _SPACING, 3, axis=0)
-    return Atoms("OH2" * edge**3, positions, cell=[edge * _SPACING] * 3, pbc=True)
-
-
-def _symbols(calculator: object) -> tuple[list[str], list[str]]:
-    """Elements to try: those the calculator names and the usual ones, and all others."""
-    from ase.data import chemical_symbols
-
-    named: list[str] = []
-    for attribute in ("elements", "species", "symbols", "atom_types", "parameters"):
-        value = getattr(calculator, attribute, None)
-        if isinstance(value, dict | list | tuple | set):
-            words = [word for key in value for word in (key if isinstance(key, tuple) else (key,))]
-            named += [word for word in words if isinstance(word, str) and word in chemical_symbols[1:]]
-    likely = list(dict.fromkeys([*named, *_FIRST]))
-    return likely, [one for one in chemical_symbols[1:_LAST_ELEMENT] if one not in likely]
-
-
-def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atoms | None:
-    """The element's crystal, None where the calculator answers for it at no density."""
-    cutoff, least = (None, None) if pair is None else _felt(subject, pair)
-    cell, lattice = _unit_cell(symbol)
-    start = next((scale for scale in _DENSITIES if subject.answers(_small(cell, scale))), None)
-    if start is None:
-        return None
-    scale, relaxed = _least_energy(subject, cell, least, start)
-    for how in ((scale, relaxed, cutoff), (start, False, cutoff)):
-        made = _filled(cell, f"{symbol}, {lattice}", *how)
-        if not subject.answers(made):
-            continue
-        took = _processor_time(subject, made)
-        small = _filled(cell, f"{symbol}, {lattice}", *how, few=True)
-        # it is asked hundreds of times; narrower than two cutoffs, which not every calculator takes
-        if took <= _SLOW or len(small) >= len(made) or not subject.answers(small):
-            return made
-        why = f"; of {len(made)} atoms, for two cutoffs, one calculation takes {took:.2g} s of a processor"
-        return _labeled(small, small.info["origin"] + why)
-    return None
-
-
-def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Seconds of processor time of energy and forces, after the first; the less of two.
-
-    Programs that a calculator starts and ends count. What other programs do at the time does not, so that
-    the same structure is asked about whatever the load.
-    """
-
-    def clock() -> float:
-        children = os.times()
-        return time.process_time() + children.children_user + children.children_system
-
-    took = []
-    for _ in range(2):
-        atoms = atoms.copy()
-        atoms.positions[0, 0] += 1e-4
-        began = clock()
-        subject.both(atoms)
-        took.append(clock() - began)
-    return min(took)
-
-
-def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """As `rough`; of a calculator that fails on atoms without neighbors, the distance at which it does."""
-    try:
-        return rough(subject, pair)
-    except CalculatorError:
-        curve = pair.curve(subject)
-        for distance in np.arange(3.0, FARTHEST, 0.25):
-            try:
-                curve(float(distance))
-            except CalculatorError:
-                return float(distance), None
-        return None, None
-
-
-def _filled(
-    cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None, few: bool = False
-) -> Atoms:
-    """The crystal with its lattice scaled, repeated to two cutoffs or a few atoms, and displaced a little."""
-    cell = cell.copy()
-    tabulated = "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")
-    at = "at the calculator's own least energy" if relaxed else tabulated
-    if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
-        # nothing holds it together: a crystal in which nothing is felt would tell nothing
-        scale, at = _PRESSED * cutoff / _least_distance(cell), "nothing binds it, so pressed together"
-    cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
-    wanted = 0.0 if few else 2.05 * cutoff if cutoff else 12.0
-    edge = float(np.asarray(cell.cell).diagonal().min())
-    repeat = max(int(np.ceil(wanted / edge)), int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))))
-    repeat = max(min(repeat, int((_MOST_ATOMS / len(cell)) ** (1 / 3))), 1)
-    atoms = cell.repeat(repeat)
-    nearest = _least_distance(cell)
-    atoms.rattle(_RATTLE * nearest, seed=0)
-    return _labeled(
-        atoms,
-        f"{len(atoms)} atoms of {kind}, nearest distance {nearest:.4g} Å ({at}), "
-        f"displaced by {_RATTLE * nearest:.2g} Å",
-    )
-
-
-def _unit_cell(symbol: str) -> tuple[Atoms, str]:
-    """The element's crystal as a rectangular cell; fcc of its size where it has none of these."""
-    from ase.build import bulk
-    from ase.data import atomic_numbers, covalent_radii, reference_states
-
-    state = reference_states[atomic_numbers[symbol]]
-    if state is not None and state.get("symmetry") in ("fcc", "bcc", "diamond") and state.get("a"):
-        return bulk(symbol, cubic=True), state["symmetry"]
-    nearest = 2 * float(covalent_radii[atomic_numbers[symbol]])
-    return bulk(symbol, "fcc", a=nearest * np.sqrt(2), cubic=True), "fcc"
-
-
-def _least_distance(cell: Atoms) -> float:
-    """Smallest distance between two atoms of a crystal, images included."""
-    return nearest_distance(cell.repeat(2))
-
-
-def _least_energy(
-    subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
-) -> tuple[float, bool]:
-    """(factor on the lattice at which its energy is least, whether there was one), from a start on."""
-
-    def energy(scale: float) -> float:
-        try:
-            return subject.energy(_small(cell, scale))
-        except CalculatorError:
-            return np.inf
-
-    if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
-        start = least / _least_distance(cell)  # too far apart to feel one another: start at two atoms' own
-    scale, here = start, energy(start)
-    for direction in (1.03, 1 / 1.03):
-        for _ in range(60):
-            there = energy(scale * direction)
-            if not there < here:
-                break
-            scale, here = scale * direction, there
-    ended = np.isfinite(here) and 0.2 < scale / start < 5.0
-    return (scale, True) if ended else (start, False)
-
-
-def _small(cell: Atoms, scale: float) -> Atoms:
-    """A few atoms of a crystal whose lattice is scaled."""
-    small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
-    small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
-    return small
+    atoms.info["origin"] = f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}"
+    return atoms
 
 
 # -- two particles on a line, in which a calculator shows where its pair interaction changes -------
@@ -466,19 +226,6 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
     if first > len(places) - 4:
         curve(float(places[-4]))  # says why
     return places[first:], float(places[-1])
-
-
-def rough(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """(where a pair stops interacting, where its energy is least), to within a coarse scan; None if never."""
-    curve = pair.curve(subject)
-    coarse, far = coarse_scan(subject, curve)
-    energies, forces = curve.many(coarse)
-    energies = energies - curve(far)[0]
-    felt = np.flatnonzero((np.abs(energies) > 1e-12) | (np.abs(forces) > 1e-12))
-    cutoff = None if len(felt) == 0 or felt[-1] >= len(coarse) - 2 else float(coarse[felt[-1] + 1])
-    lowest = int(np.argmin(energies[coarse > 0.8])) + int((coarse <= 0.8).sum())
-    least = float(coarse[lowest]) if energies[lowest] < -1e-9 and lowest > 0 else None
-    return cutoff, least
 
 
 def group(atoms: Atoms) -> int | None:

@@ -189,6 +189,7 @@ class CalculatorSubject:
         meter: counts the calls of all objects.
         forgets: drop what a calculator's own test for changes calls unchanged, where a bit has changed.
         renews: make a new object after one that raised: some are of no use afterwards.
+        copies: ask about a copy of the atoms, and not about the object that is given.
         saving: save structures on which the calculator fails.
     """
 
@@ -206,7 +207,7 @@ class CalculatorSubject:
         self.folder = None if folder is None else Path(folder)
         self.known: dict[Any, Any] = {}
         self.repeats, self.meter = Repeats(), Meter()
-        self.forgets = self.renews = self.saving = True
+        self.forgets = self.renews = self.saving = self.copies = True
         self._make = make
         self._calculator: Any = None
         self._last: tuple[np.ndarray, ...] | None = None
@@ -225,7 +226,7 @@ class CalculatorSubject:
     def fresh(self) -> CalculatorSubject:
         """The same with a calculator object of its own, which remembers nothing."""
         other = copy.copy(self)
-        other.forgets = other.renews = True
+        other.forgets = other.renews = other.copies = True
         other._calculator = other._last = None
         return other
 
@@ -354,6 +355,18 @@ class CalculatorSubject:
             chance.typical = rms(now[1])
         return True
 
+    def returned(self, atoms: Atoms) -> dict[str, Any]:
+        """The very objects that the calculator gives back and keeps, by name; elsewhere copies are given.
+
+        Raises:
+            CalculatorError: as for `energy`.
+        """
+        asked = self._ask(atoms)
+        energies = self._answer(lambda: self._energies(asked), asked, "energy")
+        found = {"energy": energies[0], "forces": self._answer(asked.get_forces, asked, "forces")}
+        results = getattr(self.calculator, "results", None)
+        return found | ({f"results[{key!r}]": results[key] for key in results} if results else {})
+
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
 
@@ -368,7 +381,7 @@ class CalculatorSubject:
         return [word for word, before, after in both if before.tobytes() != after.tobytes()]
 
     def _ask(self, atoms: Atoms) -> Atoms:
-        asked = _bare(atoms)
+        asked = _bare(atoms) if self.copies else atoms
         bits = _bits(asked)
         same = self._last is not None and all(
             a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(bits, self._last, strict=True)

@@ -37,7 +37,7 @@ from mdnum.audit.subject import CalculatorSubject
 STEP = 0.025
 #: For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
 #: that stands out of it. A pair whose share is less than the fewest is not walked.
-_CALLS, _FEWEST_CALLS = 20_000, 1500
+_CALLS, _FEWEST_CALLS, WALKING_CALLS = 4000, 900, 4300
 #: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
 STEPS = 2.5
 #: Distances are walked down to where two particles cost so many kT.
@@ -151,9 +151,14 @@ def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Walk every pair of species through its distances; remembered for the subject."""
-    if "walks" in subject.known:
-        return subject.known["walks"]
+    """Walk every pair of species through its distances, by calls of their own; remembered for the subject."""
+    if "walks" not in subject.known:
+        with subject.meter.apart(WALKING_CALLS):
+            subject.known["walks"] = _walked(subject, progress)
+    return subject.known["walks"]
+
+
+def _walked(subject: CalculatorSubject, progress: Progress) -> PairWalks:
     found, skipped = pairs(subject)
     # those beyond the most frequent ones are skipped already
     ways = Ways(skipped, possible=sum(what.startswith("pair ") for what, _ in skipped))
@@ -180,8 +185,7 @@ def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWal
     not_walked = tuple("-".join(two) for two in species if frozenset(two) not in known)
     if any(one.pair.moves == "molecule" for one in walks):
         not_walked = ()
-    subject.known["walks"] = PairWalks(tuple(walks), ways, not_walked)
-    return subject.known["walks"]
+    return PairWalks(tuple(walks), ways, not_walked)
 
 
 def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:

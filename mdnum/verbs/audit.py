@@ -23,7 +23,7 @@ from mdnum.plain import plain
 from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Key, Page, Plot, Section, cell, curves, pairs, points_of, records
-from mdnum.report.words import count, heading, many, number
+from mdnum.report.words import count, heading, listed, many, number
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
 from mdnum.store.files import read_text, remove, subfolder, write_text
@@ -64,7 +64,8 @@ def audit(
     """Ask a calculator whether it is safe to run and to differentiate.
 
     How much is asked is counted in calls of the calculator and does not depend on how fast it answers: some
-    6,000 calls for one element. Whatever ends an audit, the checks that were done are in its folder.
+    6,000 calls for one element, and 12,000 at most. What leads to a verdict is asked first. Whatever ends an
+    audit, the checks that were done are in its folder.
 
     Args:
         calculator: as the command line names one, or a function that makes a new ASE calculator; may be left
@@ -117,7 +118,8 @@ def audit(
         raise InputError("no calculator is named", remedy="Name one, or resume an audit")
     loaded = _loaded(calculator)
     _internal(timestep, loaded.units)
-    atoms, wanted = _structure(structure, loaded), _wanted(checks)
+    # a quarter of the time, so that most is left for what it is asked
+    atoms, wanted = _structure(structure, loaded, Deadline(time and time / 4)), _wanted(checks)
     kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
     kT = kT if temperature is None else temperature * loaded.units.k_B
     state = AuditState(
@@ -154,15 +156,20 @@ def _ask_all(
         subject.known["thresholds"] = state.thresholds
     timestep = _internal(state.timestep, loaded.units)
     log = frame.logged(folder, progress)
-    earlier, state.during, state.why = state.cut, None, ""
-    for name in state.left:
+    state.during, state.why = next(iter(state.left), None), ""
+    # what leads to an answer first, in brief, and only then any check in full
+    first = [name for name in state.left if CHECKS[name].basic and name not in state.cut]
+    rounds = [(name, True) for name in first if len(state.left) > 1]
+    for name, brief in [*rounds, *((name, False) for name in state.left)]:
         check = CHECKS[name](timestep, state.steps)
+        check.brief = brief
         log(0, 0, {"phase": name})
         state.during = name
         try:
-            result = _repeatable(_ask(check, subject, log), subject, state.results)
+            others = [one for one in state.shown if one.name != name]
+            result = _repeatable(_ask(check, subject, log), subject, others)
         except KeyboardInterrupt:
-            if not state.results:
+            if not state.shown:
                 raise
             state.why = "stopped"
             break
@@ -170,14 +177,19 @@ def _ask_all(
             state.why = TIME_UP
             break
         _keep_evidence(folder, loaded, check)
-        if any(reason == TIME_UP for _, reason in result.skipped):
+        cut = any(reason == TIME_UP for _, reason in result.skipped)
+        if not result.asked and name in state.cut:  # its calls were used up: the brief form is what is known
+            result = replace(state.cut[name], skipped=result.skipped)
+        if brief or cut:
             # asked again, and not as far: what was known stays known
-            again = earlier if earlier is not None and earlier.name == name else result
-            state.cut, state.why = max(again, result, key=lambda one: one.asked), TIME_UP
+            again = state.cut.get(name, result)
+            state.cut[name] = max(again, result, key=lambda one: one.asked)
+        else:
+            state.results.append(result)
+            state.cut.pop(name, None)
+        if cut:
+            state.why = TIME_UP
             break
-        state.results.append(result)
-        if state.cut is not None and state.cut.name == name:
-            state.cut = None
         if name == "smoothness":
             state.thresholds = find_thresholds(subject)
         state.failed = sorted(path.name for path in (folder.path / "structures").glob("failed-*.extxyz"))
@@ -185,8 +197,6 @@ def _ask_all(
         answers.save()
         summary = plain(_summary(state))
         _judge(AuditView(folder, summary, given=state)).store(folder, summary)
-    if state.cut is not None and state.during is None:
-        state.cut = None
     answers.save()
     frame.store(folder, _summary(state), _tables(state))
     outcome = frame.finish(
@@ -199,10 +209,16 @@ def _ask_all(
 
 def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
-    from mdnum.audit.base import CalculatorError, CheckResult, finding
+    from mdnum.audit.base import CalculatorError, CallsUp, CheckResult, finding
 
+    named: dict[str, Any] = {"name": check.name, "title": check.title}
     try:
         return check(subject, log)
+    except CallsUp as up:
+        return CheckResult(
+            (["calls_up"], {"calls": check.calls}), skipped=[(f"the rest of {check.name}", up.why)], asked=0,
+            **named,
+        )  # fmt: skip
     except CalculatorError as error:
         values = {"check": check.name, "why": error.message}
         values["file"] = error.structure.name if error.structure else ""
@@ -211,8 +227,7 @@ def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> 
             (["failed"], values),
             [finding("CALCULATOR_FAILED", "error", saved, **values)],
             skipped=[(f"the rest of {check.name}", error.message)],
-            name=check.name,
-            title=check.title,
+            **named,
         )
 
 
@@ -286,15 +301,16 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
     return _loaded(state.name if calculator is None else calculator)
 
 
-def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator) -> Atoms:
+def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, deadline: Any) -> Atoms:
     from ase import Atoms
 
-    from mdnum.audit.structures import default_structure, read_structure
+    from mdnum.audit.building import default_structure
+    from mdnum.audit.structures import read_structure
 
     if isinstance(structure, Atoms):
         found = structure
     else:
-        found = default_structure(loaded) if structure is None else read_structure(structure)
+        found = default_structure(loaded, deadline) if structure is None else read_structure(structure)
     if not len(found):
         raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
     return found
@@ -314,7 +330,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
-    from mdnum.audit.base import answers
+    from mdnum.audit.base import TIME_UP, answers, to_come
 
     atoms, given = state.atoms, units.get(state.units)
     said = answers(state.shown, state.checks)
@@ -322,8 +338,9 @@ def _summary(state: AuditState) -> dict[str, Any]:
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
     rest = [{"what": f"the check of {name}", "why": why, "part": name} for name in left]
     found = [(one, one.name) for one in state.shown]
-    unfinished = "stopped" if state.why == "stopped" else "unfinished"
-    status = "complete" if state.during is None else unfinished
+    early = frame.UNDECIDED if to_come(state.shown, state.checks) else frame.PARTIAL
+    status = {"stopped": "stopped", TIME_UP: early}.get(state.why, "unfinished")
+    status = "complete" if state.during is None else status
     return _in_units(
         {
             "system": state.name,
@@ -459,17 +476,18 @@ def _judge(view: AuditView) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    from mdnum.audit.base import TIME_UP, answers, largely_unasked, to_come
+    from mdnum.audit.base import CALLS_UP, TIME_UP, answers, largely_unasked, to_come
 
-    said = answers(state.shown, state.checks)
+    said, formula = answers(state.shown, state.checks), state.atoms.get_chemical_formula()
+    name = TEXTS("on", name=state.name, formula=formula)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
     asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
     if len(set(slugs.values())) == 1:
-        head = TEXTS(f"same_{slugs['run']}", name=state.name)
+        head = TEXTS(f"same_{slugs['run']}", name=name)
     elif len(asked) == 1:
-        head = TEXTS("one", name=state.name, answer=asked[0])
+        head = TEXTS("one", name=name, answer=asked[0])
     else:
-        head = TEXTS("both", name=state.name, run=asked[0], differentiate=asked[1])
+        head = TEXTS("both", name=name, run=asked[0], differentiate=asked[1])
     begun = {one.name for one in state.shown}
     left = [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
 
@@ -479,7 +497,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         ]
 
     if state.shown and not asked and to_come(state.shown, state.checks):
-        head = TEXTS("nothing_yet", name=state.name, ways=", ".join([*ways(state.shown), *left]))
+        head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
         return _unfinished(state, head, TIME_UP)
     rest = ", ".join([*ways(one for one in state.shown if largely_unasked(one)), *left])
     if rest:
@@ -502,6 +520,9 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         head = TEXTS("found_nothing", head=head, checks=len(state.shown))
     else:
         head = TEXTS("nothing_asked", head=head)
+    refused = sum(why not in (TIME_UP, CALLS_UP) for one in state.shown for _, why in one.skipped)
+    head += " " + TEXTS("unasked", elements=listed(list(dict.fromkeys(state.atoms.symbols))))
+    head += " " + TEXTS("refused", n=refused) if refused else ""
     return _unfinished(state, head, TIME_UP)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -488,3 +489,123 @@ class ThroughAtoms(Good):
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         assert atoms is not None and atoms.calc is self, "not attached"
         super().calculate(atoms, properties, system_changes)
+
+
+# -- questions about the caller's atoms, arrays and random numbers, and about some axes that repeat ----
+
+
+def flagged(rule: Callable[[np.ndarray], Any]) -> type[Any]:
+    """Periodicity as one flag for all axes: rule(pbc)."""
+
+    def answer(self, atoms):
+        one = Atoms(atoms.numbers, atoms.positions, cell=atoms.cell, pbc=False)
+        one.pbc = bool(rule(atoms.pbc)) and atoms.cell.rank == 3
+        return Good.answer(self, one)
+
+    return but(answer=answer)
+
+
+#: One periodic axis makes all periodic, or all have to be for any.
+AnyForAll, AllOrNone = flagged(np.any), flagged(np.all)
+
+
+class CompletesCell(Good):
+    """Vectors of length 0 become unit vectors, and then all axes repeat."""
+
+    def answer(self, atoms):
+        lengths = atoms.cell.lengths()
+        if not atoms.pbc.any() or lengths.all():
+            return super().answer(atoms)
+        cell = np.where((lengths > 0)[:, None], atoms.cell.array, 3.0 * np.eye(3))
+        return super().answer(Atoms(atoms.numbers, atoms.positions, cell=cell, pbc=True))
+
+
+class WrapsFreeAxes(Good):
+    """Wraps along all axes of a cell, those that do not repeat included."""
+
+    def positions(self, atoms):
+        if atoms.cell.rank < 3 or not atoms.pbc.any():
+            return super().positions(atoms)
+        shares = atoms.positions @ np.linalg.inv(atoms.cell.array)
+        return atoms.positions - np.floor(shares) @ atoms.cell.array
+
+
+class ByPresence(Good):
+    """Numbers species by those that are there, sorted: without the first the second has its parameters."""
+
+    def weight(self, atoms, i, j):
+        size = 1.0 + 0.05 * np.searchsorted(np.unique(atoms.numbers), atoms.numbers)
+        return size[i] * size[j]
+
+
+class ByIdentity(Good):
+    """Remembers answers by the object that it was asked about."""
+
+    def get_property(self, name, atoms=None, allow_calculation=True):
+        memory = vars(self).setdefault("memory", {})
+        if id(atoms) not in memory:
+            memory[id(atoms)] = atoms, self.answer(atoms)
+        energy, forces = memory[id(atoms)][1]
+        return forces.copy() if name == "forces" else energy
+
+
+def reading(read: Callable[[Atoms], float]) -> type[Any]:
+    """Depends on what ASE's test for changes does not look at."""
+    return adding(lambda atoms, e, f: (e * (1 + 0.1 * read(atoms)), f * (1 + 0.1 * read(atoms))))
+
+
+ReadsTags = reading(lambda atoms: float(np.sum(atoms.get_tags())))
+ReadsCharge = reading(lambda atoms: float(atoms.info.get("charge", 0)))
+ReadsSpin = reading(lambda atoms: float(atoms.info.get("spin", 1) - 1))
+
+
+class OneBuffer(Good):
+    """Returns its only array of forces."""
+
+    def get_forces(self, atoms):
+        forces = self.get_property("forces", atoms)
+        if getattr(self, "buffer", np.zeros(0)).shape != forces.shape:
+            self.buffer = np.zeros_like(forces)
+        self.buffer[:] = forces
+        return self.buffer
+
+
+class GivesResults(Good):
+    """Returns what it keeps: a caller that adds a bias to its forces changes the next answer."""
+
+    def get_forces(self, atoms):
+        self.get_property("forces", atoms)
+        return self.results["forces"]
+
+
+def calling(what: Callable[[], Any]) -> type[Any]:
+    """Does something at every call."""
+
+    def answer(self, atoms):
+        what()
+        return Good.answer(self, atoms)
+
+    return but(answer=answer)
+
+
+SeedsNumpy = calling(lambda: np.random.seed(0))  # noqa: NPY002
+SeedsPython = calling(lambda: random.seed("md"))
+DrawsNumpy = calling(lambda: np.random.rand())  # noqa: NPY002
+
+
+class SeedsAtFirst(Good):
+    """Seeds a generator that is not its own when it is made."""
+
+    def __init__(self):
+        super().__init__()
+        np.random.seed(3)  # noqa: NPY002
+
+
+def pairs_in(dtype: Any) -> type[Any]:
+    """Forces of pairs in a narrow format, summed in double precision under an energy in double precision."""
+
+    def pair(self, distances):
+        u, slope = Good.pair(self, distances)
+        return u, slope.astype(dtype).astype(float)
+
+    return but(pair=pair)

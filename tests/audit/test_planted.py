@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms
-from ase.build import bulk
+from ase.build import bulk, fcc111
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.calculators.tip3p import TIP3P, angleHOH, rOH
@@ -14,11 +14,12 @@ from ase.neighborlist import neighbor_list
 from audit import planted
 from audit.planted import Good, Single, asked, but, chain, codes, crystal, decimals, subject, values
 
+from mdnum.audit.building import water
 from mdnum.audit.checks import CHECKS, invariance
+from mdnum.audit.checks.alone import Alone
 from mdnum.audit.checks.smoothness import SmoothnessCheck
-from mdnum.audit.checks.state import Alone, all_sequences
 from mdnum.audit.noise import NoiseFloor
-from mdnum.audit.structures import water
+from mdnum.audit.sequences import all_sequences
 from mdnum.audit.subject import CalculatorError
 
 ROWS = "One object, asked again and again, beside new ones"
@@ -61,6 +62,26 @@ class Once(Good):
         if len(atoms) < self.seen - 3:
             raise IndexError("index 12 is out of bounds")
         return super().answer(atoms)
+
+
+class KeepsCell(Good):
+    """Keeps the cell of the last structure for a molecule, which has none."""
+
+    cell = None
+
+    def answer(self, atoms):
+        if atoms.cell.rank == 3 and atoms.pbc.all():
+            self.cell = atoms.cell.array.copy()
+        if self.cell is not None and not atoms.cell.array.any():
+            atoms = Atoms(atoms.numbers, atoms.positions, cell=self.cell, pbc=True)
+        return super().answer(atoms)
+
+
+def slab() -> Atoms:
+    """Two layers that repeat along two axes, with a gap that is wider than the cutoff on both sides."""
+    atoms = fcc111("Ar", (2, 2, 2), a=3.9, vacuum=6.0)
+    atoms.pbc = (True, True, False)
+    return atoms
 
 
 class Bonds(Good):
@@ -125,11 +146,11 @@ def found_by(check, make, atoms: Atoms, order: int | None = 4) -> dict[str, str]
     return codes(result)
 
 
-@pytest.mark.parametrize("name", ["invariance", "forces", "curl", "state"])
+@pytest.mark.parametrize("name", ["invariance", "periodicity", "forces", "curl", "state", "alone", "caller"])
 @pytest.mark.parametrize("atoms", [crystal(), chain()], ids=["crystal", "chain"])
 def test_what_is_right_passes(name: str, atoms: Atoms):
     result = asked(name, Good, atoms)
-    assert not result.findings and result.asked == result.possible > 10
+    assert not result.findings and result.asked == result.possible > 3
     expected = {"invariance": ["invariance_right"], "state": ["state_none", "state_repeated"]}
     assert result.says[0] == expected.get(name, result.says[0])
     assert name != "state" or result.numbers["bit_identical"]
@@ -162,7 +183,7 @@ def test_what_is_right_passes(name: str, atoms: Atoms):
         case("curl", planted.NoSwitchInForce),
         case("state", planted.HalfSkin, night=True),
         case("state", planted.HalfSkin, chain()),
-        case("state", planted.WrapsGiven, chain()),
+        case("caller", planted.WrapsGiven, chain()),
         # answers that go in steps are found whatever they look like; from an energy alone no force comes
         case("forces", planted.HalfPrecision, QUANTIZED="error", night=True),
         case("forces", planted.HalfInOtherUnits, QUANTIZED="error"),
@@ -233,11 +254,48 @@ def test_what_is_said_and_nothing_else(name: str, make, atoms: Atoms, expected: 
         case("state", Breaks, BROKEN_BY_FAILURE="info", STALE_STATE=None),
         # what nobody answers is no memory
         case("state", planted.OnlyRectangles, STALE_STATE=None),
-        case("state", planted.MeanNeighbor, LONELY_NOT_FINITE="error"),
-        case("state", planted.EmptyList, LONELY_FAILS="warning"),
-        case("state", planted.Background, LONELY_ENERGY="warning"),
-        case("state", planted.Whirl, LONELY_FORCE="error"),
-        case("state", planted.WrapsGiven, CHANGED_INPUT="error"),
+        case("alone", planted.MeanNeighbor, LONELY_NOT_FINITE="error"),
+        case("alone", planted.EmptyList, LONELY_FAILS="warning"),
+        case("alone", planted.Background, LONELY_ENERGY="warning"),
+        case("alone", planted.Whirl, LONELY_FORCE="error"),
+        case("caller", planted.WrapsGiven, CHANGED_INPUT="error"),
+        # one flag for all axes, whichever axis it is taken from
+        *(
+            case("periodicity", make, atoms, MIXED_PERIODICITY="error")
+            for make in (planted.AnyForAll, planted.AllOrNone, planted.flagged(lambda pbc: pbc[0]))
+            for atoms in (crystal(), slab())
+        ),
+        case("periodicity", planted.AnyForAll, chain(), MIXED_PERIODICITY="error"),
+        case("periodicity", planted.flagged(lambda pbc: pbc[2]), MIXED_PERIODICITY="error"),
+        *(
+            case("periodicity", make, atoms, MIXED_PERIODICITY="error")
+            for make in (planted.CompletesCell, planted.WrapsFreeAxes)
+            for atoms in (crystal(), chain(), slab())
+        ),
+        case("state", KeepsCell, STALE_STATE="error"),
+        case("alone", planted.ByPresence, mixed(crystal(), 1, 3, 5, 7), LONELY_ENERGY="warning"),
+        *(
+            case("caller", make, atoms, **{code: severity})
+            for atoms in (crystal(), chain())
+            for make, code, severity in (
+                (planted.ByIdentity, "CHANGE_NOT_SEEN", "error"),
+                (planted.ReadsTags, "CHANGE_NOT_SEEN", "error"),
+                (planted.ReadsCharge, "CHANGE_NOT_SEEN", "error"),
+                (planted.ReadsSpin, "CHANGE_NOT_SEEN", "error"),
+                (planted.OneBuffer, "REUSED_BUFFER", "error"),
+                (planted.GivesResults, "REUSED_BUFFER", "error"),
+                (planted.SeedsNumpy, "RANDOM_SEEDED", "error"),
+                (planted.SeedsPython, "RANDOM_SEEDED", "error"),
+                (planted.SeedsAtFirst, "RANDOM_SEEDED", "warning"),
+                (planted.DrawsNumpy, "RANDOM_SEEDED", "info"),
+            )
+        ),
+        # what comes by chance is no change that was not seen
+        case("caller", planted.drops(0.3, 7), CHANGE_NOT_SEEN=None),
+        *(
+            case("forces", planted.pairs_in(dtype), LOW_PRECISION=severity, FORCES_NOT_GRADIENT=None)
+            for dtype, severity in ((np.float32, "warning"), (np.float16, "error"))
+        ),
         # one call in fifty is chance and no memory
         *(
             case(
@@ -302,7 +360,9 @@ def test_who_answers_through_atoms_alone_is_asked_through_atoms(make, name: str)
 def test_a_structure_with_room_does_not_hide_the_nearest_image(make, expected, monkeypatch):
     rng = np.random.default_rng(0)
     monkeypatch.setattr(invariance, "all_of", lambda atoms, *_: invariance.narrow(atoms, rng))
-    assert codes(asked("invariance", make, bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2))) == expected
+    wide = bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2)
+    for atoms in (wide, mixed(wide.copy(), *range(0, 32, 2))):
+        assert codes(asked("invariance", make, atoms)) == expected
 
 
 def test_a_shell_on_the_cutoff_is_shown_by_an_ulp_of_the_cell():

@@ -16,10 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
+from mdnum.audit.building import default_structure
 from mdnum.audit.checks.smoothness import figures, place, reach
 from mdnum.audit.curve import Curve, bisect, find_jumps, smallest_steps
 from mdnum.audit.record import load_calculator
-from mdnum.audit.structures import Pair, default_structure, trio
+from mdnum.audit.structures import Pair, trio
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.surroundings import EnvironmentWalks
 from mdnum.audit.thresholds import STEP, PairWalk, find_thresholds, walk, walk_pairs

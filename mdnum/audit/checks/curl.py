@@ -51,23 +51,34 @@ class Loop:
 class CurlCheck(AuditCheck):
     """Do the forces work around closed loops?"""
 
-    name, title, order = "curl", "Curl", 40
+    name, title, order, basic, calls = "curl", "Curl", 20, True, 500
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """The circulation of the forces in planes of all kinds."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
-        atoms, noise = settled(worker, rng, at_least=FEW)
-        ways = Ways()
-        wanted = list(_planes(worker, atoms, rng))
+        radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
+        with subject.meter.limited():
+            atoms, noise = settled(worker, rng, at_least=FEW, brief=self.brief)
+            wanted = list(_planes(worker, atoms, rng))
 
         def asked(plane: tuple[str, Displacement, Displacement]) -> Loop:
             name, u, v = plane
-            return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in _RADII])
+            return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in radii])
 
         name = lambda plane: f"a loop of {plane[0]}"  # noqa: E731
-        found = ways.each(worker, wanted, name, asked, progress, self.name, spread=True, required=True)
+        found = ways.each(
+            worker,
+            wanted,
+            name,
+            asked,
+            progress,
+            self.name,
+            spread=True,
+            required=True,
+            most=1 if self.brief else None,
+        )
         loops = list(found.values())
         wrong = [one for one in loops if not one.conservative]
         worst = max(wrong, key=lambda one: one.share, default=None)

@@ -19,15 +19,18 @@ from jaxtyping import Float, Int
 from mdnum.audit.base import AuditCheck, CalculatorError, Chart, CheckResult, Observed, Progress, finding
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.energy import Drift, EnergyBalance, NveRun, balance, crossings, drift, ratio, wandering
-from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, direction, displaced, roomy
+from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, direction, displaced, roomy, settled
 from mdnum.audit.structures import group
 from mdnum.audit.subject import CalculatorSubject, largest, rms
 from mdnum.audit.thresholds import PairThreshold, find_thresholds
+from mdnum.units import Units
 
 #: Of a run where nobody says how many. A step takes some six calls: two in the run of half the time step,
 #: warming up, work on the way.
 _STEPS = 200
 _COMPARED = 12
+#: Of the brief form: steps, structures on their way that new objects are asked about, power iterations.
+_FEW_STEPS, _FEW_COMPARED, _FEW_ITERATIONS = 16, 2, 3
 #: Share of the thermal energy of an atom that may drift away in a ps before a run is not one at constant
 #: energy: within 100 ps all of it.
 _MUCH = 1e-2
@@ -58,7 +61,7 @@ class DynamicsCheck(AuditCheck):
     quarter with half the time step, which a second run tests.
     """
 
-    name, title, order = "dynamics", "Dynamics", 60
+    name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
@@ -68,24 +71,26 @@ class DynamicsCheck(AuditCheck):
 
     def _ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         rng = np.random.default_rng(self.seed)
-        limits, unknown = _limits(subject)
+        limits, unknown = ([], "") if self.brief else _limits(subject)
         atoms = roomy(subject.atoms, FEW)
         held = rigid(atoms) if _only_molecules(subject) else None
         worker = subject.fresh()
-        fitting, period = fitting_timestep(worker, atoms, rng)
+        iterations = _FEW_ITERATIONS if self.brief else _POWER_ITERATIONS
+        fitting, period = fitting_timestep(worker, atoms, rng, iterations)
         start = prepared(worker, atoms, held, period, rng)
         step = fitting if self.timestep is None else self.timestep
         if not np.isfinite(step):
             why = "no force and no thermal motion: there is nothing to integrate"
             return CheckResult(says=(["dynamics_nothing"], {}), skipped=[("a run", why)])
-        count = self.steps or _STEPS
+        count = _FEW_STEPS if self.brief else self.steps or _STEPS
         total = 3 * count + count // 4
 
         def each(before: int):
             return lambda reached: progress(before + reached, total, {"phase": "dynamics", "unit": "steps"})
 
-        # from where it was given, a structure relaxes; that is no drift
-        _, start = run(worker, start, step, count // 4, each(0))
+        if not self.brief:
+            # from where it was given, a structure relaxes; that is no drift
+            _, start = run(worker, start, step, count // 4, each(0))
         whole, _ = run(subject.fresh(), start, step, count, each(count // 4))
         if whole.blown_up:
             after = len(whole.potential) - 1
@@ -96,6 +101,9 @@ class DynamicsCheck(AuditCheck):
                 findings=[finding("BLEW_UP", "error", **values)],
                 numbers={"steps": after, "blew_up": True, "drift": None},
             )
+        if self.brief:
+            noise = settled(subject.fresh(), np.random.default_rng(self.seed), FEW, brief=True)[1]
+            return _brief(whole, _aged(subject, whole, _FEW_COMPARED, noise), subject.units)
         half, _ = run(subject.fresh(), start, step / 2, 2 * count, each(count + count // 4))
         probe = subject.fresh()
         noise = along_a_line(probe, whole.at(start.positions), rng)
@@ -103,16 +111,27 @@ class DynamicsCheck(AuditCheck):
         found = balance(probe, whole, limits, rng, noise.allowed.energy)
         # the other run's flips count only where they bring energy
         finer = crossings(half, limits) if any(one.order == 0 for one in limits) else []
-        # largest difference of the run's energies from those of objects that saw nothing else
-        places = np.unique(np.linspace(0, len(whole.potential) - 1, _COMPARED).astype(int))
-        again = [subject.fresh().energy(whole.at(whole.positions[n])) for n in places]
-        stale = largest(np.array(again) - whole.potential[places])
-        rounding = NoiseFloor(np.finfo(float).eps * largest(whole.potential), 0.0)
-        allowed = noise.louder(rounding).allowed.energy
+        stale = _aged(subject, whole, _COMPARED, noise)
         brought = found.by_means(finer, len(half.potential))
-        return TwoRuns(subject, whole, half, found, brought, limits, (stale, allowed), noise, period).outcome(
-            unknown
-        )
+        return TwoRuns(subject, whole, half, found, brought, limits, stale, noise, period).outcome(unknown)
+
+
+def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
+    """Largest difference of a run's energies from those of new objects, and what noise allows, eV."""
+    places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
+    again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
+    rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
+    return largest(np.array(again) - ran.potential[places]), noise.louder(rounding).allowed.energy
+
+
+def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
+    """What a few steps tell: that they were answered, and by what does not depend on the steps before."""
+    (differs, allowed), steps = stale, len(ran.potential) - 1
+    change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
+    old = [finding("STALE_DYNAMICS", "error", differs=differs, allowed=allowed)] if differs > allowed else []
+    values: dict[str, Any] = {"steps": steps, "change": change, "stale": differs}
+    values |= {"timestep": ran.timestep / units.time_factor, "time_unit": units.time}
+    return CheckResult(says=(["dynamics_brief"], values), findings=old, numbers=values, possible=2)
 
 
 def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
@@ -400,14 +419,14 @@ def prepared(
 
 
 def fitting_timestep(
-    subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
+    subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
     """A time step for a structure, internal time, and the period of its fastest vibration (inf for none)."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
     square = 0.0
-    for _ in range(_POWER_ITERATIONS):
+    for _ in range(iterations):
         # mass-weighted second derivative along the mode, by a central difference of forces
         step = mode / roots
         size = 1e-3 / np.max(np.abs(step))

@@ -92,35 +92,37 @@ class ForcesCheck(AuditCheck):
     the energy, not a wrong force, and is reported as such.
     """
 
-    name, title, order = "forces", "Forces", 30
+    name, title, order, basic, calls = "forces", "Forces", 10, True, 500
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Forces against central differences, extrapolated, and sums that must vanish."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
-        atoms, noise = settled(worker, rng, at_least=FEW)
         ways = Ways()
-        summed = 0.0 if steps(worker, atoms).energy else worker.known["order"][1].energy
-        if 2 * summed / _LADDER[2] > _DROWNED * rms(worker.forces(atoms)):
-            # the rounding of a long sum grows with the number of atoms, and hides the force on one of them
-            try:
-                with worker.trying():
-                    fewer, other = _fewer(worker, atoms, rng)
-                if other.energy < 0.5 * noise.energy:
-                    ways.skip(
-                        f"forces on {len(atoms)} atoms", f"rounding hides them; {len(fewer)} were taken"
-                    )
-                    atoms, noise = fewer, other
-            except CalculatorError:
-                pass  # it takes no cluster
-        forces = worker.forces(atoms)
+        with subject.meter.limited():
+            atoms, noise = settled(worker, rng, at_least=FEW, brief=self.brief)
+            summed = 0.0
+            if not self.brief and not steps(worker, atoms).energy:
+                summed = worker.known["order"][1].energy
+            if 2 * summed / _LADDER[2] > _DROWNED * rms(worker.forces(atoms)):
+                # rounding of a long sum grows with the number of atoms, and hides the force on one of them
+                try:
+                    with worker.trying():
+                        fewer, other = _fewer(worker, atoms, rng)
+                    if other.energy < 0.5 * noise.energy:
+                        why = f"rounding hides them; {len(fewer)} were taken"
+                        ways.skip(f"forces on {len(atoms)} atoms", why)
+                        atoms, noise = fewer, other
+                except CalculatorError:
+                    pass  # it takes no cluster
+            forces = worker.forces(atoms)
         scale = rms(forces)
         wanted = list(_directions(atoms, rng))
         found = ways.each(
             worker, wanted, lambda way: f"moving {way[0]}",
             lambda way: slope(worker, atoms, way[1], forces, noise, way[0]),
-            progress, self.name, spread=True, required=True,
+            progress, self.name, spread=True, required=True, most=1 if self.brief else None,
         )  # fmt: skip
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = list(_judged_sums(sums, scale))
@@ -133,7 +135,7 @@ class ForcesCheck(AuditCheck):
         # of directions in which one atom moves: to within what differences typically tell its force
         single = [one.error for one in slopes if not one.direction.startswith("all")]
         known = float(np.median(single)) if single else 0.0
-        drowned = _drowned(worker, atoms, noise, known, scale)
+        drowned = [] if self.brief else _drowned(worker, atoms, noise, known, scale)
         unclear = [
             one
             for place, one in found.items()
@@ -146,9 +148,11 @@ class ForcesCheck(AuditCheck):
             *drowned,
             *_judged(slopes, scale, places),
             *wrong_sums,
-            *([] if any(one.severity == "error" for one in drowned) else precision(worker, atoms, noise)),
-            *_two_energies(worker, atoms, noise, wanted[first][1], found[first]),
         ]
+        if not self.brief:
+            if not any(one.severity == "error" for one in drowned):
+                observed += precision(worker, atoms, noise)
+            observed += _two_energies(worker, atoms, noise, wanted[first][1], found[first])
         values = _values(slopes, unclear, scale)
         if unclear and not observed:  # otherwise that is why
             observed.append(finding("NOISE_FLOOR", "warning", "some", **values))

@@ -37,7 +37,7 @@ _FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
-    name, title, order = "smoothness", "Smoothness", 20
+    name, title, order, calls = "smoothness", "Smoothness", 50, 2500
     needed_to = ("differentiate",)
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2
@@ -49,11 +49,11 @@ class SmoothnessCheck(AuditCheck):
             raise TimeUp
         find_thresholds(subject)
         ways = deepcopy(walks.ways)
-        around = walk_surroundings(subject, progress, ways, routes=self.routes)
         left = len(ways.skipped)
         crowds = crowd(subject, progress, ways, self.neighbors)
         if not crowds and len(ways.skipped) == left:
             ways.skip("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
+        around = walk_surroundings(subject, progress, ways, routes=self.routes)
         kT = subject.kT
         says, numbers = figures(walks, around, crowds, kT)
         return CheckResult(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import (
+    CALLS_UP,
     TIME_UP,
     AuditCheck,
     CalculatorError,
+    CallsUp,
     CheckResult,
     Observed,
     Progress,
@@ -22,8 +23,9 @@ from mdnum.audit.base import (
     finding,
 )
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
-from mdnum.audit.structures import Pair, molecules, pairs, whole
-from mdnum.audit.subject import Answered, CalculatorSubject, Forces, differences, largest, not_repeatable, rms
+from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
+from mdnum.audit.structures import pairs
+from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
@@ -35,16 +37,6 @@ _TINY = 10.0 ** np.arange(-9, -1)
 _KEPT = 100.0
 #: Å: what is kept within less is a matter of precision.
 _HARMLESS = 1e-7
-#: Å between two parts that cannot feel one another, and a cell that does not repeat around them: some lists
-#: take long over an empty one.
-_FAR, _BOX = 60.0, 75.0
-_CLUSTER = 12
-#: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
-#: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
-_BEYOND = tuple(0.15 * 1.5**n for n in range(8))
-_STEPS = 8
-#: Å inside the cutoff at which they are asked about.
-_INSIDE = (0.02, 0.1, 0.25)
 _EPS = np.finfo(float).eps
 
 
@@ -54,13 +46,16 @@ class StateCheck(AuditCheck):
     Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
     """
 
-    name, title, order = "state", "Memory", 50
+    name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One object, asked again and again, beside new ones."""
         rng = np.random.default_rng(self.seed)
-        atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
+        with subject.meter.limited():
+            atoms, noise = settled(subject.fresh(), rng, at_least=FEW, brief=self.brief)
+            if self.brief:
+                return self._brief(subject, atoms, rng)
         # two atoms first, which most calculators answer for quickly
         approached, skipped = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
@@ -73,16 +68,14 @@ class StateCheck(AuditCheck):
                     for reached, row in _through(subject, sequence, noise, name):
                         rows.append(row)
                         progress(done + reached, total, {"phase": "state", "unit": "structures"})
-            except TimeUp:
+            except TimeUp as up:
                 left = sum(one.compared for one in sequence) - (len(rows) - compared)
-                skipped.append((f"{left} questions of the sequence “{name}”", TIME_UP))
+                skipped.append((f"{left} questions of the sequence “{name}”", up.why))
             done += len(sequence)
-        if not rows and any(why == TIME_UP for _, why in skipped):
-            raise TimeUp
+        if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
+            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
         repeats = _repeated(subject, atoms)
         tolerance = _tolerance(subject, atoms)
-        alone = Alone(subject, atoms, noise)
-        self.structures |= alone.structures
         stale = [row for row in rows if row.remembers and not row.broken]
         chance: dict[str, Any] = {}
         if stale and not _again(subject, sequences, stale):
@@ -91,43 +84,47 @@ class StateCheck(AuditCheck):
             chance = {"answers": len(stale), "energy": worst.energy, "force": worst.force}
             stale = []
         refused = [row for row in rows if row.refused and not row.remembers]
-        identical = repeats["bit-identical"], repeats["bit-identical between objects"]
         finite = [row.energy for row in stale if np.isfinite(row.energy)]
         says = "failing" if stale and not finite else "stale" if stale else "chance" if chance else "none"
-        how = "not_repeated" if not identical[0] else "repeated" if identical[1] else "not_between"
         values: dict[str, Any] = {
             "rows": len(rows), "stale": len(stale), "sequences": len({row.sequence for row in rows}),
             "answers": chance.get("answers", 0), "energy": max(finite, default=chance.get("energy", 0.0)),
         }  # fmt: skip
         numbers = {
-            "structures": len(rows), "remembered": len(stale), "bit_identical": identical[0],
+            "structures": len(rows), "remembered": len(stale), "bit_identical": repeats["bit-identical"],
             "largest": max((row.energy for row in rows), default=0.0),
-            "bit_identical_objects": identical[1], "kept_within": tolerance,
+            "bit_identical_objects": repeats["bit-identical between objects"], "kept_within": tolerance,
         }  # fmt: skip
         return CheckResult(
-            says=([f"state_{says}", f"state_{how}"], values),
+            says=([f"state_{says}", _how(repeats)], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
                 *self._memory(stale),
                 *_kept(tolerance, atoms),
                 *self._failures(rows),
-                *_changed_input(subject, atoms),
-                *alone.findings(),
             ],
             tables={
                 "One object, asked again and again, beside new ones": [row.row() for row in rows],
                 "The same question again": [repeats],
-                "Atoms alone": alone.rows,
             },
             numbers=numbers,
             limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
             skipped=[
                 *skipped,
                 *((row.what, row.why) for row in refused),
-                *((what, error.message) for what, error in alone.refused),
             ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
+        )
+
+    def _brief(self, subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> CheckResult:
+        """Repeats alone."""
+        repeats = _repeated(subject, atoms, brief=True)
+        return CheckResult(
+            says=([_how(repeats)], {}),
+            findings=list(_unsteady(repeats, {}, subject.kT)),
+            tables={"The same question again": [repeats]},
+            possible=1 + sum(map(len, all_sequences(atoms, rng).values())),
         )
 
     def _memory(self, stale: list[Comparison]) -> Iterator[Observed]:
@@ -256,24 +253,39 @@ def _again(
     )
 
 
-def _repeated(subject: CalculatorSubject, atoms: Atoms) -> dict[str, Any]:
+def _how(repeats: Mapping[str, Any]) -> str:
+    """The name of the sentence about repeated calls."""
+    if not repeats["bit-identical"]:
+        return "state_not_repeated"
+    return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
+
+
+def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
     """The same structure again: of one object, with another structure between, and of new objects."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
+    at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)
+
+    def asked(one: CalculatorSubject) -> tuple[np.ndarray, np.ndarray]:
+        # both energies, where there are two: a run logs the one that forces do not belong to
+        return np.array([value for value in one.energies(atoms) if value is not None]), one.forces(atoms)
+
     within = []
-    for number in range(_AT_ONCE + _BETWEEN):
-        within.append(used.both(atoms))
-        if number >= _AT_ONCE:
+    for number in range(at_once + between):
+        within.append(asked(used))
+        if number >= at_once:
             used.energy(aside)
         else:
             used.forget()
-    objects = [within[0], *(subject.fresh().both(atoms) for _ in range(_NEW - 1))]
+    objects = [within[0], *(asked(subject.fresh()) for _ in range(new - 1))]
 
-    def spread(answers: list[tuple[float, np.ndarray]]) -> tuple[bool, float, float]:
-        (energy, forces), *others = answers
-        same = all(one[0] == energy and one[1].tobytes() == forces.tobytes() for one in others)
-        force = np.max(np.ptp([one[1] for one in answers], axis=0), initial=0.0)
-        return same, float(np.ptp([one[0] for one in answers])), float(force)
+    def spread(answers: list[tuple[np.ndarray, np.ndarray]]) -> tuple[bool, float, float]:
+        (energies, forces), *others = answers
+        same = all(
+            one[0].tobytes() == energies.tobytes() and one[1].tobytes() == forces.tobytes() for one in others
+        )
+        energy, force = (np.max(np.ptp(values, axis=0), initial=0.0) for values in zip(*answers, strict=True))
+        return same, float(energy), float(force)
 
     everywhere, one, several = subject.repeats.new, spread(within), spread(objects)
     return {
@@ -353,278 +365,3 @@ def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
     if tolerance:
         severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
         yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))
-
-
-def _changed_input(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
-    outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
-    for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
-        other = subject.fresh()
-        try:
-            with other.trying():
-                changed = other.writes(there)
-        except CalculatorError:
-            continue  # reported elsewhere
-        if changed:
-            yield finding("CHANGED_INPUT", "error", what=what, changed=" and ".join(changed))
-            return
-
-
-class Alone:
-    """Atoms without a neighbor: they feel no force, and energies of parts far apart add up.
-
-    Single atoms, two atoms far apart, and a cluster with an atom far away; molecules for calculators that
-    take nothing less.
-
-    Args:
-        subject: a new object is made for each question.
-        atoms: species, and the cluster.
-        noise: of the calculator.
-
-    Attributes:
-        rows: a row for each structure that was answered for.
-        refused: what was not, and why.
-        takes_atoms: whether the calculator answers for anything that is no whole molecule.
-        structures: on which it failed, by name.
-    """
-
-    def __init__(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor):
-        self.rows: list[dict[str, Any]] = []
-        self.refused: list[tuple[str, CalculatorError]] = []
-        self.structures: dict[str, Atoms] = {}
-        self._subject, self._noise = subject, noise
-        species = list(dict.fromkeys(atoms.symbols))
-        single: dict[str, float] = {}
-        for symbol, periodic in product(species, (False, True)):
-            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
-            energy = self._ask(what, one, single.get(symbol))
-            if energy is not None:
-                single.setdefault(symbol, energy)
-        two = (species[0], species[-1])
-        pair = Atoms(two, positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]], cell=[_BOX] * 3)
-        expected = single[two[0]] + single[two[1]] if set(two) <= set(single) else None
-        self._ask(f"{two[0]} and {two[1]} {_FAR:g} Å apart", pair, expected)
-        cluster = atoms[: min(len(atoms), _CLUSTER)]
-        cluster.pbc = False
-        cluster.positions += 1.0 - cluster.positions.min(axis=0)
-        cluster.set_cell([_BOX + float(np.ptp(cluster.positions, axis=0).max())] * 3)
-        near = subject.fresh().try_both(cluster)
-        failed = isinstance(near, CalculatorError)
-        # one that knows whole molecules alone takes nothing of which an atom is gone; one that fails on an
-        # atom without neighbors may fail on the cluster, and takes the structure with a vacancy
-        fewer = (atoms[:-1],) if failed else (cluster[:-1], atoms[:-1])
-        self.takes_atoms = any(subject.fresh().answers(one) for one in fewer)
-        if failed:
-            self.refused.append((f"a cluster of {len(cluster)} atoms", near))
-        elif self.takes_atoms:
-            symbol = str(atoms.symbols[0])
-            far = cluster + Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-            expected = near[0] + single[symbol] if symbol in single else None
-            what = f"a {symbol} atom {_FAR:g} Å from a cluster"
-            self._ask(what, far, expected, lambda forces: forces[-1:])
-        else:
-            one = whole(atoms, molecules(atoms)[0])
-            one.positions += [1.0, 2.0, 3.0]
-            one.set_cell([_BOX] * 3)
-            both, formula = one + displaced(one, np.array([_FAR, 0.0, 0.0])), one.get_chemical_formula()
-            # within a molecule there are forces, on it as a whole there is none
-            felt = lambda forces: forces.reshape(-1, len(one), 3).sum(axis=1)  # noqa: E731
-            energy = self._ask(f"one {formula}", one, None, felt)
-            self._ask(f"two {formula} {_FAR:g} Å apart", both, energy and 2 * energy, felt)
-
-    def _ask(
-        self,
-        what: str,
-        atoms: Atoms,
-        expected: float | None,
-        felt: Callable[[Forces], np.ndarray] = np.asarray,
-    ) -> float | None:
-        """The energy of a structure, of which note is taken; without an expected one, only of its force."""
-        answer = self._subject.fresh().try_both(atoms)
-        if isinstance(answer, CalculatorError):
-            self.refused.append((what, answer))
-            if answer.cause is None:
-                self.structures["alone-failed"] = atoms
-            return None
-        energy, force = answer[0], largest(felt(answer[1]))
-        expected = energy if expected is None else expected
-        allowed = self._noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
-        self.rows.append({
-            "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(energy - expected) <= allowed.energy,
-            "no force": force <= allowed.force,
-        })  # fmt: skip
-        return energy
-
-    def findings(self) -> Iterator[Observed]:
-        """What is wrong with atoms alone."""
-        for what, why in [one for one in self.refused if one[1].cause is None][:1]:
-            yield finding("LONELY_NOT_FINITE", "error", what=what, why=why.message)
-        for what, why in [one for one in self.refused if one[1].cause is not None and self.takes_atoms][:1]:
-            yield finding("LONELY_FAILS", "warning", what=what, why=why.message)
-        if pushed := [row for row in self.rows if not row["no force"]]:
-            worst = max(pushed, key=lambda row: row["force (eV/Å)"])
-            yield finding("LONELY_FORCE", "error", what=worst["atoms"], force=worst["force (eV/Å)"])
-        if apart := [row for row in self.rows if not row["adds up"]]:
-            worst = max(apart, key=lambda row: abs(row["energy (eV)"] - row["expected"]))
-            energies = f"{worst['energy (eV)']:.10g}", f"{worst['expected']:.10g}"
-            values = {"what": worst["atoms"], "energy": energies[0], "expected": energies[1], "far": _FAR}
-            yield finding("LONELY_ENERGY", "warning", **values)
-
-
-# -- structures that one object is asked about one after another: what a neighbor list can miss ----
-
-
-class SequenceStep(NamedTuple):
-    """A structure in a sequence, how it differs from the one before, and whether its answer is compared."""
-
-    what: str
-    atoms: Atoms
-    compared: bool = True
-
-
-def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Sequences that begin with a structure, by name; those without anything in them left out."""
-    sequences = {
-        "sizes": _sizes(atoms, rng),
-        "a slow drift": _slow_drift(atoms, rng),
-        "two atoms head on": _head_on(atoms),
-        "strain": _strain(atoms),
-        "wrapping": _wrapping(atoms, rng),
-    }
-    made = {name: [SequenceStep(*step) for step in sequence] for name, sequence in sequences.items()}
-    return {name: sequence for name, sequence in made.items() if sequence}
-
-
-def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """More atoms, fewer atoms, more and fewer neighbors, other species' places, other periodicity."""
-    yield "the structure", atoms
-    if len(atoms) <= 64 and atoms.pbc.any():
-        yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
-        yield "it shrank back", atoms
-    if len(atoms) > 2:
-        yield "its last third was removed", atoms[: max(1, 2 * len(atoms) // 3)]
-        yield "all but two atoms were removed", atoms[:2]
-        yield "all atoms came back", atoms
-    yield "all distances grew by half: fewer neighbors", _scaled(atoms, 1.5)
-    yield "they shrank again: more neighbors", atoms
-    yield "all distances shrank by 6 %: more neighbors", _scaled(atoms, 0.94)
-    yield "they grew again: fewer neighbors", atoms
-    if len(atoms) > 1:
-        yield "the atoms came in another order", atoms[rng.permutation(len(atoms))]
-        yield "they came in the first order", atoms
-    if atoms.pbc.any():
-        cluster = atoms.copy()
-        cluster.pbc = False
-        yield "the periods were switched off", cluster
-        yield "they were switched on", atoms
-    if len(set(atoms.numbers)) > 1:
-        swapped = atoms.copy()
-        swapped.numbers = np.roll(atoms.numbers, 1)
-        yield "the species changed places", swapped
-        yield "they changed back", atoms
-
-
-def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
-    there = atoms
-    heading = rng.standard_normal((len(atoms), 3))
-    heading /= np.linalg.norm(heading, axis=1)[:, None]
-    yield "the structure", there
-    for number in range(12):
-        # there and back, so that atoms do not run into one another
-        there = displaced(there, (0.04 if number < 6 else -0.04) * heading)
-        yield f"all atoms moved by 0.04 Å, {number + 1} times", there
-
-
-def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """One atom, then two, move toward another in steps: what a criterion without its half misses."""
-    if len(atoms) < 2:
-        return
-    yield "the structure", atoms
-    distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
-    other = 1 + int(np.argmax(np.linalg.norm(distances, axis=1)))
-    line = distances[other - 1] / np.linalg.norm(distances[other - 1])
-    for moving, word in (((0,), "one atom"), ((0, other), "two atoms")):
-        there = atoms
-        for number in range(5):
-            step = np.zeros((len(atoms), 3))
-            for who in moving:
-                step[who] = (0.09 if who == 0 else -0.09) * line
-            there = displaced(there, step)
-            yield f"{word} moved by 0.09 Å toward another, {number + 1} times", there
-        yield "the structure", atoms
-
-
-def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """The cell changes with the atoms, and without them."""
-    if not atoms.pbc.any():
-        return
-    yield "the structure", atoms
-    for scaled, word in ((True, "cell and atoms"), (False, "the cell alone")):
-        there = atoms
-        for number in range(4):
-            there = there.copy()
-            there.set_cell(there.cell.array * 0.985, scale_atoms=scaled)
-            yield f"{word} shrank by 1.5 %, {number + 1} times", there
-        yield "the structure", atoms
-    sheared = atoms.copy()
-    sheared.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]), scale_atoms=True)
-    yield "cell and atoms were sheared by 5 %", sheared
-    yield "the structure", atoms
-
-
-def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Atoms jump to other images between calls, as codes that wrap positions make them."""
-    if not atoms.pbc.any():
-        return
-    there = atoms
-    yield "the structure", there
-    for number in range(4):
-        boxes = rng.integers(-1, 2, (len(atoms), 3)) * atoms.pbc
-        there = displaced(there, boxes @ atoms.cell.array + 0.02 * rng.uniform(-1, 1, (len(atoms), 3)))
-        yield f"atoms moved a little and were put into other boxes, {number + 1} times", there
-    folded = there.copy()
-    folded.wrap(eps=0)
-    yield "all atoms were wrapped", folded
-
-
-def _scaled(atoms: Atoms, factor: float) -> Atoms:
-    there = atoms.copy()
-    there.set_cell(factor * atoms.cell.array)
-    there.positions = factor * atoms.positions
-    return there
-
-
-def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Two particles that come into one another's reach: sequences by name, each for an object of its own.
-
-    Args:
-        radius: beyond which they do not feel one another, Å.
-    """
-    apart, count = "the two apart", len(pair.first)
-    for beyond in _BEYOND:
-        # both move, in small steps: neither further than half of what the distance changes by
-        start = pair.at(radius + beyond)
-        sequence = [SequenceStep(apart, start, compared=False)]
-        for moved in (*np.linspace(0, beyond, _STEPS + 1)[1:], *(beyond + inside for inside in _INSIDE)):
-            there = start.copy()
-            there.positions[:count, 0] += 0.5 * moved
-            there.positions[count:, 0] -= 0.5 * moved
-            what = f"each moved by {0.5 * moved:.3g} Å toward the other"
-            sequence.append(SequenceStep(what, there, compared=bool(moved > beyond)))
-        yield f"two atoms from {beyond:.2g} Å beyond the cutoff", sequence
-    if len(pair.first) == len(pair.second) == 1:
-        # atoms stand still while the cell brings an image of one into the other's reach: across the face they
-        # are 0.05 Å beyond the cutoff at first
-        shrinking = []
-        for moved in (0.0, 0.03, 0.06, 0.09, 0.12, 0.16):
-            there = pair.at(2.0 * radius - 0.05)
-            there.set_cell([3.0 * radius - moved] * 3)
-            there.pbc = True
-            what = f"the cell shrank by {moved:.2g} Å" if moved else apart
-            shrinking.append(SequenceStep(what, there, compared=moved > 0.05))
-        yield "a cell that shrinks around two atoms", shrinking
-        near = SequenceStep("one atom jumped next to the other", pair.at(0.95 * radius))
-        yield "one atom that jumps", [SequenceStep(apart, pair.at(3.0 * radius), compared=False), near]

@@ -1,0 +1,403 @@
+"""A structure for a calculator that came without one: of elements that it is meant for, within few calls."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.base import CalculatorError, Meter, TimeUp
+from mdnum.audit.structures import FARTHEST, Pair, nearest_distance, pairs
+from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
+from mdnum.deadline import Deadline
+from mdnum.errors import InputError
+
+#: Tried in this order, and then every other element: argon where anything goes; and a second one beside each.
+_FIRST = {"Ar": "Kr", "Cu": "Ni", "Si": "Ge", "C": "Si", "O": "S", "Al": "Cu", "Fe": "Cr", "Na": "K"}
+_LAST_ELEMENT = 95
+#: Calls for building a structure, at most; of them in each direction of a search for the least energy.
+BUILDING_CALLS, _SCALES = 400, 15
+_MOST_ATOMS, _FEWEST_ATOMS = 500, 32
+#: Å between molecules of water, as in the liquid.
+_SPACING = 3.1
+#: Molecules along an edge: some calculators want a box of two cutoffs.
+_WATER_EDGES = (4, 5, 6, 8)
+#: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
+_DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
+#: A nearest distance above the first part of the cutoff is made to be the second part of it.
+_BARELY, _PRESSED = 0.9, 0.6
+#: Seconds of processor time of a calculation above which the crystal is made no larger.
+_SLOW = 0.15
+#: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
+_RATTLE = 0.02
+#: Distances at which two atoms are asked about, from the farthest inward.
+_DISTANCES = FARTHEST * 1.12 ** -np.arange(29.0)
+#: Attributes that name elements, those that do so by atomic numbers, and attributes that hold a model.
+_NAMES = ("elements", "species", "symbols", "atom_types", "chemical_symbols", "type_map", "parameters")
+_NUMBERS = ("atomic_numbers", "z_table", "zs")
+_MODELS = ("model", "models", "potential")
+#: A calculator that names more elements than these is meant for many: the usual ones come first.
+_MANY = 3
+#: Names of elements that are words of English as well.
+_WORDS = ("lead", "tin")
+#: Of the energy: a second element that changes it by less is none to this calculator.
+_SAME = 1e-9
+
+
+def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
+    """A structure for a calculator: its own, or a crystal of elements it takes, or rigid water.
+
+    The crystal is that of an element that the calculator is meant for, half of its atoms of a second one
+    where it tells the two apart, with the lattice at the calculator's own least energy. It is repeated until
+    two cutoffs fit in (at most 500 atoms, fewer where a calculation takes long), its atoms displaced a
+    little. `info["origin"]` describes it. For a calculator that fails on atoms without neighbors a denser
+    crystal is built: that it fails is a finding, and no reason to stop.
+
+    Args:
+        deadline: of building; what is known by then has to do, as after `BUILDING_CALLS` calls.
+
+    Raises:
+        InputError: the calculator answers for no element and not for water; where it was asked about water,
+            that is saved.
+    """
+    if loaded.atoms is not None:
+        return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
+    builder = _Builder(loaded, Meter(deadline=deadline or Deadline(), most=BUILDING_CALLS))
+    try:
+        with builder.meter.limited():
+            return builder.built()
+    except TimeUp as up:
+        best = builder.best if builder.best is not None else _filled(*_unit_cell(*builder.likely[:1]))
+        return _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
+
+
+def _labeled(atoms: Atoms, origin: str) -> Atoms:
+    copy = atoms.copy()
+    copy.info["origin"] = origin
+    return copy
+
+
+class _Builder:
+    """Builds a structure for a calculator, and keeps the best that was answered for so far."""
+
+    def __init__(self, loaded: LoadedCalculator, meter: Meter):
+        self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
+        self.best: Atoms | None = None
+        self.named = meant_for(self.calculator, loaded.name)
+        self.likely = list(dict.fromkeys([*self.named, *_FIRST]))
+
+    def about(self, atoms: Atoms) -> CalculatorSubject:
+        """The calculator, and a structure that it is to be asked about."""
+        subject = CalculatorSubject(self.name, lambda: self.calculator, atoms, kT=1.0)
+        subject.meter = self.meter
+        return subject
+
+    def built(self) -> Atoms:
+        """The structure."""
+        from ase.data import chemical_symbols
+
+        others = [one for one in chemical_symbols[1:_LAST_ELEMENT] if one not in self.likely]
+        made = self._first(self.likely)
+        why, saved = "", None
+        for edge in _WATER_EDGES if made is None else ():
+            subject = self.about(water(edge))
+            subject.saving = edge == _WATER_EDGES[-1]
+            try:
+                subject.energy(subject.atoms)
+            except CalculatorError as error:
+                why, saved = error.message, error.structure
+            else:
+                return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+        # after water, since a calculator of molecules may take any atoms in threes for them
+        made = made or self._first(others) or self._first(self.likely, paired=False)
+        if made is None:
+            raise InputError(
+                "the calculator answers neither for atoms of any element nor for water "
+                f"({why}; saved in {saved})",
+                where=self.name,
+                remedy="Give a structure that it is made for: --structure FILE",
+            )
+        return self._mixed(made)
+
+    def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
+        """The crystal of the first element that is answered for, two atoms of it first where asked."""
+        for symbol in symbols:
+            subject = self.about(Atoms(symbol, [(0, 0, 0)]))
+            with subject.trying():
+                for pair in pairs(subject)[0][:1] if paired else [None]:
+                    if (made := self._crystal(subject, pair, symbol)) is not None:
+                        return made
+        return None
+
+    def _mixed(self, made: Atoms) -> Atoms:
+        """The same with a second element, where the calculator takes one and tells it from the first."""
+        from ase.data import atomic_numbers
+
+        self.best, symbol = made, str(made.symbols[0])
+        others = [one for one in self.named if one != symbol]
+        if len(others) > _MANY:
+            size = lambda one: nearest_distance(_unit_cell(one)[0].repeat(2))  # noqa: E731
+            others.sort(key=lambda one: abs(np.log(size(one) / size(symbol))))
+        subject, pure = self.about(made), None
+        for other in [*others[:_MANY], *([_FIRST[symbol]] if symbol in _FIRST else [])]:
+            swapped = made.copy()
+            swapped.numbers[1::2] = atomic_numbers[other]
+            with subject.trying():
+                try:
+                    mixed = subject.energy(swapped)
+                    pure = subject.energy(made) if pure is None else pure
+                except CalculatorError:
+                    continue
+                if abs(mixed - pure) <= _SAME * abs(pure):
+                    return made
+                if (found := self._crystal(subject, None, symbol, other)) is not None:
+                    return found
+        return made
+
+    def _crystal(self, subject: CalculatorSubject, pair: Pair | None, *symbols: str) -> Atoms | None:
+        """The crystal, None where the calculator answers for it at no density."""
+        if pair is not None:
+            self.cutoff, self.least = _felt(subject, pair)
+        elif len(symbols) == 1:
+            self.cutoff, self.least = None, None
+        cell, kind = _unit_cell(*symbols)
+        start = next((scale for scale in _DENSITIES if subject.answers(_small(cell, scale))), None)
+        if start is None:
+            return None
+        self.best = _filled(cell, kind, start)
+        scale, relaxed = _least_energy(subject, cell, self.least, start)
+        for how in ((scale, relaxed), (start, False)):
+            if (made := _grown(subject, cell, kind, *how, self.cutoff)) is not None:
+                return made
+        return None
+
+
+def meant_for(calculator: Any, words: str) -> list[str]:
+    """Elements that a calculator, its file, its name or its documentation names, the likeliest first."""
+    from ase.data import atomic_names, atomic_numbers, chemical_symbols
+
+    module = sys.modules.get(type(calculator).__module__)
+    found = list(_symbols(getattr(module, "parameters", None), False))
+    holders = [calculator]
+    for name in _MODELS:
+        value = getattr(calculator, name, None)
+        holders += value[:1] if isinstance(value, list | tuple) else [value]
+    for holder in filter(None, holders):
+        for name in (*_NAMES, *_NUMBERS):
+            found += _symbols(getattr(holder, name, None), name in _NUMBERS)
+    found = list(dict.fromkeys(found))
+    if len(found) > _MANY:
+        found.sort(key=lambda one: (*_FIRST, one).index(one))
+    path = Path(words.partition(".py")[0] + ".py")
+    text = path.read_text(errors="replace") if path.is_file() else ""
+    spoken = {name.lower(): chemical_symbols[k] for k, name in enumerate(atomic_names) if k}
+    texts = (words.rpartition("/")[2], type(calculator).__doc__, text)
+    for word in re.findall(r"[A-Za-z]+", " ".join(filter(None, texts))):
+        if word.lower() in spoken and word.lower() not in _WORDS:
+            found.append(spoken[word.lower()])
+    # symbols of two letters alone: others are as often something else
+    quoted = re.findall(r"""["']([A-Z][a-z])["']""", text)
+    named = re.findall(r"(?<![A-Za-z])[A-Z][a-z](?![a-z])", texts[0])
+    found += [one for one in (*named, *quoted) if one in atomic_numbers]
+    return list(dict.fromkeys(found))
+
+
+def _symbols(value: Any, numbers: bool) -> Iterator[str]:
+    """Symbols of elements in an attribute, at any depth; keys of a dictionary where all of them are."""
+    from ase.data import chemical_symbols
+
+    value = value.tolist() if hasattr(value, "tolist") else getattr(value, "zs", value)
+    if isinstance(value, str) and value in chemical_symbols[1:]:
+        yield value
+    elif isinstance(value, int) and numbers and 0 < value < _LAST_ELEMENT:
+        yield chemical_symbols[value]
+    elif isinstance(value, dict):
+        keys = [one for key in value for one in (key if isinstance(key, tuple) else (key,))]
+        if all(one in chemical_symbols[1:] for one in keys if isinstance(one, str)):
+            yield from _symbols(keys, numbers)
+        for item in value.values():
+            yield from _symbols(item, numbers)
+    elif isinstance(value, list | tuple | set):
+        for item in sorted(value) if isinstance(value, set) else value:
+            yield from _symbols(item, numbers)
+
+
+def water(edge: int = 4) -> Atoms:
+    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H."""
+    from ase.calculators.tip3p import angleHOH, rOH
+    from scipy.spatial.transform import Rotation
+
+    half = np.radians(angleHOH) / 2
+    flat = rOH * np.array([[0, 0, 0], [np.cos(half), np.sin(half), 0], [np.cos(half), -np.sin(half), 0]])
+    turns = Rotation.random(edge**3, rng=np.random.default_rng(0)).as_matrix()
+    corners = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    positions = np.concatenate([flat @ turn.T for turn in turns])
+    positions += np.repeat((corners + 0.5) * _SPACING, 3, axis=0)
+    return Atoms("OH2" * edge**3, positions, cell=[edge * _SPACING] * 3, pbc=True)
+
+
+def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
+    """Seconds of processor time of energy and forces, after the first; the less of two.
+
+    Programs that a calculator starts and ends count. What other programs do at the time does not, so that
+    the same structure is asked about whatever the load.
+    """
+
+    def clock() -> float:
+        children = os.times()
+        return time.process_time() + children.children_user + children.children_system
+
+    took = []
+    for _ in range(2):
+        atoms = atoms.copy()
+        atoms.positions[0, 0] += 1e-4
+        began = clock()
+        subject.both(atoms)
+        took.append(clock() - began)
+    return min(took)
+
+
+def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
+    """(where a pair stops interacting, where its energy is least), roughly; None if never.
+
+    Of a calculator that fails on atoms without neighbors, the distance from which on it does.
+    """
+    curve = pair.curve(subject)
+    known: dict[float, tuple[float, float]] = {}
+    for distance in _DISTANCES:
+        try:
+            known[float(distance)] = curve(float(distance))
+        except CalculatorError:
+            if known:
+                break
+    if not known:
+        return None, None
+    places = list(known)
+    energy_far = known[places[0]][0] if places[0] == _DISTANCES[0] else None
+
+    def felt(distance: float) -> bool:
+        try:
+            energy, force = curve(distance)
+        except CalculatorError:
+            return False
+        return energy_far is None or max(abs(energy - energy_far), abs(force)) > 1e-12
+
+    inside = next((one for one in places if felt(one)), None)
+    if inside is None or inside == _DISTANCES[0]:
+        cutoff = None
+    else:
+        low, high = inside, float(_DISTANCES[list(_DISTANCES).index(inside) - 1])
+        for _ in range(4):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if felt(middle) else (low, middle)
+        cutoff = high
+    least = min((one for one in places if one > 0.8), key=lambda one: known[one][0])
+    bound = energy_far is not None and known[least][0] < energy_far - 1e-9
+    return cutoff, least if bound else None
+
+
+def _grown(
+    subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
+) -> Atoms | None:
+    """The largest crystal up to one with two cutoffs that is answered for soon enough; None where none is."""
+    at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
+    if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
+        # nothing holds it together: a crystal in which nothing is felt would tell nothing
+        scale, at = _PRESSED * cutoff / _least_distance(cell), "nothing binds it, so pressed together"
+    edge = scale * float(np.asarray(cell.cell).diagonal().min())
+    few, most = (int((count / len(cell)) ** (1 / 3) + 0.999) for count in (_FEWEST_ATOMS, _MOST_ATOMS - 64))
+    wanted = int(np.ceil((2.05 * cutoff if cutoff else 12.0) / edge))
+    made: Atoms | None = None
+    for repeat in range(few, max(few, min(wanted, most)) + 1):
+        larger = _filled(cell, kind, scale, at, repeat)
+        if not subject.answers(larger):
+            continue
+        # it is asked hundreds of times; narrower than two cutoffs, which not every calculator takes
+        took = _processor_time(subject, larger)
+        if took > _SLOW and repeat < wanted:
+            made = larger if made is None else made
+            why = f"; one calculation of {len(larger)} atoms takes {took:.2g} s of a processor"
+            return _labeled(made, made.info["origin"] + why)
+        made = larger if took <= _SLOW or made is None else made
+    return made
+
+
+def _tabulated(scale: float) -> str:
+    return "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")
+
+
+def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, repeat: int = 2) -> Atoms:
+    """The crystal with its lattice scaled, repeated and displaced a little."""
+    cell = cell.copy()
+    cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
+    atoms, nearest = cell.repeat(repeat), _least_distance(cell)
+    atoms.rattle(_RATTLE * nearest, seed=0)
+    return _labeled(
+        atoms,
+        f"{len(atoms)} atoms of {kind}, nearest distance {nearest:.4g} Å ({at or _tabulated(scale)}), "
+        f"displaced by {_RATTLE * nearest:.2g} Å",
+    )
+
+
+def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
+    """The element's crystal as a rectangular cell; fcc of its size where it has none of these.
+
+    Every second atom is of the other element, where there is one.
+    """
+    from ase.build import bulk
+    from ase.data import atomic_numbers, covalent_radii, reference_states
+
+    state = reference_states[atomic_numbers[symbol]]
+    if state is not None and state.get("symmetry") in ("fcc", "bcc", "diamond") and state.get("a"):
+        cell, lattice = bulk(symbol, cubic=True), state["symmetry"]
+    else:
+        nearest = 2 * float(covalent_radii[atomic_numbers[symbol]])
+        cell, lattice = bulk(symbol, "fcc", a=nearest * np.sqrt(2), cubic=True), "fcc"
+    for other in others:
+        cell.numbers[1::2] = atomic_numbers[other]
+    return cell, f"{' and '.join((symbol, *others))}, {lattice}"
+
+
+def _least_distance(cell: Atoms) -> float:
+    """Smallest distance between two atoms of a crystal, images included."""
+    return nearest_distance(cell.repeat(2))
+
+
+def _least_energy(
+    subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
+) -> tuple[float, bool]:
+    """(factor on the lattice at which its energy is least, whether there was one), from a start on."""
+
+    def energy(scale: float) -> float:
+        try:
+            return subject.energy(_small(cell, scale))
+        except CalculatorError:
+            return np.inf
+
+    if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
+        start = least / _least_distance(cell)  # too far apart to feel one another: start at two atoms' own
+    scale, here = start, energy(start)
+    for direction in (1.03, 1 / 1.03):
+        for _ in range(_SCALES):
+            there = energy(scale * direction)
+            if not there < here:
+                break
+            scale, here = scale * direction, there
+        else:
+            return start, False
+    ended = np.isfinite(here)
+    return (scale, True) if ended else (start, False)
+
+
+def _small(cell: Atoms, scale: float) -> Atoms:
+    """A few atoms of a crystal whose lattice is scaled."""
+    small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
+    small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
+    return small

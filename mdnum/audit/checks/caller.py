@@ -1,0 +1,193 @@
+"""What a calculator does to its caller: atoms, arrays and random numbers that are not its own."""
+
+from __future__ import annotations
+
+import pickle
+import random
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.base import (
+    AuditCheck,
+    CalculatorError,
+    CheckResult,
+    Observed,
+    Progress,
+    Severity,
+    Ways,
+    finding,
+)  # fmt: skip
+from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
+from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest
+
+#: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
+_SEEDS = (271828, 314159)
+#: What some calculators read from `Atoms.info`.
+_INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
+
+
+class CallerCheck(AuditCheck):
+    """Does a calculator see what its caller changes, and leave alone what is the caller's?
+
+    One `Atoms` object that is edited in place, as dynamics edits it; arrays that were returned; generators of
+    random numbers.
+    """
+
+    name, title, order, calls = "caller", "Caller", 30, 280
+    needed_to = ("run",)
+
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
+        """Every question, each with an object of its own."""
+        with subject.meter.limited():
+            atoms, noise = settled(subject.fresh(), np.random.default_rng(self.seed), at_least=FEW)
+        questions: list[tuple[str, Callable[[], Iterator[Observed]]]] = [
+            (f"{what} changed in place", partial(_edited, subject, atoms, noise, what, change))
+            for what, change in _changes(atoms, np.random.default_rng(self.seed))
+        ]
+        questions += [
+            ("arrays that were returned", partial(_buffers, subject, atoms, noise)),
+            ("the caller's random numbers", partial(_random, subject, atoms)),
+            ("the caller's atoms", partial(_written, subject, atoms)),
+        ]
+        ways = Ways()
+        found = ways.each(
+            subject, questions, lambda one: one[0], lambda one: list(one[1]()), progress, self.name,
+            unit="questions", required=True, tolerant=True,
+        )  # fmt: skip
+        observed = [one for several in found.values() for one in several]
+        # one that keeps its answer whatever has changed is reported once
+        if unseen := [one for one in observed if one.code == "CHANGE_NOT_SEEN"]:
+            worst = max(unseen, key=lambda one: one.values["force"])
+            worst.values["changed"] = ", ".join(one.values["changed"] for one in unseen)
+            observed = [worst, *(one for one in observed if one not in unseen)]
+        says = "caller_wrong" if observed else "caller_right"
+        return CheckResult(([says], {"questions": ways.asked}), observed, numbers={}, **vars(ways))
+
+
+def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
+    """(what is changed, what changes it in an `Atoms` object)."""
+    moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
+    yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
+    if len(set(atoms.numbers)) > 1:
+        swapped = np.roll(atoms.numbers, 1)
+        yield "numbers", lambda there: there.numbers.__setitem__(slice(None), swapped)
+    if atoms.pbc.any():
+        yield "cell", lambda there: np.multiply(there.cell.array, 1.01, out=there.cell.array)
+        yield "periods", lambda there: there.pbc.__setitem__(slice(None), False)
+    yield "tags", lambda there: there.set_tags(np.arange(len(there)) % 3)
+    yield "info", lambda there: there.info.update(_INFO)
+    yield "initial charges", lambda there: there.set_initial_charges(np.linspace(-0.5, 0.5, len(there)))
+    yield "initial magnetic moments", lambda there: there.set_initial_magnetic_moments([1.0] * len(there))
+
+
+def _edited(
+    subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, what: str, change: Callable[[Atoms], Any]
+) -> Iterator[Observed]:
+    """One calculator and one `Atoms` object, before a change and after it, beside new ones."""
+
+    def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
+        used, there = subject.used(), atoms.copy()
+        used.copies = False
+        used.both(there)
+        change(there)
+        return used.both(there), subject.fresh().both(there.copy())
+
+    with subject.trying():  # it may not take a charge, or a structure without periods
+        old, new = asked()
+        energy, force = differences(old, new)
+        eps = np.finfo(float).eps
+        allowed = noise.louder(NoiseFloor(eps * abs(new[0]), eps * max(1.0, largest(new[1])))).allowed
+        if energy <= allowed.energy and force <= allowed.force:
+            return
+        again = zip((old, new), asked(), strict=True)
+    # what comes by chance does not come again
+    if all(e <= 0.5 * energy and f <= 0.5 * force for e, f in (differences(*two) for two in again)):
+        values = {"changed": what, "energy": energy, "force": force}
+        yield finding("CHANGE_NOT_SEEN", "error", tests=("repeat", "fresh"), **values)
+
+
+def _buffers(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
+    """Arrays that were returned stay what they were, and writing to them changes no later answer."""
+    used = subject.fresh()
+    first = used.returned(atoms)
+    before = {name: np.array(value, copy=True) for name, value in first.items()}
+    used.both(displaced(atoms, 0.01 * np.arange(3 * len(atoms)).reshape(-1, 3) / len(atoms)))
+    changed = [name for name, value in first.items() if _bits(value) != _bits(before[name])]
+    own = [name for name in changed if not name.startswith("results")]
+    if changed:
+        yield finding(
+            "REUSED_BUFFER",
+            "error" if own else "info",
+            None if own else "kept",
+            what=" and ".join(own or changed),
+        )
+        return
+    forces = used.returned(atoms)["forces"]
+    if isinstance(forces, np.ndarray) and forces.flags.writeable:
+        forces += 1.0
+        if largest(used.forces(atoms) - before["forces"]) > 0.5:
+            yield finding("REUSED_BUFFER", "error", "written", what="forces")
+
+
+def _bits(value: Any) -> bytes:
+    return np.asarray(value).tobytes()
+
+
+def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
+    """Generators that belong to all of a process, before and after a call: drawn from, or seeded."""
+    generators: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Callable[[int], Any]]] = {
+        "numpy.random": (np.random.get_state, np.random.set_state, np.random.seed),
+        "random": (random.getstate, random.setstate, random.seed),
+    }
+    if torch := sys.modules.get("torch"):
+        generators["torch"] = torch.get_rng_state, torch.set_rng_state, torch.manual_seed
+    kept = [(put, get()) for get, put, _ in generators.values()]
+    # by the call of an object, the first one or another: states before and after it, for each seed
+    states: dict[str, list[dict[str, tuple[bytes, bytes]]]] = {"made": [], "asked": []}
+    try:
+        for seed in _SEEDS:
+            one = subject.fresh()
+            for seen in states.values():
+                for _, _, start in generators.values():
+                    start(seed)
+                before = [pickle.dumps(get()) for get, _, _ in generators.values()]
+                one.forget()
+                one.both(atoms)
+                after = [pickle.dumps(get()) for get, _, _ in generators.values()]
+                seen.append(dict(zip(generators, zip(before, after, strict=True), strict=True)))
+    finally:
+        for put, state in kept:
+            put(state)
+    told: tuple[tuple[str, Severity, int], ...] = (
+        ("asked", "error", 1), ("made", "warning", 1), ("drawn", "info", 2),
+    )  # fmt: skip
+    for when, severity, wanted in told:
+        first, second = states["made" if when == "made" else "asked"]
+        names = [
+            name
+            for name in generators
+            if first[name][0] != first[name][1] and len({first[name][1], second[name][1]}) == wanted
+        ]
+        if names:
+            yield finding("RANDOM_SEEDED", severity, when, which=" and ".join(names))
+            return
+
+
+def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
+    """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
+    outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
+    for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
+        other = subject.fresh()
+        try:
+            with other.trying():
+                changed = other.writes(there)
+        except CalculatorError:
+            continue  # reported elsewhere
+        if changed:
+            yield finding("CHANGED_INPUT", "error", what=what, changed=" and ".join(changed))
+            return

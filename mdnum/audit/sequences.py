@@ -1,0 +1,179 @@
+"""Structures that one object is asked about one after another: what a neighbor list can miss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.noise import displaced
+from mdnum.audit.structures import Pair
+
+#: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
+#: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
+_BEYOND = tuple(0.15 * 1.5**n for n in range(8))
+_STEPS = 8
+#: Å inside the cutoff at which they are asked about.
+_INSIDE = (0.02, 0.1, 0.25)
+
+
+class SequenceStep(NamedTuple):
+    """A structure in a sequence, how it differs from the one before, and whether its answer is compared."""
+
+    what: str
+    atoms: Atoms
+    compared: bool = True
+
+
+def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
+    """Sequences that begin with a structure, by name; those without anything in them left out."""
+    sequences = {
+        "sizes": _sizes(atoms, rng),
+        "a slow drift": _slow_drift(atoms, rng),
+        "two atoms head on": _head_on(atoms),
+        "strain": _strain(atoms),
+        "wrapping": _wrapping(atoms, rng),
+    }
+    made = {name: [SequenceStep(*step) for step in sequence] for name, sequence in sequences.items()}
+    return {name: sequence for name, sequence in made.items() if sequence}
+
+
+def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """More atoms, fewer atoms, more and fewer neighbors, other species' places, other periodicity."""
+    yield "the structure", atoms
+    if len(atoms) <= 64 and atoms.pbc.any():
+        yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
+        yield "it shrank back", atoms
+    if len(atoms) > 2:
+        yield "its last third was removed", atoms[: max(1, 2 * len(atoms) // 3)]
+        yield "all but two atoms were removed", atoms[:2]
+        yield "all atoms came back", atoms
+    yield "all distances grew by half: fewer neighbors", _scaled(atoms, 1.5)
+    yield "they shrank again: more neighbors", atoms
+    yield "all distances shrank by 6 %: more neighbors", _scaled(atoms, 0.94)
+    yield "they grew again: fewer neighbors", atoms
+    if len(atoms) > 1:
+        yield "the atoms came in another order", atoms[rng.permutation(len(atoms))]
+        yield "they came in the first order", atoms
+    if atoms.pbc.any():
+        cluster = atoms.copy()
+        cluster.pbc = False
+        yield "the periods were switched off", cluster
+        molecule = cluster.copy()
+        molecule.set_cell(np.zeros((3, 3)))
+        yield "the cell was taken away", molecule
+        slab = atoms.copy()
+        slab.pbc = atoms.pbc & (np.arange(3) != np.flatnonzero(atoms.pbc)[-1])
+        yield "all axes but one repeated", slab
+        yield "all of them did", atoms
+    if len(set(atoms.numbers)) > 1:
+        swapped = atoms.copy()
+        swapped.numbers = np.roll(atoms.numbers, 1)
+        yield "the species changed places", swapped
+        yield "they changed back", atoms
+
+
+def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
+    there = atoms
+    heading = rng.standard_normal((len(atoms), 3))
+    heading /= np.linalg.norm(heading, axis=1)[:, None]
+    yield "the structure", there
+    for number in range(12):
+        # there and back, so that atoms do not run into one another
+        there = displaced(there, (0.04 if number < 6 else -0.04) * heading)
+        yield f"all atoms moved by 0.04 Å, {number + 1} times", there
+
+
+def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
+    """One atom, then two, move toward another in steps: what a criterion without its half misses."""
+    if len(atoms) < 2:
+        return
+    yield "the structure", atoms
+    distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
+    other = 1 + int(np.argmax(np.linalg.norm(distances, axis=1)))
+    line = distances[other - 1] / np.linalg.norm(distances[other - 1])
+    for moving, word in (((0,), "one atom"), ((0, other), "two atoms")):
+        there = atoms
+        for number in range(5):
+            step = np.zeros((len(atoms), 3))
+            for who in moving:
+                step[who] = (0.09 if who == 0 else -0.09) * line
+            there = displaced(there, step)
+            yield f"{word} moved by 0.09 Å toward another, {number + 1} times", there
+        yield "the structure", atoms
+
+
+def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
+    """The cell changes with the atoms, and without them."""
+    if not atoms.pbc.any():
+        return
+    yield "the structure", atoms
+    for scaled, word in ((True, "cell and atoms"), (False, "the cell alone")):
+        there = atoms
+        for number in range(4):
+            there = there.copy()
+            there.set_cell(there.cell.array * 0.985, scale_atoms=scaled)
+            yield f"{word} shrank by 1.5 %, {number + 1} times", there
+        yield "the structure", atoms
+    sheared = atoms.copy()
+    sheared.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]), scale_atoms=True)
+    yield "cell and atoms were sheared by 5 %", sheared
+    yield "the structure", atoms
+
+
+def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
+    """Atoms jump to other images between calls, as codes that wrap positions make them."""
+    if not atoms.pbc.any():
+        return
+    there = atoms
+    yield "the structure", there
+    for number in range(4):
+        boxes = rng.integers(-1, 2, (len(atoms), 3)) * atoms.pbc
+        there = displaced(there, boxes @ atoms.cell.array + 0.02 * rng.uniform(-1, 1, (len(atoms), 3)))
+        yield f"atoms moved a little and were put into other boxes, {number + 1} times", there
+    folded = there.copy()
+    folded.wrap(eps=0)
+    yield "all atoms were wrapped", folded
+
+
+def _scaled(atoms: Atoms, factor: float) -> Atoms:
+    there = atoms.copy()
+    there.set_cell(factor * atoms.cell.array)
+    there.positions = factor * atoms.positions
+    return there
+
+
+def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
+    """Two particles that come into one another's reach: sequences by name, each for an object of its own.
+
+    Args:
+        radius: beyond which they do not feel one another, Å.
+    """
+    apart, count = "the two apart", len(pair.first)
+    for beyond in _BEYOND:
+        # both move, in small steps: neither further than half of what the distance changes by
+        start = pair.at(radius + beyond)
+        sequence = [SequenceStep(apart, start, compared=False)]
+        for moved in (*np.linspace(0, beyond, _STEPS + 1)[1:], *(beyond + inside for inside in _INSIDE)):
+            there = start.copy()
+            there.positions[:count, 0] += 0.5 * moved
+            there.positions[count:, 0] -= 0.5 * moved
+            what = f"each moved by {0.5 * moved:.3g} Å toward the other"
+            sequence.append(SequenceStep(what, there, compared=bool(moved > beyond)))
+        yield f"two atoms from {beyond:.2g} Å beyond the cutoff", sequence
+    if len(pair.first) == len(pair.second) == 1:
+        # atoms stand still while the cell brings an image of one into the other's reach: across the face they
+        # are 0.05 Å beyond the cutoff at first
+        shrinking = []
+        for moved in (0.0, 0.03, 0.06, 0.09, 0.12, 0.16):
+            there = pair.at(2.0 * radius - 0.05)
+            there.set_cell([3.0 * radius - moved] * 3)
+            there.pbc = True
+            what = f"the cell shrank by {moved:.2g} Å" if moved else apart
+            shrinking.append(SequenceStep(what, there, compared=moved > 0.05))
+        yield "a cell that shrinks around two atoms", shrinking
+        near = SequenceStep("one atom jumped next to the other", pair.at(0.95 * radius))
+        yield "one atom that jumps", [SequenceStep(apart, pair.at(3.0 * radius), compared=False), near]

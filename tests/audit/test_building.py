@@ -1,0 +1,156 @@
+"""Which structure a calculator is given that came without one, and how much is asked to build it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ase.calculators.eam import EAM
+from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
+from audit import planted
+from audit.planted import Good
+
+import mdnum
+from mdnum.audit.building import BUILDING_CALLS, default_structure, meant_for
+from mdnum.audit.subject import LoadedCalculator
+from mdnum.verbs import frame
+
+TABLE = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
+
+
+class Counted(LennardJones):
+    """Counts its calls, all objects together."""
+
+    calls = 0
+
+    def calculate(self, *words, **more):
+        type(self).calls += 1
+        super().calculate(*words, **more)
+
+
+def counted(base: type = Counted, **attributes) -> type:
+    return type("Named", (base,), {"calls": 0, **attributes})
+
+
+def loaded(kind, name: str = "calculator", **words) -> LoadedCalculator:
+    return LoadedCalculator(name, "x", lambda: kind(**words))
+
+
+SILICON = {"sigma": 2.1, "epsilon": 0.5, "rc": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "first"),
+    [
+        ({"elements": ["Si"]}, "Si"),
+        ({"species": ("Ge", "Si")}, "Ge"),
+        ({"parameters": {("W", "W", "W"): 1.0}}, "W"),
+        ({"parameters": {"cutoff": 4.0, "atom_types": {"Al": 1, "Mg": 2}}}, "Al"),
+        ({"atomic_numbers": np.array([26, 6])}, "Fe"),
+        ({"model": type("Model", (), {"atomic_numbers": [79]})()}, "Au"),
+        ({"z_table": type("Table", (), {"zs": [22, 8]})()}, "Ti"),
+        # many are meant for many: the usual ones first
+        ({"elements": ["H", "He", "Li", "Be", "B", "Cu", "Si"]}, "Cu"),
+        ({"__doc__": "Stillinger-Weber silicon."}, "Si"),
+        # letters that name parameters are no elements, nor are words of English
+        ({"parameters": {"A": 7.0, "B": 0.6, "p": 4}, "__doc__": "As one may lead it."}, None),
+    ],
+)
+def test_a_calculator_is_asked_about_an_element_that_it_names(attributes, first):
+    kind = type("Any", (), attributes)
+    assert next(iter(meant_for(kind(), "any")), None) == first
+
+
+def test_the_name_and_the_text_of_a_file_are_read(tmp_path):
+    for text, expected in (
+        ('KNOWN = {"Si": 1.0}\n', ["Si"]),
+        ("# argon, or krypton\n", ["Ar", "Kr"]),
+        ("# nothing\n", []),
+    ):
+        (tmp_path / "pot.py").write_text(text)
+        assert meant_for(object(), f"{tmp_path}/pot.py:Class(a=1)") == expected
+    assert meant_for(object(), "some.package:Own(file='Cu_u3.eam')") == ["Cu"]
+
+
+def test_silicon_for_a_silicon_potential():
+    structure = default_structure(loaded(counted(__doc__="Silicon."), **SILICON))
+    assert set(structure.symbols) == {"Si"} and "diamond" in structure.info["origin"]
+
+
+def test_two_elements_where_a_calculator_tells_them_apart():
+    """One that knows a second element has both in its structure, whichever numbers it gives them."""
+    assert set(default_structure(loaded(EMT)).symbols) == {"Cu", "Ni"}
+    assert set(default_structure(loaded(LennardJones, sigma=3.4, epsilon=0.01)).symbols) == {"Ar"}
+    assert set(default_structure(loaded(EAM, potential=str(TABLE))).symbols) == {"Cu"}
+    mixed = default_structure(loaded(planted.ByAppearance))
+    counts = [int(np.sum(mixed.symbols == one)) for one in ("Ar", "Kr")]
+    assert counts[0] == counts[1] == len(mixed) / 2
+    assert planted.codes(planted.asked("invariance", planted.ByAppearance, mixed[:32]))["ORDER"] == "error"
+
+
+def test_a_named_second_element_is_taken_first():
+    kind = type("Two", (planted.ByAppearance,), {"elements": ["Cu", "Zr"]})
+    assert set(default_structure(loaded(kind)).symbols) == {"Cu", "Zr"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Counted, {"sigma": 3.4, "epsilon": 0.01, "rc": 8.5}),
+        (Counted, {}),
+        (Counted, SILICON),
+        (Counted, {"sigma": 9.0, "epsilon": 0.01, "rc": 20.0}),
+    ],
+)
+def test_building_ends_within_its_calls(kind, words):
+    made = counted(kind)
+    default_structure(loaded(made, **words))
+    assert made.calls <= 100 < BUILDING_CALLS
+
+
+def test_what_is_known_when_the_calls_are_spent_has_to_do(monkeypatch):
+    """After each number of calls there is a structure; from some on it is one that was answered for."""
+    for most in (0, 1, 5, 20, 45):
+        monkeypatch.setattr("mdnum.audit.building.BUILDING_CALLS", most)
+        made = counted()
+        structure = default_structure(loaded(made, sigma=3.4, epsilon=0.01, rc=8.5))
+        assert made.calls <= most and len(structure) >= 32
+        assert "the calls were used up" in structure.info["origin"]
+
+
+def test_a_calculation_of_many_atoms_is_not_begun_where_one_of_few_takes_long(monkeypatch):
+    """Time goes with the third power of the number of atoms: none is asked about that takes minutes."""
+    asked, worked = [], [0.0]
+
+    class Cubic(LennardJones):
+        def calculate(self, atoms=None, *words, **more):
+            asked.append(len(atoms))
+            worked[0] += 0.14 * (len(atoms) / 32) ** 3
+            super().calculate(atoms, *words, **more)
+
+    monkeypatch.setattr("time.process_time", lambda: worked[0])
+    structure = default_structure(loaded(Cubic, sigma=3.4, epsilon=0.01, rc=15.0))
+    assert len(structure) == 32 and max(asked) <= 108
+
+
+def test_the_deadline_ends_building_and_the_audit_says_that_there_is_no_verdict(monkeypatch, tmp_path):
+    """A quarter of the time for a structure; a folder with a page, whatever had been answered."""
+
+    class Passed:
+        left = 0.0
+
+        def __init__(self, minutes=None):
+            self.passed = minutes is not None
+
+    monkeypatch.setattr("mdnum.deadline.Deadline", Passed)
+    outcome = mdnum.audit_calculator(Good, time=1.0, out=tmp_path / "a")
+    assert outcome.summary["status"] == frame.UNDECIDED and (tmp_path / "a" / "report.html").exists()
+    assert "the time was up" in outcome.summary["structure"]
+
+
+def test_the_first_line_names_the_structure(tmp_path):
+    outcome = mdnum.audit_calculator(Good, planted.chain(), checks="caller", out=tmp_path / "a", report=False)
+    assert outcome.summary["headline"].startswith("Good on Ar4Kr2")
+    assert "Not asked: stress, and elements other than Ar and Kr." in outcome.summary["headline"]
