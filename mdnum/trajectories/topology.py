@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, reading
+from mdnum.reading import ase_images, check_claim, reading
 from mdnum.trajectories.frame import Box
 
 #: what a reader of results from MDAnalysis's coordinates should know
@@ -140,8 +140,23 @@ def topology_universe(topology: str | Path) -> Any:
     from MDAnalysis import Universe
     from MDAnalysis.core._get_readers import get_parser_for
 
+    check_claim(topology, atoms_in(topology) or 0)
     with reading(topology), get_parser_for(str(topology))(str(topology)) as parser:
         return Universe(parser.parse())
+
+
+def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
+    """Atoms in a trajectory; None where its format does not tell. Some readers want those of its topology."""
+    from MDAnalysis.core._get_readers import get_reader_for
+
+    for known in ({}, {"n_atoms": topology}):
+        try:
+            reader: Any = get_reader_for(str(path), format=format)
+            return int(reader.parse_n_atoms(str(path), **known))
+        except Exception:
+            # a format without that question, or a file that opening will say more about
+            continue
+    return None
 
 
 # ---- boxes

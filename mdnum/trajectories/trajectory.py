@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Int
 
 from mdnum.errors import InputError, expect_path
-from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
+from mdnum.reading import CHECK, FrameError, UnreadableFrame, check_claim, first_line, reading
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.repeats import Repeats
 from mdnum.trajectories.topology import AtomTable, topology_universe
@@ -86,6 +86,7 @@ class Trajectory(ABC):
 
     def _has(self, atoms: int, table: AtomTable | None = None) -> None:
         """Sets the table of atoms: the topology's, where there is one."""
+        check_claim(self.path, atoms)
         if self.topology is not None:
             table = AtomTable.read(self.topology)
             self._belongs(len(table), atoms)
@@ -308,6 +309,11 @@ def open_trajectory(
             raise InputError("no such file", remedy="Check the path", where=str(one))
         if one is not None and one.is_file() and not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
+        if one is not None and not one.is_dir():
+            if not one.is_file():
+                # a reader would wait for what comes, or read without end
+                raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
+            check_claim(one)
     opened = _reader_of(file, format)(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
@@ -334,9 +340,9 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
-    if word == "xtc":
+    if word in ("xtc", "trr"):
         # without what the readers of all other formats import, which takes as long as reading many frames
-        return binary.XtcTrajectory
+        return binary.XtcTrajectory if word == "xtc" else binary.TrrTrajectory
     import MDAnalysis
 
     from mdnum.trajectories import mdanalysis_source, text
