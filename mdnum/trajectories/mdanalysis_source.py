@@ -48,10 +48,21 @@ _PART = 1 << 22
 
 
 class LibraryFrames:
-    """Frames of one of MDAnalysis's readers, each looked at before the library reads it."""
+    """Frames of one of MDAnalysis's readers, each looked at before the library reads it.
+
+    Attributes:
+        raw: the last frame that was read, before transformations; None where there are none.
+        replaced: whether transformations were made in memory, where nothing of what was read is left.
+    """
 
     def __init__(self, trajectory: Any):
+        from MDAnalysis.coordinates.base import ProtoReader
+
         self.trajectory = trajectory
+        self.raw: Frame | None = None
+        self._later: tuple[Any, ...] = tuple(getattr(trajectory, "transformations", ()))
+        on_reading = type(trajectory)._apply_transformations is ProtoReader._apply_transformations
+        self.replaced = bool(self._later) and not (on_reading and hasattr(trajectory, "_transformations"))
         self.boxes, self.labels = Boxes(trajectory), labels_of(trajectory)
         self._guard = opened(trajectory)
 
@@ -69,7 +80,19 @@ class LibraryFrames:
                 if len(offsets) > number and offsets[number] != self._guard.start(number):
                     raise ValueError(_STALE)
             self._refuse_cut_text(number)
-            return self.trajectory.next() if forward else self.trajectory[number]
+            if not self._later or self.replaced:
+                return self.trajectory.next() if forward else self.trajectory[number]
+            trajectory = self.trajectory
+            trajectory._transformations = []
+            try:
+                ts = trajectory[number]
+                self.raw = Frame(number, 0.0, np.array(ts.positions, np.float64), self._box(ts, number))
+            finally:
+                trajectory._transformations = list(self._later)
+            for one in self._later:
+                ts = one(ts)
+            trajectory.ts = ts
+            return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
         """A frame from a timestep, copied; errors as of `timestep`."""
