@@ -29,7 +29,7 @@ from mdnum.trajectories.topology import (
     atoms_in,
     file_of,
     formats_of,
-    topology_universe,
+    read_topology,
 )
 from mdnum.trajectories.trajectory import Trajectory
 
@@ -145,7 +145,8 @@ class MDAnalysisTrajectory(Trajectory):
         hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
         with reading(path, remedy=CHECK + hint if topology is None else CHECK):
             self._universe, said = self._universe_of(format)
-            self.table = AtomTable.of(self._universe.atoms)
+            if topology is None:
+                self.table = AtomTable.of(self._universe.atoms)
             self.table.give_elements(self._universe)
             trajectory = self._universe.trajectory
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
@@ -173,7 +174,7 @@ class MDAnalysisTrajectory(Trajectory):
                 check_claim(path, atoms_in(path, format=format) or 0)
                 universe = MDAnalysis.Universe(str(path), format=format)
             else:
-                universe = topology_universe(self.topology)
+                self.table, universe = read_topology(self.topology)
                 atoms = len(universe.atoms)
                 other = atoms_in(path, atoms, format)
                 check_claim(path, other or 0)

@@ -6,6 +6,7 @@ import shutil
 import struct
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -406,3 +407,85 @@ def test_a_pipe_or_a_device_is_no_file_to_open(tmp_path):
             open_trajectory(path)
         with pytest.raises(InputError, match="no regular file"):
             open_trajectory(datafiles.XTC, path)
+
+
+# ---- topologies
+
+
+LAMMPS = """\
+ITEM: TIMESTEP
+0
+ITEM: NUMBER OF ATOMS
+8
+ITEM: BOX BOUNDS pp pp pp
+0 12
+0 12
+0 12
+ITEM: ATOMS id type element x y z
+"""
+
+
+@pytest.mark.parametrize("suffix", ["lammpstrj", "extxyz", "traj", "XDATCAR", "gro", "data", "cif", "npz"])
+def test_any_structure_that_can_be_read_says_what_the_atoms_of_a_dcd_are(tmp_path, rng, suffix):
+    path, places = dcd(tmp_path / "a.dcd", rng), rng.uniform(1, SIDE - 1, (8, 3))
+    words = ["O", "H", "H", "C", "O", "H", "H", "N"]
+    atoms = Atoms(words, places, cell=[SIDE] * 3, pbc=True)
+    topology = tmp_path / (suffix if suffix == "XDATCAR" else f"a.{suffix}")
+    if suffix == "lammpstrj":
+        # in the order of LAMMPS's neighbor list, where the dcd has that of the ids
+        rows = [
+            f"{k + 1} 1 {word} {x:.3f} {y:.3f} {z:.3f}\n"
+            for k, (word, (x, y, z)) in enumerate(zip(words, places, strict=True))
+        ]
+        topology.write_text(LAMMPS + "".join(rows[::-1]))
+    elif suffix == "XDATCAR":
+        atoms = atoms[np.argsort(words)]
+        write(topology, atoms, format="vasp-xdatcar")
+    elif suffix == "data":
+        write(topology, atoms, format="lammps-data", masses=True)
+    elif suffix == "npz":
+        np.savez(topology, a=1)
+    else:
+        write(topology, atoms)
+    if suffix in ("data", "npz"):
+        # what is none is refused, as is one that says nothing of a species
+        with pytest.raises(InputError):
+            mdnum.flips(path, topology=topology, pairs=["O-H=5"], out=tmp_path / "a", report=False)
+        return
+    opened = open_trajectory(path, topology)
+    assert opened.species.tolist() == atoms.get_chemical_symbols()
+    assert len(select(opened, "element H")) == 4
+    summary = mdnum.flips(path, topology=topology, pairs=["O-H=5"], out=tmp_path / "a", report=False).summary
+    frames, (oxygen, hydrogen) = (
+        list(opened.frames()),
+        ([np.flatnonzero(opened.species == one) for one in "OH"]),
+    )
+    inside = [
+        {
+            (i, j)
+            for i in oxygen
+            for j in hydrogen
+            if np.linalg.norm(frame.positions[i] - frame.positions[j]) < 5
+        }
+        for frame in frames
+    ]
+    flips = sum(len(one ^ other) for one, other in pairwise(inside))
+    rule = summary["rules"][0]
+    assert rule["entered"] + rule["left"] == flips > 0
+
+
+@pytest.mark.parametrize("kind", ["dcd", "trr", "nc"])
+def test_no_topology_is_needed_without_species(tmp_path, rng, kind):
+    path = tmp_path / f"a.{kind}"
+    if kind == "trr":
+        trr(path, rng.uniform(0, 1, (4, 8, 3)), [None] * 4)
+    else:
+        (dcd if kind == "dcd" else amber)(path, rng)
+    assert mdnum.flips(path, cutoffs=[5.0], out=tmp_path / "a", report=False).summary["frames"] == 4
+
+
+def test_what_mdanalysis_says_of_a_data_file_reaches_the_message(tmp_path, rng):
+    topology = tmp_path / "a.data"
+    topology.write_text(HEADS["a.data"].format(1))
+    with pytest.raises(InputError, match="atom_style="):
+        open_trajectory(dcd(tmp_path / "a.dcd", rng), topology)
