@@ -117,21 +117,15 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
     Raises:
         InputError: there would be a thousand atoms and more to a byte, which compression does not reach.
     """
-    size = Path(path).stat().st_size
-    if atoms is None:
+    size, found = Path(path).stat().st_size, None
+    suffix = next((one for one in reversed(Path(path).suffixes) if one not in (".gz", ".bz2")), "").lower()
+    if atoms is None and (announced := _ANNOUNCED.get(suffix)):
         from ase.io.formats import open_with_compression
 
-        name = Path(path)
-        suffix = (name.with_suffix("") if name.suffix in (".gz", ".bz2") else name).suffix.lower()
-        if suffix not in _ANNOUNCED:
-            return
-        try:
-            with open_with_compression(str(path), "r") as file:
-                found = re.match(_ANNOUNCED[suffix], file.read(_HEAD), re.DOTALL)
-        except (OSError, EOFError, ValueError, zlib.error):
-            # opening it will say more
-            return
-        atoms = int(found[1]) if found else 0
+        # opening a damaged file will say more
+        with suppress(OSError, EOFError, ValueError, zlib.error), open_with_compression(str(path)) as file:
+            found = re.match(announced, file.read(_HEAD), re.DOTALL)
+    atoms = atoms or (int(found[1]) if found else 0)
     if atoms > _MOST_ATOMS * max(size, 1):
         said = f"it announces {atoms:,} atoms, which its {size:,} bytes cannot hold"
         raise InputError(said, remedy=CHECK, where=str(path))

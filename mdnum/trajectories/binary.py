@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float
 
 from mdnum.reading import reading
 from mdnum.trajectories.frame import Box, Frame
@@ -47,10 +46,10 @@ _FIRST, _LAST = 9, 72
 # a coordinate this wide is written by itself
 _WIDE = 0xFFFFFF
 
-# of trr: magic, length of the word with its end, length of the word, the word; the bytes of ten blocks,
-# atoms, step and one more
+# of trr: magic, length of the word with its end, length of the word, the word; the bytes of ten blocks, of
+# which the third is the box and the last three are positions, velocities and forces; atoms, step and one more
 _TRR, _TRR_BEGIN = struct.Struct(">3i12s13i"), (1993, b"GMX_trn_file")
-_BLOCKS = ("ir", "e", "box", "virial", "pressure", "topology", "symbols", "x", "v", "f")
+_BOX, _X = 2, 7
 # nm to Å
 _TEN = np.float32(10)
 
@@ -105,7 +104,7 @@ class XdrFile:
         """Where a frame begins, bytes."""
         while len(self._starts) <= number:
             at = len(self._starts) - 1
-            self._pass(at)
+            self._stream(at)
             end = self._file.tell()
             if end > self._size:
                 raise ValueError("the file ends in it")
@@ -116,12 +115,8 @@ class XdrFile:
         """Examines a frame without decoding it."""
         self.start(number + 1)
 
-    def read(self, number: int) -> Any:
-        """A frame, in nm and ps, once it has been checked."""
-        raise NotImplementedError
-
-    def _pass(self, number: int) -> None:
-        """Goes to the end of a frame."""
+    def _stream(self, number: int, look: bool = False) -> None:
+        """Goes to the end of a frame, through its coordinates or past them."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -133,6 +128,8 @@ class XdrFile:
 
 class XtcFile(XdrFile):
     """Frames of an xtc file."""
+
+    bits = 32
 
     def __init__(self, path: str | Path):
         super().__init__(path)
@@ -170,9 +167,6 @@ class XtcFile(XdrFile):
         self._at = number + 1
         return self._library.read()
 
-    def _pass(self, number: int) -> None:
-        self._stream(number, look=False)
-
     def _head(self, number: int) -> tuple[Any, ...]:
         self._file.seek(self.start(number))
         head = _HEAD.unpack(self._read(_HEAD.size))
@@ -180,8 +174,7 @@ class XtcFile(XdrFile):
             raise ValueError("damaged: no head of a frame where one has to be")
         return head
 
-    def _stream(self, number: int, look: bool) -> None:
-        """Goes to the end of a frame, through its compressed coordinates or past them."""
+    def _stream(self, number: int, look: bool = False) -> None:
         head = self._head(number)
         atoms = head[1]
         if atoms <= _PLAIN:
@@ -243,48 +236,50 @@ def _walk(stream, atoms, whole, small):
     return at if done == atoms and at <= most else -8
 
 
-class TrrFrame(NamedTuple):
-    """A frame of a trr file, in nm and ps."""
-
-    time: float
-    box: Float[np.ndarray, "3 3"] | None
-    positions: Float[np.ndarray, "atoms 3"]
-    velocities: Float[np.ndarray, "atoms 3"] | None
-
-
 class TrrFile(XdrFile):
     """Frames of a trr file, in float32 or float64 as they are written."""
 
-    def head(self, number: int) -> tuple[int, int, dict[str, int]]:
-        """(atoms, bytes of a number, bytes of each block of a frame); the file stands at its time."""
+    @property
+    def atoms(self) -> int:
+        """Atoms of the first frame."""
+        return self.head(0)[0]
+
+    @property
+    def bits(self) -> int:
+        """Width of its numbers."""
+        return 8 * self.head(0)[1]
+
+    def head(self, number: int) -> tuple[int, int, list[int]]:
+        """(atoms, bytes of a number, bytes of the ten blocks) of a frame; the file is then at its time."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
-        blocks, atoms = numbers[:10], numbers[10]
-        sizes: dict[str, int] = dict(zip(_BLOCKS, blocks, strict=True))
+        sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]
         # nine numbers of a box, or three an atom, are of one width, and so are the time and lambda
-        vectors = [sizes[name] for name in ("x", "v", "f") if sizes[name]]
-        width = sizes["box"] // 9 if sizes["box"] else max(vectors, default=0) // max(3 * atoms, 1)
-        fits = all(size == 3 * width * atoms for size in vectors) and sizes["box"] in (0, 9 * width)
-        if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(blocks) < 0:
+        vectors = [size for size in sizes[_X:] if size]
+        width = box // 9 if box else max(vectors, default=0) // max(3 * atoms, 1)
+        fits = all(size == 3 * width * atoms for size in vectors) and box in (0, 9 * width)
+        if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(sizes) < 0:
             raise ValueError("damaged: no head of a frame where one has to be")
         return atoms, width, sizes
 
-    def _pass(self, number: int) -> None:
-        _, width, sizes = self.head(number)
-        self._file.seek(2 * width + sum(sizes.values()), 1)
+    def has_box(self, number: int) -> bool:
+        """Whether a frame has one."""
+        return self.head(number)[2][_BOX] > 0
 
-    def read(self, number: int) -> TrrFrame:
-        """A frame."""
+    def _stream(self, number: int, look: bool = False) -> None:
         _, width, sizes = self.head(number)
-        time, _ = np.frombuffer(self._read(2 * width), f">f{width}")
-        found = {}
-        for name, size in sizes.items():
-            data = self._read(size)
-            if size and name in ("box", "x", "v"):
-                found[name] = np.frombuffer(data, f">f{width}").reshape(-1, 3).astype(f"f{width}")
-        if "x" not in found:
+        self._file.seek(2 * width + sum(sizes), 1)
+
+    def read(self, number: int) -> tuple[float, Any, np.ndarray, Any]:
+        """(time, box or None, positions, velocities or None) of a frame, in nm and ps."""
+        _, width, sizes = self.head(number)
+        time, *blocks = [np.frombuffer(self._read(size), f">f{width}") for size in (2 * width, *sizes)]
+        box, x, v = (
+            blocks[k].reshape(-1, 3).astype(f"f{width}") if sizes[k] else None for k in (_BOX, _X, _X + 1)
+        )
+        if x is None:
             raise ValueError("it has no positions")
-        return TrrFrame(float(time), found.get("box"), found["x"], found.get("v"))
+        return float(time[0]), box, x, v
 
 
 class XtcTrajectory(Trajectory):
@@ -292,15 +287,14 @@ class XtcTrajectory(Trajectory):
 
     format = "XTC"
     reader = "MDAnalysis"
-    bits = 32
     time = "ps"
     notes = (NARROWED,)
-    _file: type[XdrFile] = XtcFile
+    _file: type[Any] = XtcFile
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
         with reading(path, by="mdnum"), closing(self._file(path)) as file:
-            atoms = self._atoms(file)
+            atoms, self.bits = file.atoms, file.bits
             whole = file.whole_frames()
             # a frame that is cut is one to read
             self._count = whole + (not file.ends_at(whole))
@@ -308,9 +302,6 @@ class XtcTrajectory(Trajectory):
         # of the last frame, which has the same box as the next in most files
         self._box = b"", Box()
         self.notes = (*self.notes, *self.table.notes)
-
-    def _atoms(self, file: Any) -> int:
-        return file.atoms
 
     @contextmanager
     def _reader(self) -> Iterator[Callable[[int], Any]]:
@@ -341,19 +332,13 @@ class TrrTrajectory(XtcTrajectory):
     notes = ()
     _file = TrrFile
 
-    def _atoms(self, file: TrrFile) -> int:
-        atoms, width, _ = file.head(0)
-        self.bits = 8 * width
-        return atoms
-
-    def _frame(self, number: int, raw: TrrFrame) -> Frame:
-        box, ten = Box(), raw.positions.dtype.type(10)
-        if raw.box is not None and raw.box.any():
-            wide = raw.box.dtype == np.float64
-            box = Box(raw.box * ten, np.ones(3, bool)) if wide else self._box_of(raw.box)
-        x, v = (None if one is None else (one * ten).astype(np.float64) for one in raw[2:])
-        assert x is not None
-        return Frame(number, raw.time, x, box, v)
+    def _frame(self, number: int, raw: Any) -> Frame:
+        time, vectors, x, v = raw
+        box, ten = Box(), x.dtype.type(10)
+        if vectors is not None and vectors.any():
+            box = self._box_of(vectors) if self.bits == 32 else Box(vectors * ten, np.ones(3, bool))
+        v = None if v is None else (v * ten).astype(np.float64)
+        return Frame(number, time, (x * ten).astype(np.float64), box, v)
 
 
 # ---- NetCDF

@@ -107,7 +107,7 @@ class LibraryFrames:
             )
 
     def _box(self, ts: Any, number: int) -> Box:
-        if isinstance(self._guard, TrrFile) and not self._guard.head(number)[2]["box"]:
+        if isinstance(self._guard, TrrFile) and not self._guard.has_box(number):
             # what MDAnalysis has then is what was in the memory
             return Box()
         return self.boxes.box(ts, number)

@@ -486,6 +486,6 @@ def test_no_topology_is_needed_without_species(tmp_path, rng, kind):
 
 def test_what_mdanalysis_says_of_a_data_file_reaches_the_message(tmp_path, rng):
     topology = tmp_path / "a.data"
-    topology.write_text(HEADS["a.data"].format(1))
+    topology.write_text(HEADS["a.data"].format(1).replace("1 1 0 0 0", "1 water 0 0 0"))
     with pytest.raises(InputError, match="atom_style="):
         open_trajectory(dcd(tmp_path / "a.dcd", rng), topology)
