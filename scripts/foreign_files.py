@@ -196,12 +196,13 @@ def campaign(
                     child.stdin.flush()
                     with selectors.DefaultSelector() as waiting:
                         waiting.register(child.stdout, selectors.EVENT_READ)
-                        answer = child.stdout.readline() if waiting.select(patience) else ""
+                        late = not waiting.select(patience)
+                        answer = "" if late else child.stdout.readline()
                     if answer:
                         outcome, said = json.loads(answer)
                     else:
-                        late = child.poll() is None
-                        child.kill()
+                        if late:
+                            child.kill()
                         outcome, said = (
                             ("HANG", f"{patience:g} s") if late else ("CRASH", f"exit {child.wait()}")
                         )
