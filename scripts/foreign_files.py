@@ -154,7 +154,7 @@ def examine(path: Path, way: str, how: str) -> tuple[str, str]:
         out = ["--no-report", "-o", str(Path(elsewhere) / "out")]
         if way == "trajectory":
             frames = "@:3" if len(content) > _LARGE else ""
-            outcome, said = call(["flips", f"{copy}{frames}", "--cutoff", "2.5", *out])
+            outcome, said = call(["flips", f"{copy}{frames}", "--cutoff", "1", *out])
         elif way == "topology":
             outcome, said = call(["flips", str(small), "-s", str(copy), "--cutoff", "5", *out])
             if "atoms and the trajectory 2" in said:

@@ -4,6 +4,7 @@ import os
 import resource
 import shutil
 import struct
+import sys
 import threading
 import time
 from itertools import pairwise
@@ -20,6 +21,7 @@ from scipy.io import netcdf_file
 
 import mdnum
 from mdnum.audit.structures import read_structure
+from mdnum.cli import main
 from mdnum.errors import InputError
 from mdnum.reading import UnreadableFrame, ase_images, first_line, reading
 from mdnum.trajectories import NeighborFlips
@@ -489,3 +491,39 @@ def test_what_mdanalysis_says_of_a_data_file_reaches_the_message(tmp_path, rng):
     topology.write_text(HEADS["a.data"].format(1).replace("1 1 0 0 0", "1 water 0 0 0"))
     with pytest.raises(InputError, match="atom_style="):
         open_trajectory(dcd(tmp_path / "a.dcd", rng), topology)
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.extxyz", "POSCAR", "a.cube"])
+def test_a_system_whose_structure_announces_too_many_atoms_is_refused_at_once(tmp_path, capsys, name):
+    (tmp_path / name).write_text(HEADS[name].format(10**12))
+    (tmp_path / "system.toml").write_text(SYSTEM.format(name))
+    began = time.perf_counter()
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(main(["systems", "check", str(tmp_path / "system.toml")]))
+    said = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and len(said) == 1 and name in said[0]
+    assert time.perf_counter() - began < 20
+
+
+SYSTEM = """\
+name = "argon"
+units = "metal"
+[structure]
+file = "{}"
+[potential]
+kind = "lennard-jones"
+sigma = 3.405
+epsilon = 0.0103235
+[cutoff]
+kind = "hard"
+radius = 8.5
+compare = "r2 <"
+[neighbors]
+skin = 1.0
+[dynamics]
+kind = "nve"
+timestep = 0.002
+temperature = 40.0
+steps = 4
+seed = 7
+"""
