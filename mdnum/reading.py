@@ -10,8 +10,10 @@ import io
 import re
 import sys
 import warnings
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,16 @@ _ENDS = "buffer is smaller than requested size"
 _WRAPPED = ("Failed to construct topology", "Failed to load from the topology")
 # names of columns that are velocities or momenta
 _VELOCITY = re.compile(r"(v|vel\w*|v_?[xyz]|mom|momentum|momenta\w+)", re.IGNORECASE)
+# the number of atoms in the head of formats whose readers count up to it, or fill memory, at once
+_LINE_ONE, _PRMTOP = r"\s*(\d+)", r".*?%FLAG POINTERS\s*%FORMAT[^\n]*\s*(\d+)"
+_ANNOUNCED = {
+    ".xyz": _LINE_ONE, ".txyz": _LINE_ONE, ".arc": _LINE_ONE, ".gro": r"[^\n]*\n\s*(\d+)",
+    ".inpcrd": r"[^\n]*\n\s*(\d+)", ".psf": r".*?(\d+)\s*!NATOM", ".data": r".*?\n\s*(\d+)\s+atoms",
+    ".crd": r"(?:\s*\*[^\n]*\n)*\s*(\d+)", ".prmtop": _PRMTOP, ".parm7": _PRMTOP, ".top": _PRMTOP,
+}  # fmt: skip
+_HEAD = 20_000
+# atoms to a byte of a file
+_MOST_ATOMS = 1000
 # calls at the end of a file after which a reader is taken to count and not to read
 _PATIENCE = 10_000
 
@@ -95,6 +107,30 @@ def reading(
         sys.unraisablehook = hook
 
 
+def check_claim(path: str | Path, atoms: int | None = None) -> None:
+    """Rejects a number of atoms that a file cannot hold, for which readers would allocate memory, or count.
+
+    Args:
+        path: the file.
+        atoms: what its head announces; None to look for that in formats whose readers believe it.
+
+    Raises:
+        InputError: there would be a thousand atoms and more to a byte, which compression does not reach.
+    """
+    size, found = Path(path).stat().st_size, None
+    suffix = next((one for one in reversed(Path(path).suffixes) if one not in (".gz", ".bz2")), "").lower()
+    if atoms is None and (announced := _ANNOUNCED.get(suffix)):
+        from ase.io.formats import open_with_compression
+
+        # opening a damaged file will say more
+        with suppress(OSError, EOFError, ValueError, zlib.error), open_with_compression(str(path)) as file:
+            found = re.match(announced, file.read(_HEAD), re.DOTALL)
+    atoms = atoms or (int(found[1]) if found else 0)
+    if atoms > _MOST_ATOMS * max(size, 1):
+        said = f"it announces {atoms:,} atoms, which its {size:,} bytes cannot hold"
+        raise InputError(said, remedy=CHECK, where=str(path))
+
+
 def first_line(error: BaseException) -> str:
     """The message of an error in a line."""
     cause: BaseException | None = error
@@ -152,6 +188,11 @@ def ase_images(
     if kind.acceptsfd and not kind.isbinary:
         lines: Any = open_with_compression(file, "r")
         file = _Lines(lines.detach(), lines.encoding, lines.errors)
+        if kind.name == "vasp":
+            # a list of so many symbols is made first
+            counts = [one for row in list(islice(file, 7))[5:] for one in row.split() if one.isdecimal()]
+            check_claim(path, sum(map(int, counts)))
+            file.seek(0)
     found: Any = read if isinstance(index, str) else iread
     yield from map(with_elements, found(file, index, format, do_not_split_by_at_sign=True))
 

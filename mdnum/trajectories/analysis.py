@@ -30,11 +30,11 @@ from MDAnalysis.core.universe import Universe
 from mdnum.errors import InputError
 from mdnum.reading import FrameError, UnreadableFrame
 from mdnum.trajectories.collective import Collective
-from mdnum.trajectories.frame import FrameCheck
+from mdnum.trajectories.frame import Frame, FrameCheck
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.repeats import Repeats, digest
-from mdnum.trajectories.resolution import Resolution, infer
+from mdnum.trajectories.resolution import FLOAT32, Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.topology import AtomTable, formats_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
@@ -183,12 +183,14 @@ class NeighborFlips(AnalysisBase):
         r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of them for several at once.
         other: with it, pairs of one atom of each group; atoms may be in both.
         rule: any membership rule or several, in the place of r_cut or beside it.
-        bound: how far a distance can be off, Å; None for what the resolution of the file gives.
+        bound: how far a distance can be off, Å; None for what the resolution of the file gives, as it is
+            before transformations.
         verbose: show progress.
 
     Raises:
         InputError: an empty or changing group, groups of two universes, no rule or none that can be, a
-            species that no atom has, a bound below 0.
+            species that no atom has, a bound below 0. By `run` without a bound: transformations change
+            distances, or were made in memory.
 
     Error: MDAnalysis hands coordinates over in float32; from there on everything is float64.
     """
@@ -303,16 +305,26 @@ class NeighborFlips(AnalysisBase):
                 f"the frames go backward or stand still: frame {after} after frame {before}",
                 remedy="Give them in ascending order: flips follow time",
             )
-        sample = []
+        sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
             try:
                 sample.append(self.library.frame(self.library.timestep(int(number)), int(number)))
             except UnreadableFrame:
                 # met again in its turn, and told there
                 break
+            # a transformation hides the digits that were read
+            raw.append(self.library.raw or sample[-1])
+            changed = max(changed, _changed(raw[-1], sample[-1]))
         if sample:
-            self._resolution = infer(sample, 32, formats_of(self._trajectory)[0])
+            self._resolution = infer(raw, 32, formats_of(self._trajectory)[0])
             self._check.pbc = sample[0].box.pbc
+            if self._bound is None and (self.library.replaced or changed > self._bound_of(sample[-1])):
+                why = f"they change distances by up to {changed:.3g} Å"
+                why = "they have replaced what was read in memory" if self.library.replaced else why
+                raise InputError(
+                    f"the transformations of the trajectory hide its digits: {why}",
+                    remedy="Give bound=LENGTH, by which a distance can be off (0 for none), or remove them",
+                )
         self._library = None
         return groups
 
@@ -381,9 +393,7 @@ class NeighborFlips(AnalysisBase):
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
-        bound = self._bound or 0.0
-        if self._bound is None and self._resolution is not None:
-            bound = self._resolution.bound(frame, self._check.atoms)
+        bound = self._bound_of(frame) if self._bound is None else self._bound
         try:
             # a margin among the nearest is the difference of two distances
             return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
@@ -391,6 +401,16 @@ class NeighborFlips(AnalysisBase):
             raise FrameError(
                 f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
             ) from error
+
+    def _bound_of(self, frame: Frame) -> float:
+        """How far a distance in the frame that was just read can be off, length."""
+        if self._resolution is None:
+            return 0.0
+        atoms, raw = self._check.atoms, self.library.raw
+        if raw is None:
+            return self._resolution.bound(frame, atoms)
+        # what transformations give is rounded once more
+        return self._resolution.bound(raw, atoms) + FLOAT32.bound(frame, atoms)
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence
@@ -425,6 +445,21 @@ class NeighborFlips(AnalysisBase):
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
         count = int(self._trajectory.n_frames)
         return None if rest is None else _Failure(count, f"frame {count} cannot be read ({rest})", True)
+
+
+def _changed(before: Frame, after: Frame) -> float:
+    """How much distances between successive atoms differ that transformations should have kept, length.
+
+    Kept is one up to lattice vectors, or in a rotation.
+    """
+    if before is after:
+        return 0.0
+    old, new = np.diff(before.positions, axis=0), np.diff(after.positions, axis=0)
+    apart = new - old
+    if after.box.pbc.all():
+        apart -= np.rint(np.linalg.solve(after.box.matrix.T, apart.T).T) @ after.box.matrix
+    turned = np.abs(np.linalg.norm(new, axis=1) - np.linalg.norm(old, axis=1))
+    return float(np.minimum(turned, np.linalg.norm(apart, axis=1)).max(initial=0.0))
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:

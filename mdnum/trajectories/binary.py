@@ -1,10 +1,13 @@
-"""Binary files that are read with care: GROMACS's xtc when damaged, Amber's NetCDF when it ends early.
+"""Binary files that are read with care: GROMACS's xtc and trr, Amber's NetCDF when it ends early.
 
 The library that decodes xtc files divides by zero, or writes where it must not, when bytes are wrong, and all
 that was read before is lost with the process. So each frame is looked at first. The compressed stream says
 how many bits each atom takes, and walking through it (decoding nothing) tells whether it is one: head, number
 of atoms, step sizes and length have to come out. Damage that leaves a stream which could have been written is
 not found. Source: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), the walk alone.
+
+MDAnalysis's readers of xtc and trr keep an index next to the file. They write it through links and trust it
+where it belongs to another file; nothing of the kind is done here. Source of trr: GROMACS, trrio.
 
 The libraries that read Amber's NetCDF take a file with fewer records than its head names, which is what a run
 that was killed leaves, for no file at all. Classic format, with 32 or 64 bit offsets
@@ -43,6 +46,13 @@ _FIRST, _LAST = 9, 72
 # a coordinate this wide is written by itself
 _WIDE = 0xFFFFFF
 
+# of trr: magic, length of the word with its end, length of the word, the word; the bytes of ten blocks, of
+# which the third is the box and the last three are positions, velocities and forces; atoms, step and one more
+_TRR, _TRR_BEGIN = struct.Struct(">3i12s13i"), (1993, b"GMX_trn_file")
+_BOX, _X = 2, 7
+# nm to Å
+_TEN = np.float32(10)
+
 # NetCDF's bytes of each type: byte, char, short, int, float, double
 _TYPES = {1: ">i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8"}
 _OFFSETS = {1: ">I", 2: ">Q"}
@@ -52,14 +62,14 @@ _STREAMING = 0xFFFFFFFF
 _LONGEST = 1 << 24
 
 
-def opened(trajectory: Any) -> XtcFile | None:
-    """The file behind an MDAnalysis trajectory; None where that is no xtc file."""
-    path = file_of(trajectory)
-    return None if trajectory.format != "XTC" or path is None else XtcFile(path)
+def opened(trajectory: Any) -> XdrFile | None:
+    """The file behind an MDAnalysis trajectory; None where that is neither xtc nor trr."""
+    path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
+    return None if kind is None or path is None else kind(path)
 
 
-class XtcFile:
-    """Frames of an xtc file, by number.
+class XdrFile:
+    """Frames of a file of GROMACS's, by number. Nothing is written beside the file, nor read there.
 
     Raises:
         ValueError: by every method, where bytes are not what they have to be or the file ends.
@@ -70,26 +80,17 @@ class XtcFile:
         self.path = path
         self._size = Path(path).stat().st_size
         self._starts = [0]
-        self._library: Any = None
-        self._at = 0
 
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
-        if self._library is not None:
-            self._library.close()
-
-    @property
-    def atoms(self) -> int:
-        """Atoms of the first frame."""
-        return self._head(0)[1]
 
     def whole_frames(self) -> int:
         """Frames up to the end of the file, or to the first whose head is damaged or whose end is missing."""
         number = 0
         try:
             while self._starts[number] < self._size:
-                self._start(number + 1)
+                self.start(number + 1)
                 number += 1
         except ValueError:
             pass
@@ -97,7 +98,54 @@ class XtcFile:
 
     def ends_at(self, number: int) -> bool:
         """Whether the file ends with the frame before this one."""
-        return self._start(number) == self._size
+        return self.start(number) == self._size
+
+    def start(self, number: int) -> int:
+        """Where a frame begins, bytes."""
+        while len(self._starts) <= number:
+            at = len(self._starts) - 1
+            self._stream(at)
+            end = self._file.tell()
+            if end > self._size:
+                raise ValueError("the file ends in it")
+            self._starts.append(end)
+        return self._starts[number]
+
+    def check(self, number: int) -> None:
+        """Examines a frame without decoding it."""
+        self.start(number + 1)
+
+    def _stream(self, number: int, look: bool = False) -> None:
+        """Goes to the end of a frame, through its coordinates or past them."""
+        raise NotImplementedError
+
+    def _read(self, count: int) -> bytes:
+        data = self._file.read(min(count, self._size + 1))
+        if len(data) < count:
+            raise ValueError("the file ends in it")
+        return data
+
+
+class XtcFile(XdrFile):
+    """Frames of an xtc file."""
+
+    bits = 32
+
+    def __init__(self, path: str | Path):
+        super().__init__(path)
+        self._library: Any = None
+        self._at = 0
+
+    def close(self) -> None:
+        """Closes the file."""
+        super().close()
+        if self._library is not None:
+            self._library.close()
+
+    @property
+    def atoms(self) -> int:
+        """Atoms of the first frame."""
+        return self._head(0)[1]
 
     def check(self, number: int) -> None:
         """Looks at a frame without decoding it."""
@@ -119,25 +167,14 @@ class XtcFile:
         self._at = number + 1
         return self._library.read()
 
-    def _start(self, number: int) -> int:
-        while len(self._starts) <= number:
-            at = len(self._starts) - 1
-            self._stream(at, look=False)
-            end = self._file.tell()
-            if end > self._size:
-                raise ValueError("the file ends in it")
-            self._starts.append(end)
-        return self._starts[number]
-
     def _head(self, number: int) -> tuple[Any, ...]:
-        self._file.seek(self._start(number))
+        self._file.seek(self.start(number))
         head = _HEAD.unpack(self._read(_HEAD.size))
         if head[0] not in _MAGIC or head[1] != head[-1] or head[1] < 0:
             raise ValueError("damaged: no head of a frame where one has to be")
         return head
 
-    def _stream(self, number: int, look: bool) -> None:
-        """Goes to the end of a frame, through its compressed coordinates or past them."""
+    def _stream(self, number: int, look: bool = False) -> None:
         head = self._head(number)
         atoms = head[1]
         if atoms <= _PLAIN:
@@ -160,12 +197,6 @@ class XtcFile:
         self._read(-size % 4)
         if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
             raise ValueError("damaged: the compressed coordinates do not end where their length says")
-
-    def _read(self, count: int) -> bytes:
-        data = self._file.read(min(count, self._size + 1))
-        if len(data) < count:
-            raise ValueError("the file ends in it")
-        return data
 
 
 @numba.njit(cache=True, nogil=True)
@@ -205,43 +236,109 @@ def _walk(stream, atoms, whole, small):
     return at if done == atoms and at <= most else -8
 
 
+class TrrFile(XdrFile):
+    """Frames of a trr file, in float32 or float64 as they are written."""
+
+    @property
+    def atoms(self) -> int:
+        """Atoms of the first frame."""
+        return self.head(0)[0]
+
+    @property
+    def bits(self) -> int:
+        """Width of its numbers."""
+        return 8 * self.head(0)[1]
+
+    def head(self, number: int) -> tuple[int, int, list[int]]:
+        """(atoms, bytes of a number, bytes of the ten blocks) of a frame; the file is then at its time."""
+        self._file.seek(self.start(number))
+        magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
+        sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]
+        # nine numbers of a box, or three an atom, are of one width, and so are the time and lambda
+        vectors = [size for size in sizes[_X:] if size]
+        width = box // 9 if box else max(vectors, default=0) // max(3 * atoms, 1)
+        fits = all(size == 3 * width * atoms for size in vectors) and box in (0, 9 * width)
+        if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(sizes) < 0:
+            raise ValueError("damaged: no head of a frame where one has to be")
+        return atoms, width, sizes
+
+    def has_box(self, number: int) -> bool:
+        """Whether a frame has one."""
+        return self.head(number)[2][_BOX] > 0
+
+    def _stream(self, number: int, look: bool = False) -> None:
+        _, width, sizes = self.head(number)
+        self._file.seek(2 * width + sum(sizes), 1)
+
+    def read(self, number: int) -> tuple[float, Any, np.ndarray, Any]:
+        """(time, box or None, positions, velocities or None) of a frame, in nm and ps."""
+        _, width, sizes = self.head(number)
+        time, *blocks = [np.frombuffer(self._read(size), f">f{width}") for size in (2 * width, *sizes)]
+        box, x, v = (
+            blocks[k].reshape(-1, 3).astype(f"f{width}") if sizes[k] else None for k in (_BOX, _X, _X + 1)
+        )
+        if x is None:
+            raise ValueError("it has no positions")
+        return float(time[0]), box, x, v
+
+
 class XtcTrajectory(Trajectory):
     """An xtc file, in Å and ps. Its coordinates are integers, and float32 by the time they come here."""
 
     format = "XTC"
     reader = "MDAnalysis"
-    bits = 32
     time = "ps"
+    notes = (NARROWED,)
+    _file: type[Any] = XtcFile
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        with reading(path, by="mdnum"), closing(XtcFile(path)) as file:
-            atoms = file.atoms
+        with reading(path, by="mdnum"), closing(self._file(path)) as file:
+            atoms, self.bits = file.atoms, file.bits
             whole = file.whole_frames()
             # a frame that is cut is one to read
             self._count = whole + (not file.ends_at(whole))
         self._has(atoms)
         # of the last frame, which has the same box as the next in most files
         self._box = b"", Box()
-        self.notes = (NARROWED, *self.table.notes)
+        self.notes = (*self.notes, *self.table.notes)
 
     @contextmanager
     def _reader(self) -> Iterator[Callable[[int], Any]]:
-        with closing(XtcFile(self.path)) as file:
+        with closing(self._file(self.path)) as file:
             yield file.read
 
     def _frame(self, number: int, raw: Any) -> Frame:
+        return Frame(number, float(raw.time), (raw.x * _TEN).astype(np.float64), self._box_of(raw.box))
+
+    def _box_of(self, vectors: np.ndarray) -> Box:
         # in Å by the operations that MDAnalysis makes, so that both see the same numbers
         from MDAnalysis.lib.mdamath import triclinic_box
 
-        ten = np.float32(10)
         known, box = self._box
-        if (vectors := raw.box.tobytes()) != known:
-            dimensions: Any = triclinic_box(*raw.box)
-            dimensions[:3] *= ten
+        if (read := vectors.tobytes()) != known:
+            dimensions: Any = triclinic_box(*vectors)
+            dimensions[:3] *= _TEN
             box = box_of(dimensions)
-            self._box = vectors, box
-        return Frame(number, float(raw.time), (raw.x * ten).astype(np.float64), box)
+            self._box = read, box
+        return box
+
+
+class TrrTrajectory(XtcTrajectory):
+    """A trr file, in Å and ps."""
+
+    format = "TRR"
+    reader = "mdnum"
+    notes = ()
+    _file = TrrFile
+
+    def _frame(self, number: int, raw: Any) -> Frame:
+        time, vectors, x, v = raw
+        box, ten = Box(), x.dtype.type(10)
+        if vectors is not None and vectors.any():
+            box = self._box_of(vectors) if self.bits == 32 else Box(vectors * ten, np.ones(3, bool))
+        v = None if v is None else (v * ten).astype(np.float64)
+        return Frame(number, time, (x * ten).astype(np.float64), box, v)
 
 
 # ---- NetCDF

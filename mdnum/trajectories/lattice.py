@@ -353,7 +353,8 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
             if lattice.periodic[k]:
                 bins[k] = max(1, int(min(lattice.widths[k] / width, 1e6)))
                 step[k] = 1.0 / bins[k]
-                reach[k] = int(np.ceil(safe * bins[k] / lattice.widths[k]))
+                # no memory holds as many images
+                reach[k] = int(min(np.ceil(safe * bins[k] / lattice.widths[k]), 1e9))
             else:
                 # three at least, so that no bin is met twice
                 bins[k], step[k] = 3 + int(min(extent[k] / safe, 1e6)), safe

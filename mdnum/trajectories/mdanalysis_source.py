@@ -9,33 +9,34 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import struct
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mdnum.reading import CHECK, reading
-from mdnum.trajectories.binary import head_of, opened
+from mdnum.reading import CHECK, check_claim, reading
+from mdnum.trajectories.binary import TrrFile, head_of, opened
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
 from mdnum.trajectories.topology import (
     NARROWED,
     AtomTable,
     Boxes,
+    atoms_in,
     file_of,
     formats_of,
-    topology_universe,
+    read_topology,
 )
 from mdnum.trajectories.trajectory import Trajectory
 
-# of trr: magic, length of the word with its end, length of the word, the word; then thirteen numbers
-_TRR = struct.Struct(">3i12s13i")
-_TRR_MAGIC = 1993
+_STALE = (
+    "the index of frames that MDAnalysis keeps next to the file is not of this file; open the Universe with "
+    "refresh_offsets=True"
+)
 # readers of text by lines, and where each has its open file
 _LINES = {"XYZ": "xyzfile", "TXYZ": "xyzfile", "ARC": "xyzfile", "TRJ": "trjfile", "MDCRD": "trjfile"}
 # where readers keep the places at which frames begin
@@ -47,10 +48,21 @@ _PART = 1 << 22
 
 
 class LibraryFrames:
-    """Frames of one of MDAnalysis's readers, each looked at before the library reads it."""
+    """Frames of one of MDAnalysis's readers, each looked at before the library reads it.
+
+    Attributes:
+        raw: the last frame that was read, before transformations; None where there are none.
+        replaced: whether transformations were made in memory, where nothing of what was read is left.
+    """
 
     def __init__(self, trajectory: Any):
+        from MDAnalysis.coordinates.base import ProtoReader
+
         self.trajectory = trajectory
+        self.raw: Frame | None = None
+        self._later: tuple[Any, ...] = tuple(getattr(trajectory, "transformations", ()))
+        on_reading = type(trajectory)._apply_transformations is ProtoReader._apply_transformations
+        self.replaced = bool(self._later) and not (on_reading and hasattr(trajectory, "_transformations"))
         self.boxes, self.labels = Boxes(trajectory), labels_of(trajectory)
         self._guard = opened(trajectory)
 
@@ -64,8 +76,23 @@ class LibraryFrames:
         with self._reading(number):
             if self._guard is not None:
                 self._guard.check(number)
+                offsets = getattr(getattr(self.trajectory, "_xdr", None), "offsets", ())
+                if len(offsets) > number and offsets[number] != self._guard.start(number):
+                    raise ValueError(_STALE)
             self._refuse_cut_text(number)
-            return self.trajectory.next() if forward else self.trajectory[number]
+            if not self._later or self.replaced:
+                return self.trajectory.next() if forward else self.trajectory[number]
+            trajectory = self.trajectory
+            trajectory._transformations = []
+            try:
+                ts = trajectory[number]
+                self.raw = Frame(number, 0.0, np.array(ts.positions, np.float64), self._box(ts, number))
+            finally:
+                trajectory._transformations = list(self._later)
+            for one in self._later:
+                ts = one(ts)
+            trajectory.ts = ts
+            return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
         """A frame from a timestep, copied; errors as of `timestep`."""
@@ -74,10 +101,16 @@ class LibraryFrames:
                 index=number,
                 time=float(number) if untimed else float(ts.time),
                 positions=np.array(ts.positions, np.float64),
-                box=self.boxes.box(ts, number),
+                box=self._box(ts, number),
                 velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
                 labels=self.labels(number),
             )
+
+    def _box(self, ts: Any, number: int) -> Box:
+        if isinstance(self._guard, TrrFile) and not self._guard.has_box(number):
+            # what MDAnalysis has then is what was in the memory
+            return Box()
+        return self.boxes.box(ts, number)
 
     def _reading(self, number: int) -> AbstractContextManager[None]:
         return reading(file_of(self.trajectory) or "the trajectory", number)
@@ -112,7 +145,8 @@ class MDAnalysisTrajectory(Trajectory):
         hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
         with reading(path, remedy=CHECK + hint if topology is None else CHECK):
             self._universe, said = self._universe_of(format)
-            self.table = AtomTable.of(self._universe.atoms)
+            if topology is None:
+                self.table = AtomTable.of(self._universe.atoms)
             self.table.give_elements(self._universe)
             trajectory = self._universe.trajectory
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
@@ -137,11 +171,13 @@ class MDAnalysisTrajectory(Trajectory):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             if self.topology is None:
+                check_claim(path, atoms_in(path, format=format) or 0)
                 universe = MDAnalysis.Universe(str(path), format=format)
             else:
-                universe = topology_universe(self.topology)
+                self.table, universe = read_topology(self.topology)
                 atoms = len(universe.atoms)
                 other = atoms_in(path, atoms, format)
+                check_claim(path, other or 0)
                 self._belongs(atoms, atoms if other is None else other)
                 _loaded(universe, path, format)
             # a topology without coordinates has no trajectory at all
@@ -211,20 +247,6 @@ def _loaded(universe: Any, path: Path, format: str | None) -> None:
         universe.load_new(str(path), format=format, convert_units=False)
 
 
-def atoms_in(path: Path, topology: int, format: str | None = None) -> int | None:
-    """Atoms in a trajectory; None where its format does not tell. Some readers want those of its topology."""
-    from MDAnalysis.core._get_readers import get_reader_for
-
-    for known in ({"n_atoms": topology}, {}):
-        try:
-            reader: Any = get_reader_for(str(path), format=format)
-            return int(reader.parse_n_atoms(str(path), **known))
-        except Exception:
-            # a format without that question, or a file that opening will say more about
-            continue
-    return None
-
-
 def _length_of(trajectory: Any) -> str:
     """Unit of length in words; "" where the file has one of its own (GSD)."""
     unit = trajectory.units.get("length")
@@ -258,8 +280,15 @@ def left_over(trajectory: Any) -> str | None:
     words = formats_of(trajectory)
     if "DCD" in words:
         rest, frame = _behind_dcd(path, int(trajectory.n_frames))
-    elif "TRR" in words:
-        rest, frame = _behind_trr(path, trajectory)
+    elif (file := opened(trajectory)) is not None:
+        with closing(file):
+            try:
+                if not file.ends_at(count := int(trajectory.n_frames)):
+                    file.check(count)
+                    return _STALE
+            except ValueError as error:
+                return str(error)
+        return None
     elif "NCDF" in words:
         # a run that was killed has not always come to saying in the head what it wrote
         head = head_of(path)
@@ -290,27 +319,6 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
         return 0, 0
     head, first, other = (int(one) for one in sizes if one is not None)
     return path.stat().st_size - head - first - (frames - 1) * other, other
-
-
-def _behind_trr(path: Path, trajectory: Any) -> tuple[int, int]:
-    """As `_behind_dcd`: the last frame's head says how long it is."""
-    offsets = getattr(getattr(trajectory, "_xdr", None), "offsets", None)
-    if offsets is None or not len(offsets):
-        return 0, 0
-    begin = int(offsets[-1])
-    with path.open("rb") as file:
-        file.seek(begin)
-        head = file.read(_TRR.size)
-    if len(head) < _TRR.size:
-        return 0, 0
-    magic, _, _, _, *numbers = _TRR.unpack(head)
-    sizes, atoms = numbers[:10], numbers[10]
-    # nine numbers of a box, or three an atom, are of one width, and so are the time and lambda
-    width = sizes[2] // 9 if sizes[2] else max(sizes[7:]) // max(3 * atoms, 1)
-    if magic != _TRR_MAGIC or width not in (4, 8):
-        return 0, 0
-    size = _TRR.size + 2 * width + sum(sizes)
-    return path.stat().st_size - begin - size, size
 
 
 def _behind_text(file: Any) -> str | None:

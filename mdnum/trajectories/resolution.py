@@ -124,6 +124,10 @@ class Resolution:
         return float(steps_of(np.array(frame.furthest), self.step, self.digits)) / 2
 
 
+#: Of coordinates that are rounded to float32 and to nothing else.
+FLOAT32 = Resolution("float32", 0.0, 32, 0)
+
+
 def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:
     """The resolution of frames.
 

@@ -32,7 +32,7 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.reading import ase_images, ignored_velocities, reading, with_elements
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.topology import AtomTable
+from mdnum.trajectories.topology import AtomTable, topology_universe
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
@@ -458,7 +458,7 @@ class GroTrajectory(TextTrajectory):
 
     def _described(self, block: list[str]) -> AtomTable:
         self.time = "ps" if _TIME.search(block[0]) else "frame"
-        return AtomTable.read(self.path)
+        return AtomTable.of(topology_universe(self.path).atoms)
 
     def _frame(self, number: int, raw: list[str]) -> Frame:
         rows = [line.rstrip("\n") for line in raw[2:-1]]

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, reading
+from mdnum.reading import check_claim, reading
 from mdnum.trajectories.frame import Box
 
 #: what a reader of results from MDAnalysis's coordinates should know
@@ -108,27 +108,43 @@ class AtomTable:
             guessed=guessed,
         )
 
-    @classmethod
-    def read(cls, topology: str | Path) -> AtomTable:
-        """The atoms of a topology file: any that MDAnalysis takes for one, or any structure that ASE reads.
+    def universe(self) -> Any:
+        """A Universe of these atoms, without coordinates."""
+        from MDAnalysis import Universe
 
-        Raises:
-            InputError: neither reads it.
-        """
-        try:
-            return cls.of(topology_universe(topology).atoms)
-        except InputError as refused:
-            try:
-                with reading(topology, by="ASE"):
-                    return cls.plain(next(ase_images(topology, -1)).get_chemical_symbols())
-            except InputError:
-                # MDAnalysis knows most of the formats, and says more of them
-                raise refused from None
+        at = np.unique(self.residues, return_index=True)[1]
+        universe = Universe.empty(len(self), n_residues=len(at), atom_resindex=self.residues)
+        for name, values in (
+            ("names", self.names), ("types", self.species), ("elements", self.species),
+            ("resnames", self.residue_names[at]), ("resids", self.residue_ids[at]),
+        ):  # fmt: skip
+            universe.add_TopologyAttr(name, values)
+        return universe
 
     def give_elements(self, universe: Any) -> None:
         """Adds the elements that were guessed, for selections by element."""
         if self.guessed and not hasattr(universe.atoms, "elements"):
             universe.add_TopologyAttr("elements", self.species)
+
+
+def read_topology(topology: str | Path) -> tuple[AtomTable, Any]:
+    """The atoms of a file, and a Universe of them without coordinates: of a topology, or any structure.
+
+    Raises:
+        InputError: nobody reads it.
+    """
+    from mdnum.trajectories.trajectory import open_trajectory
+
+    try:
+        universe = topology_universe(topology)
+        return AtomTable.of(universe.atoms), universe
+    except InputError as refused:
+        try:
+            table = open_trajectory(topology).table
+        except InputError:
+            # MDAnalysis knows most of the formats, and says more of them
+            raise refused from None
+        return table, table.universe()
 
 
 def topology_universe(topology: str | Path) -> Any:
@@ -140,8 +156,23 @@ def topology_universe(topology: str | Path) -> Any:
     from MDAnalysis import Universe
     from MDAnalysis.core._get_readers import get_parser_for
 
+    check_claim(topology, atoms_in(topology) or 0)
     with reading(topology), get_parser_for(str(topology))(str(topology)) as parser:
         return Universe(parser.parse())
+
+
+def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
+    """Atoms in a trajectory; None where its format does not tell. Some readers want those of its topology."""
+    from MDAnalysis.core._get_readers import get_reader_for
+
+    for known in ({}, {"n_atoms": topology}):
+        try:
+            reader: Any = get_reader_for(str(path), format=format)
+            return int(reader.parse_n_atoms(str(path), **known))
+        except Exception:
+            # a format without that question, or a file that opening will say more about
+            continue
+    return None
 
 
 # ---- boxes

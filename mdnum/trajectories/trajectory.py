@@ -26,10 +26,10 @@ import numpy as np
 from jaxtyping import Int
 
 from mdnum.errors import InputError, expect_path
-from mdnum.reading import CHECK, FrameError, UnreadableFrame, first_line, reading
+from mdnum.reading import CHECK, FrameError, UnreadableFrame, check_claim, first_line, reading
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.repeats import Repeats
-from mdnum.trajectories.topology import AtomTable, topology_universe
+from mdnum.trajectories.topology import AtomTable, read_topology
 
 #: Frames from which the resolution of a file is read.
 SAMPLE = 8
@@ -86,8 +86,9 @@ class Trajectory(ABC):
 
     def _has(self, atoms: int, table: AtomTable | None = None) -> None:
         """Sets the table of atoms: the topology's, where there is one."""
+        check_claim(self.path, atoms)
         if self.topology is not None:
-            table = AtomTable.read(self.topology)
+            table, _ = read_topology(self.topology)
             self._belongs(len(table), atoms)
         self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
 
@@ -308,6 +309,11 @@ def open_trajectory(
             raise InputError("no such file", remedy="Check the path", where=str(one))
         if one is not None and one.is_file() and not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
+        if one is not None and not one.is_dir():
+            if not one.is_file():
+                # a reader would wait for what comes, or read without end
+                raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
+            check_claim(one)
     opened = _reader_of(file, format)(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
@@ -334,9 +340,9 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
-    if word == "xtc":
+    if word in ("xtc", "trr"):
         # without what the readers of all other formats import, which takes as long as reading many frames
-        return binary.XtcTrajectory
+        return binary.XtcTrajectory if word == "xtc" else binary.TrrTrajectory
     import MDAnalysis
 
     from mdnum.trajectories import mdanalysis_source, text
@@ -466,10 +472,9 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
 
 def _universe(trajectory: Trajectory) -> Any:
     """A Universe that stands at the first frame asked for. Distances in a selection are float32."""
-    import MDAnalysis
     from MDAnalysis.lib.mdamath import triclinic_box
 
-    first, table, universe = next(iter(trajectory.frames()), None), trajectory.table, None
+    first = next(iter(trajectory.frames()), None)
     if first is None:
         raise InputError(
             "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
@@ -478,20 +483,10 @@ def _universe(trajectory: Trajectory) -> Any:
         # `frames` has left the Universe there
         return trajectory.universe
     if trajectory.topology is not None:
-        try:
-            universe = topology_universe(trajectory.topology)
-            table.give_elements(universe)
-        except InputError:
-            # a topology of ASE's says no more than the table
-            universe = None
-    if universe is None:
-        at = np.unique(table.residues, return_index=True)[1]
-        universe = MDAnalysis.Universe.empty(len(table), n_residues=len(at), atom_resindex=table.residues)
-        for name, values in (
-            ("names", table.names), ("types", table.species), ("elements", table.species),
-            ("resnames", table.residue_names[at]), ("resids", table.residue_ids[at]),
-        ):  # fmt: skip
-            universe.add_TopologyAttr(name, values)
+        table, universe = read_topology(trajectory.topology)
+        table.give_elements(universe)
+    else:
+        universe = trajectory.table.universe()
     box = triclinic_box(*first.box.matrix) if first.box.pbc.all() else np.zeros(6, np.float32)
     universe.load_new(first.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
     return universe
