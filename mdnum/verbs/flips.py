@@ -340,7 +340,7 @@ def _rule_told(
     trajectory: Trajectory,
     groups: Groups,
     window: int,
-    motion: Motion,
+    motion: Motion | None,
     log: Progress,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
@@ -404,7 +404,7 @@ def _rule_told(
 
 
 def _counted(
-    total: Statistics, motion: Motion, flux: Mapping[str, Any] | None, reach: float
+    total: Statistics, motion: Motion | None, flux: Mapping[str, Any] | None, reach: float
 ) -> dict[str, Any]:
     """Plain values of what was counted, lengths of time in frames."""
     from mdnum.trajectories.lost import lost_flips

@@ -336,17 +336,11 @@ def _lifetimes(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
 def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     between, flux = one["stride"]["between"], one["flux"]
     if between is not None:
-        code = between["reason"]
-        yield (
-            "By leaving frames out",
-            TEXTS("stride_none_lost" if code == "none_lost" else "stride_seen", **between),
-        )
-        if between["lost"] is None:
-            yield "Lost between frames", TEXTS(f"stride_{code}", **between)
-        else:
-            told = "stride_range" if between["low"] else "stride_below"
-            yield "Lost between frames", TEXTS(told, **between)
-        for name, (odds, _) in (between["parts"] or {}).items():
+        none, lost = between["reason"] == "none_lost", between["lost"]
+        yield "By leaving frames out", TEXTS("stride_none_lost" if none else "stride_seen", **between)
+        how = between["reason"] if lost is None else "range" if between["low"] else "below"
+        yield "Lost between frames", TEXTS(f"stride_{how}", **between)
+        for name, (odds, _) in between["parts"].items():
             yield TEXTS(f"part_{name}"), percent(1 / (1 + math.exp(-odds)))
     if flux is not None and flux["crossed"]:
         per = f"per {view.summary['time']}"

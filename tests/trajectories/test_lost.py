@@ -7,12 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ase import Atoms
-from ase.io import write
-from trajectories.liquid import liquid, memberships
 from trajectories.membership import ledger, random_membership
 
-import mdnum
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.history import History, Strides, doublings
 from mdnum.trajectories.lost import Motion, lost_flips
@@ -132,7 +128,7 @@ def walkers(friction: float, steps: int = 1600, atoms: int = 40):
 
 
 def solid(steps: int = 1600):
-    """Atoms that swing about the sites of a crystal at several frequencies; its second shell is at the cutoff."""
+    """Atoms that swing about the sites of a crystal, whose second shell is at the cutoff."""
     rng = np.random.default_rng(0)
     sites = np.stack(np.meshgrid(*[np.arange(4.0)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     time, rates = STEP * np.arange(steps + 1)[:, None, None, None], rng.uniform(1, 7, (5, 64, 3))
