@@ -171,12 +171,11 @@ def _run(x, v, m, length, kinds, sizes, depths, form, reach, bond, dt, friction,
 
 
 @numba.njit(cache=True)
-def _count(xs, length, cutoff, stride):
-    """(flips between frames a stride apart, flips at every step as far as they reach), of all pairs."""
-    atoms, reach = xs.shape[1], (xs.shape[0] - 1) // stride * stride
-    now, kept = np.zeros((2, atoms, atoms), np.bool_)
-    left = every = 0
-    for step in range(reach + 1):
+def _count(xs, length, cutoff, strides, reaches):
+    """By stride, (flips between frames a stride apart, flips at every step), of all pairs up to its reach."""
+    atoms, counts = xs.shape[1], np.zeros((len(strides), 2), np.int64)
+    now, kept = np.zeros((atoms, atoms), np.bool_), np.zeros((len(strides), atoms, atoms), np.bool_)
+    for step in range(reaches.max() + 1):
         for i in range(atoms):
             for j in range(i + 1, atoms):
                 square = 0.0
@@ -185,12 +184,14 @@ def _count(xs, length, cutoff, stride):
                     d -= length * np.rint(d / length)
                     square += d * d
                 inside = square < cutoff * cutoff
-                every += step > 0 and inside != now[i, j]
+                for s in range(len(strides)):
+                    if step <= reaches[s]:
+                        counts[s, 1] += step > 0 and inside != now[i, j]
+                        if step % strides[s] == 0:
+                            counts[s, 0] += step > 0 and inside != kept[s, i, j]
+                            kept[s, i, j] = inside
                 now[i, j] = inside
-                if step % stride == 0:
-                    left += step > 0 and inside != kept[i, j]
-                    kept[i, j] = inside
-    return left, every
+    return counts
 
 
 def trajectory(one: Planted) -> tuple[np.ndarray, np.ndarray]:
@@ -241,9 +242,9 @@ def asked(one: Planted) -> list[dict[str, Any]]:
         xs.shape[1], trajectory=True, velocities=one.format == "velocities"
     )
     universe.dimensions = [one.length * SIGMA] * 3 + [90.0] * 3
-    for stride in one.strides:
-        reach = min(STEPS, FRAMES * stride) // stride * stride
-        left, every = _count(xs[: reach + 1], one.length, one.cutoff, stride)
+    reaches = [min(STEPS, FRAMES * stride) // stride * stride for stride in one.strides]
+    counts = _count(xs, one.length, one.cutoff, np.array(one.strides), np.array(reaches)).tolist()
+    for stride, reach, (left, every) in zip(one.strides, reaches, counts, strict=True):
         row: dict[str, Any] = {"stride": stride, "left": left, "every": every}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"planted.{FORMATS[one.format]}"

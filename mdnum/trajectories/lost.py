@@ -92,8 +92,7 @@ class Motion:
             return None
         flown = [a.velocities * (b.time - a.time) for a, b in pairs if a.velocities is not None]
         timed = timed and len(flown) == len(pairs) and all(b.time > a.time for a, b in pairs)
-        said = variance(np.array(flown)) if timed else 0.0
-        moved = one / math.sqrt(said) if said > 0 else math.nan
+        moved = one / math.sqrt(said) if timed and (said := variance(np.array(flown))) > 0 else math.nan
         return cls((1.0, two / one / 2, four / one / 4), math.sqrt(2) * one, moved, atoms)
 
 
@@ -109,29 +108,26 @@ class LostFlips:
     rounded: float  # share of the first that the rounding of the file may have made
     parts: Mapping[str, Estimate]  # what it is made from
     lost: float | None = None  # the estimate; None where the numbers do not tell
-    low: float | None = None  # its range: the truth was in it in 9 of 10 planted files and more
+    low: float | None = None  # its range: the truth was in it in more than 9 of 10 planted files
     high: float | None = None
 
 
 def lost_flips(
     found: Strides, motion: Motion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """What is lost between the frames, from how flips thin out, and how atoms move where that is known.
+    """What is lost between the frames; None with fewer than three strides, or no flips.
 
     Args:
         found: flips left at each stride.
         motion: of the atoms of the pairs.
         flux: crossings by velocities, "crossed", and the share of them that is "lost"; None without any.
         reach: the threshold's distance, length, where there is one.
-
-    Returns:
-        None with fewer than three strides, or no flips.
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None
     of, (near, fourth) = int(found.of[1]), (found.share[0] - found.share[1:3]).tolist()
     seen = (near, fourth, float(found.doubtful[1] / of))
-    # there a doubled stride shows half of the flips: the same pairs come back
+    # where atoms stay at their places the same pairs come back: a doubled stride shows half of the flips
     halved = np.max(-np.diff(np.log2(found.share[found.flips > 10])), initial=0.0)
     parts = {} if motion is None else _of_motion(motion, reach, _BOUND * np.clip(5 * halved - 4, 0.0, 1.0))
     if near <= 0 or 2 * found.doubtful[1] <= found.of[1] - found.flips[1]:
@@ -184,13 +180,11 @@ def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, 
     """What is lost at stride 1, by all laws that take so much at each doubling."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
-    weight /= weight.sum()
-    mean = float((weight * _LOST).sum())
-    return mean, math.sqrt(float((weight * (_LOST - mean) ** 2).sum()))
+    mean = float(np.average(_LOST, weights=weight))
+    return mean, math.sqrt(float(np.average((_LOST - mean) ** 2, weights=weight)))
 
 
 def _odds(name: str, share: float, error: float) -> dict[str, Estimate]:
-    # none where the share is within its error
     return {name: (_log_odds(share), error / (share * (1 - share)))} if error < share < 1 else {}
 
 

@@ -243,7 +243,7 @@ def test_what_is_lost_between_frames_is_a_range_and_a_finding_where_it_is_much(
     result = examined("gas.extxyz", gas(frames=12))
     summary = copy.deepcopy(dict(result.summary))
     one = summary["rules"][0]
-    parts = {"thinning": (-1.4, 0.3), "persistence": (-1.3, 0.2), "velocities": (-1.5, 0.2), "flux": (-1.2, 1)}
+    parts = dict.fromkeys(("thinning", "persistence", "velocities", "flux"), (-1.4, 0.3))
     values = dict(zip(("lost", "low", "high"), share, strict=True))
     reason = "open" if share[0] is None else "estimate"
     seen = {"reason": reason, "doubled": 0.3, "fourth": 0.5, "rounded": 0.0}
@@ -260,7 +260,7 @@ def test_what_is_lost_between_frames_is_a_range_and_a_finding_where_it_is_much(
 
 
 def test_a_damped_gas_says_what_its_frames_lose_from_the_file_alone(examined) -> None:
-    """Every 10th step of a gas whose velocities are kicked at each step; the truth is counted at all steps."""
+    """Every 10th step of a gas whose velocities are kicked; the truth is counted at all steps."""
     rng, side, step, keep = np.random.default_rng(0), 7.0, 0.02, np.exp(-0.08)
     v, x = np.empty((2, 1601, 40, 3))
     v[0], x[0] = rng.normal(size=(40, 3)), rng.uniform(0, side, (40, 3))
