@@ -143,7 +143,7 @@ def lost_flips(
     wide = _WIDE * math.sqrt(1 / np.sum(error**-2) + _DISAGREE * float(weight @ (mean - middle) ** 2))
     low, lost, high = _share(middle - wide), _share(middle), _share(middle + wide)
     # a flip that is lost comes with the one that reverses it: what chance does to their number in this file
-    low, high = max(low - 2 * math.sqrt(2 * low / of), 0.0), min(high + 2 * math.sqrt(2 * high / of), 1.0)
+    low, high = max(low - 2 * math.sqrt(2 * low / of), 0.0), min(high + 2 * math.sqrt(2 * high / of), 0.999)
     if near <= 0:
         # 3 events or fewer are not seen in one case of 20; each is two flips
         return LostFlips("none_lost", *seen, parts, 0.0, 0.0, max(high, 12 / (of + 12)))

@@ -56,7 +56,8 @@ def _headline(view: FlipsView) -> str:
     if one["flips"] >= FEW:
         between = one["stride"]["between"]
         if between and (between["lost"] or 0.0) > LOST:
-            parts.append(TEXTS("lost_between", **between))
+            low, high = (1 / (1 - between[name]) for name in ("low", "high"))
+            parts.append(TEXTS("lost_between", low=low, high=high))
         if one["ambiguous"] > UNDECIDED * one["flips"]:
             parts.append(TEXTS("undecided", share=one["ambiguous"] / one["flips"]))
     return " ".join(parts)
