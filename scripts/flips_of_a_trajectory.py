@@ -6,14 +6,14 @@ been written, and as if positions had been rounded to so many decimals:
     flips        pairs that entered or left the cutoff between the frames that are left
     of all       their share of the flips in all frames
     said lost    share of all flips that mdnum says happened and reverted between the frames, from those
-                 frames alone; the range is what two ways of carrying the losses on give
+                 frames alone, and its range (docs/lost-flips.md has how often that holds the truth)
     lost         the same for true, as far as all frames know
     median       median contact that begins in the file (product-limit estimate)
     by rate      mean contact by the rate at which they end, which needs no beginning
     missed, made up   flips that rounding hides from a frame, or puts there
 
 How to read it. Where "of all" falls, contacts seem to last longer than they do, by as much; "by rate" shows
-it. Where "said lost" is a dash, motion looks Brownian at that stride, or cannot be
+it. Where "said lost" is a dash, too wide a range fits, or what is lost cannot be
 told apart from the rounding of the file, and no number is given. A file with
 three decimals of a nanometer (xtc) is the row with two decimals of an Ångström.
 """

@@ -1,12 +1,6 @@
-"""What every pair did over the frames: its flips, every stay inside, and what happened between two frames.
+"""What every pair did over the frames: its flips, every stay inside, and what fewer frames would show.
 
-Flips that happened and reverted between two frames are not in the file, but it can tell their number, by two
-estimates that know nothing of one another:
-
-- **from the frames themselves**: every second frame alone would have lost a share of the flips; how that
-  share grows with the stride is carried on to what lies between the frames that there are;
-- **from velocities**, where the file has them: atoms that fly on straight for a moment cross their thresholds
-  at a rate, the flux of pairs, which is what a run that looks at every instant would record.
+What is lost between the frames is estimated from such counts in `lost`.
 """
 
 from __future__ import annotations
@@ -26,11 +20,6 @@ from mdnum.trajectories.ledger import Columns, FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is far faster
 _ROOM = 2**62
-# share of the flips below which those that a stride of 2 loses are too few to see a trend in
-_FEW = 5e-3
-# ratio of successive losses, from one doubling of the stride to the next, above which they do not die out
-# when the stride is halved again and again: Brownian motion crosses a threshold infinitely often
-_DIES_OUT = 0.9
 
 
 class Sums:
@@ -244,101 +233,12 @@ def _thinned(rows, frame, ambiguous, frames, stride):
     return total - out, total, doubtful
 
 
-@dataclass(frozen=True)
-class MissingFlips:
-    """An estimate of what is missing between the frames, as shares of all flips that happened."""
-
-    # "none_lost", "few" (too few lost to see a trend), "trend"; or why there is no number: "rounding" (the
-    # file's digits may have made them), "brownian" (losses do not die out)
-    reason: str
-    doubled: float  # share that every second frame alone would lose, and every fourth
-    fourth: float
-    rounded: float  # share of the first that the rounding of the file may have made
-    lost: float | None = None  # the estimate; None where the numbers do not tell
-    low: float | None = None  # the range of it, never of no width; None where `lost` is
-    high: float | None = None
-
-
 def doublings(frames: int) -> list[int]:
     """Strides 1, 2, 4, ... that leave at least four intervals."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])
     return strides
-
-
-def between_frames(found: Strides) -> MissingFlips | None:
-    """What lies between the frames, from how the flips thin out when frames are left out.
-
-    Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer
-    by a factor q, halving the stride for ever brings back a geometric series of them. In a liquid q itself
-    falls with the stride, from about 1 where motion looks Brownian to 1/4 where atoms fly straight, so that q
-    held fixed says too much (high), and q that falls on as from one doubling to the next too little (low).
-    Where there are too few strides to see q fall, low is that of straight flight from here on.
-
-    Flips that the rounding of the file may have made revert just so, and say nothing of what lies between its
-    frames: the range is that with and without them, and there is no number where they are half of what a
-    stride of 2 leaves out. What chance does to counts is in the range, by two standard deviations.
-
-    Returns:
-        None with fewer than three strides, or no flips.
-
-    Error: in a Lennard-Jones liquid, and in sums of a few oscillations, the truth is between the two, and
-        the estimate is within a factor of 3 of it (tests/trajectories); neither is a bound.
-    """
-    if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
-        return None
-    shares, of = found.share[:4], int(found.of[1])
-    near, second = float(shares[0] - shares[1]), float(shares[0] - shares[2])
-    seen = (near, second, float(found.doubtful[1] / of))
-    if near <= 0:
-        # 3 events or fewer are not seen in one case of 20; each is two flips
-        return MissingFlips("none_lost", *seen, 0.0, 0.0, _share(2 * 6.0 / of))
-    if 2 * found.doubtful[1] > found.of[1] - found.flips[1]:
-        return MissingFlips("rounding", *seen)
-    lost = np.diff(-found.flips[:4] * (of / found.of[:4]))
-    sure = np.maximum(lost - np.diff(found.doubtful[:4] * (of / found.of[:4])), 0.0)
-    if near < _FEW:
-        # straight flight, and too few to see a trend in: in proportion to the stride, or to its square
-        low, high = float(sure[0]) / of / 3, 2 * (near + 2 * math.sqrt(2 * near / of))
-        return MissingFlips("few", *seen, _share(near), _share(low), _share(high))
-    ranges = [carried for carried in map(_carried_on, (lost, sure)) if carried is not None]
-    if len(ranges) < 2:
-        return MissingFlips("brownian", *seen)
-    low, high = min(low for low, _ in ranges) / of, max(high for _, high in ranges) / of
-    # what chance does to the counts: a flip that is left out comes with the one that reverses it
-    chance = 2 * np.sqrt(2 * np.maximum(lost[:2], 2.0) / lost[:2] ** 2)
-    least, most = low * max(1 - chance[0], 0.0), high * (1 + chance.sum())
-    return MissingFlips("trend", *seen, _share(math.sqrt(low * high)), _share(least), _share(most))
-
-
-def _carried_on(lost: Float[np.ndarray, "doublings"]) -> tuple[float, float] | None:
-    """(low, high) of the flips that are missing, from those that each doubling of the stride leaves out.
-
-    None where their number does not come to an end.
-    """
-    near, far = float(lost[0]), float(lost[1])
-    if far <= 0 or near / far >= _DIES_OUT:
-        return None
-    q = near / far
-    high = near * q / (1 - q)
-    trend = q * float(lost[2]) / far if len(lost) > 2 and lost[2] > 0 else 1.0
-    if trend >= 1:
-        return min(near / 3, high), high
-    # near (q + q q' + q q' q'' + ...), with q' = trend q and so on
-    low, term, q = 0.0, near, q * trend
-    for _ in range(200):
-        term *= q
-        low += term
-        q *= trend
-        if term < 1e-6 * low:
-            return low, high
-    return None
-
-
-def _share(missing: float) -> float:
-    """Of all flips, those missing, from those missing for each flip in the file."""
-    return missing / (1 + missing)
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:

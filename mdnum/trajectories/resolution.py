@@ -365,13 +365,13 @@ def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "ato
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, np.zeros_like(sample[0].positions)
     for before, after in pairwise(sample):
-        total = total + _shortest(after.positions - before.positions, after.box)
+        total = total + shortest(after.positions - before.positions, after.box)
         lag += 1
         moves = total - total.mean(axis=0)
         if np.sqrt((moves**2).mean()) >= _CLEAR * size:
             break
     variance = float((moves**2).mean())
-    true = _unrounded(variance, size)
+    true = unrounded(variance, size)
     if true < _MOSTLY * variance:
         # most atoms seem to stand still and some to hop: what they do in truth has lost its shape
         moves = np.random.default_rng(0).normal(scale=np.sqrt(true), size=moves.shape)
@@ -380,7 +380,7 @@ def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "ato
     return moves * (keep / max(lag, 1)), lag
 
 
-def _unrounded(variance: float, size: float) -> float:
+def unrounded(variance: float, size: float) -> float:
     """Variance of displacements whose ends, rounded to multiples of size, differ with this variance.
 
     A displacement of f steps beyond a whole number of them gains size² f (1 - f) on average over where it
@@ -398,7 +398,7 @@ def _unrounded(variance: float, size: float) -> float:
     return low
 
 
-def _shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "atoms 3"]:
+def shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "atoms 3"]:
     """Displacements without whole periods: atoms that were wrapped have not moved far."""
     matrix = np.where(box.pbc[:, None], box.matrix, np.eye(3))
     if not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:

@@ -24,6 +24,7 @@ from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
     from mdnum.trajectories.history import History
+    from mdnum.trajectories.lost import Motion
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.statistics import Classes, Statistics
     from mdnum.trajectories.topology import AtomTable
@@ -86,6 +87,7 @@ def flips(
         FolderError: the folder cannot be used.
     """
     from mdnum.trajectories.follow import follow
+    from mdnum.trajectories.lost import Motion
     from mdnum.trajectories.resolution import infer
     from mdnum.trajectories.trajectory import open_trajectory
 
@@ -115,8 +117,10 @@ def flips(
         read = time.perf_counter()
         frames = folder.read("frames")
         steps = _steps(frames, opened)
+        timed = steps["timed"] and found.odd is None
+        motion = Motion.of(sample, resolution, *groups, timed=timed)
         told = [
-            _rule_told(folder, number, one, found, frames, steps, opened, groups, window, log)
+            _rule_told(folder, number, one, found, frames, steps, opened, groups, window, motion, log)
             | {"grid": _grid(sample, resolution, one, groups)}
             for number, one in enumerate(found.rules)
         ]
@@ -336,6 +340,7 @@ def _rule_told(
     trajectory: Trajectory,
     groups: Groups,
     window: int,
+    motion: Motion | None,
     log: Progress,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
@@ -389,8 +394,8 @@ def _rule_told(
             "fewest": int(rows["fewest"].min()), "mean": float(rows["neighbors"].mean()),
             "most": int(rows["most"].max()),
         },
-        "flux": _flux(one, entered + left, steps, found),
-        **_counted(total),
+        "flux": (flux := _flux(one, entered + left, steps, found)),
+        **_counted(total, motion, flux, one.reach),
     }  # fmt: skip
     for name, coded in (("by_species", labels.species), ("by_residue_name", labels.residue_names)):
         if coded is not None:
@@ -398,13 +403,15 @@ def _rule_told(
     return told
 
 
-def _counted(total: Statistics) -> dict[str, Any]:
+def _counted(
+    total: Statistics, motion: Motion | None, flux: Mapping[str, Any] | None, reach: float
+) -> dict[str, Any]:
     """Plain values of what was counted, lengths of time in frames."""
-    from mdnum.trajectories.history import between_frames
+    from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
     durations, chatter = total.durations, total.chatter
-    between = between_frames(total.strides)
+    between = lost_flips(total.strides, motion, flux, reach)
     return {
         "pairs_flipped": total.pairs,
         "images": total.images,
@@ -420,7 +427,7 @@ def _counted(total: Statistics) -> dict[str, Any]:
             "share": chatter.undone / chatter.flips if chatter.flips else 0.0,
             "inside": chatter.inside, "outside": chatter.outside,
         },
-        "stride": {**vars(total.strides), "between": between and asdict(between)},
+        "stride": {**vars(total.strides), "between": between and asdict(between), "motion": motion},
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,8 +17,8 @@ from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resol
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02
-#: The same for flips between frames, and for those that are reversed at once.
-HIDDEN, CHATTER = 0.10, 0.15
+#: The same for flips lost between frames, and for those that are reversed at once.
+LOST, CHATTER = 0.10, 0.15
 #: Share of contacts without a beginning or an end in the file above which that is view.
 CENSORED = 0.5
 #: Fewer flips than this say nothing in shares.
@@ -53,10 +54,10 @@ def _headline(view: FlipsView) -> str:
     frames, rule = summary["frames"], view.rule(one)
     parts = [TEXTS("flips", flips=one["flips"], pairs=one["pairs_flipped"], frames=frames, rule=rule)]
     if one["flips"] >= FEW:
-        flux, between = by_velocities(one), one["stride"]["between"]
-        lost = flux or (between or {}).get("lost")
-        if lost and HIDDEN < lost < 1:
-            parts.append(TEXTS("hidden_velocities" if flux else "hidden_between", times=1 / (1 - lost)))
+        between = one["stride"]["between"]
+        if between and (between["lost"] or 0.0) > LOST:
+            low, high = (1 / (1 - between[name]) for name in ("low", "high"))
+            parts.append(TEXTS("lost_between", low=low, high=high))
         if one["ambiguous"] > UNDECIDED * one["flips"]:
             parts.append(TEXTS("undecided", share=one["ambiguous"] / one["flips"]))
     return " ".join(parts)
@@ -115,10 +116,6 @@ def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
     if flips:
         yield from _undecided(one)
         yield from _between(view, one)
-        flux, lost = one["flux"], by_velocities(one)
-        if lost and lost > HIDDEN:
-            values = {name: flux[name] for name in ("frames", "rate", "error", "seen")}
-            yield "FLUX", (), {**values, "lost": lost, "time": view.summary["time"]}
         chatter = one["chatter"]
         if flips >= FEW and chatter["share"] >= CHATTER and not _far_apart(one):
             values = {name: chatter[name] for name in ("share", "window", "undone")}
@@ -160,24 +157,11 @@ def _between(view: FlipsView, one: Rule) -> Iterator[Limit]:
         return
     elif between["lost"] is None:
         reason = TEXTS(f"stride_{between['reason']}", **between)
-        minor = () if between["doubled"] > HIDDEN else ("minor",)
+        minor = () if between["doubled"] > LOST else ("minor",)
         values = {"lost": None, "low": None, "high": None, "reason": reason}
         yield "BETWEEN_FRAMES", ("unknown", *minor), {**values, "seen": TEXTS("stride_seen", **between)}
-    elif between["lost"] > HIDDEN:
+    elif between["lost"] > LOST:
         yield "BETWEEN_FRAMES", (), {**between, "seen": TEXTS("stride_seen", **between)}
-
-
-def by_velocities(one: Rule) -> float | None:
-    """Share of the crossings that velocities show to be missing in the file.
-
-    Returns:
-        0 where what is missing may be so by chance; None where there are too few crossings to tell.
-    """
-    flux = one["flux"]
-    if flux is None or flux["lost"] is None or flux["crossed"] < FEW:
-        return None
-    # a rate from a handful of frames scatters: what it may be by chance is no finding
-    return flux["lost"] if flux["rate"] - flux["seen"] > 2.0 * flux["error"] else 0.0
 
 
 def _others(view: FlipsView) -> Iterator[Finding]:
@@ -353,23 +337,16 @@ def _lifetimes(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
 def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
     between, flux = one["stride"]["between"], one["flux"]
     if between is not None:
-        code = between["reason"]
-        yield (
-            "By leaving frames out",
-            TEXTS("stride_none_lost" if code == "none_lost" else "stride_seen", **between),
-        )
-        if between["lost"] is None:
-            yield "Lost between frames", TEXTS(f"stride_{code}", **between)
-        else:
-            low, high = percent(between["low"]), percent(between["high"])
-            about = f"about {percent(between['lost'])} of all flips ({low} to {high})"
-            yield "Lost between frames", about if between["lost"] else f"below {high} of all flips"
+        none, lost = between["reason"] == "none_lost", between["lost"]
+        yield "By leaving frames out", TEXTS("stride_none_lost" if none else "stride_seen", **between)
+        how = between["reason"] if lost is None else "range" if between["low"] else "below"
+        yield "Lost between frames", TEXTS(f"stride_{how}", **between)
+        for name, (odds, _) in between["parts"].items():
+            yield TEXTS(f"part_{name}"), percent(1 / (1 + math.exp(-odds)))
     if flux is not None and flux["crossed"]:
-        per, lost = f"per {view.summary['time']}", by_velocities(one)
+        per = f"per {view.summary['time']}"
         yield "Crossings by velocities", f"{number(flux['rate'])} ± {number(flux['error'], 2)} {per}"
         yield "Crossings in the file", f"{number(flux['seen'])} {per}"
-        none = "too few to resolve" if lost is None else "none beyond chance"
-        yield "Lost by velocities", percent(lost) if lost else none
 
 
 def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Table:

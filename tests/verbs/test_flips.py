@@ -19,7 +19,7 @@ import mdnum
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.verbs.flips import rules
-from mdnum.verbs.flips_page import by_velocities, judge, page
+from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView
 from mdnum.verbs.frame import Outcome, finish
 
@@ -229,26 +229,51 @@ def test_a_coarse_file_is_one(examined) -> None:
 
 
 @pytest.mark.parametrize(
-    ("crossed", "rate", "error", "lost"),
-    [(200, 100.0, 7.0, 0.9), (10, 100.0, 32.0, None), (25, 13.0, 2.6, 0.0), (100, 9.0, 0.9, 0.0)],
+    ("share", "told", "variant"),
+    [
+        ((0.2, 0.12, 0.33), "about 20 % of all flips (12 % to 33 %)", "to"),
+        ((0.04, 0.02, 0.08), "about 4.0 % of all flips (2.0 % to 8.0 %)", None),
+        ((0.01, 0.0, 0.03), "fewer than 3.0 % of all flips", None),
+        ((None, None, None), "too far apart", "not resolvable"),
+    ],
 )
-def test_velocities_show_what_is_lost_unless_chance_may(examined, crossed, rate, error, lost) -> None:
+def test_what_is_lost_between_frames_is_a_range_and_a_finding_where_it_is_much(
+    examined, share, told, variant
+) -> None:
     result = examined("gas.extxyz", gas(frames=12))
     summary = copy.deepcopy(dict(result.summary))
     one = summary["rules"][0]
-    one["stride"]["between"] = None
-    one["flux"] = {
-        "rate": rate, "error": error, "seen": 10.0, "crossed": crossed, "frames": 4, "moved": 1.0,
-        "lost": 1 - 10.0 / rate,
-    }  # fmt: skip
-    assert by_velocities(one) == (pytest.approx(lost) if lost else lost)
+    parts = dict.fromkeys(("thinning", "persistence", "velocities", "flux"), (-1.4, 0.3))
+    values = dict(zip(("lost", "low", "high"), share, strict=True))
+    reason = "open" if share[0] is None else "estimate"
+    seen = {"reason": reason, "doubled": 0.3, "fourth": 0.5, "rounded": 0.0}
+    one["stride"]["between"] = {**seen, **values, "parts": parts}
     view = FlipsView(RunFolder.open(result.folder), summary)
     verdict = judge(view)
-    assert ("FLUX" in {one.code for one in verdict.findings}) == bool(lost)
+    titles = [one.title for one in verdict.findings if one.code == "BETWEEN_FRAMES"]
+    assert len(titles) == (variant is not None) and all(variant in title for title in titles)
+    assert ("12 % to 33 %" in verdict.headline) == (share[0] == 0.2)
     (section,) = [one for one in page(view, verdict).sections if one.title == "Between the frames"]
-    assert dict(section.parts[0].rows)["Lost by velocities"] == {0.9: "90 %", 0.0: "none beyond chance"}.get(
-        lost, "too few to resolve"
-    )
+    rows = dict(section.parts[0].rows)
+    assert told in rows["Lost between frames"]
+    assert len([name for name in rows if name.endswith(" alone")]) == 4
+
+
+def test_a_damped_gas_says_what_its_frames_lose_from_the_file_alone(examined) -> None:
+    """Every 10th step of a gas whose velocities are kicked; the truth is counted at all steps."""
+    rng, side, step, keep = np.random.default_rng(0), 7.0, 0.02, np.exp(-0.08)
+    v, x = np.empty((2, 1601, 40, 3))
+    v[0], x[0] = rng.normal(size=(40, 3)), rng.uniform(0, side, (40, 3))
+    for n in range(1600):
+        v[n + 1] = keep * v[n] + np.sqrt(1 - keep**2) * rng.normal(size=(40, 3))
+        x[n + 1] = x[n] + 0.5 * step * (v[n] + v[n + 1])
+    frames = [ase.Atoms("Ar40", one, cell=[side] * 3, pbc=True) for one in x]
+    every = examined("every.extxyz", frames, cutoffs=[2.0]).summary["rules"][0]["flips"]
+    kept = examined("kept.extxyz", frames[::10], cutoffs=[2.0])
+    one = kept.summary["rules"][0]
+    found, truth = one["stride"]["between"], 1 - one["flips"] / every
+    assert 0.05 < truth < 0.15 and 0.01 < found["low"] < truth < found["high"] < 0.25
+    assert set(found["parts"]) == {"thinning", "persistence"}
 
 
 def test_one_atom_and_steps(tmp_path: Path, examined) -> None:
