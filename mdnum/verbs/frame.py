@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, ParamSpec, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, cast
 
 import numpy as np
 
@@ -39,8 +39,7 @@ from mdnum.store.files import default_folder
 if TYPE_CHECKING:
     from mdnum.units import Units
 
-P = ParamSpec("P")
-R = TypeVar("R")
+V = TypeVar("V", bound=Callable[..., Any])
 
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -210,7 +209,7 @@ class UnknownKeyword(InputError, TypeError):
     """A verb has no such keyword; also the TypeError that Python raises for one."""
 
 
-def keywords_checked(verb: Callable[P, R], more: Iterable[str] = ()) -> Callable[P, R]:
+def keywords_checked(verb: V, more: Iterable[str] = ()) -> V:
     """A public verb that rejects a keyword it does not have before it reads or writes anything.
 
     What a verb passes on as `**keep` would otherwise be looked at only when its folder is made, after options
@@ -229,14 +228,14 @@ def keywords_checked(verb: Callable[P, R], more: Iterable[str] = ()) -> Callable
     ]
 
     @functools.wraps(verb)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+    def checked(*args: Any, **kwargs: Any) -> Any:
         for word in kwargs:
             if word not in known:
                 error = unknown(f"keyword of {verb.__name__}()", word, known)
                 raise UnknownKeyword(error.message, remedy=error.remedy)
         return verb(*args, **kwargs)
 
-    return checked
+    return cast(V, checked)
 
 
 @dataclass
