@@ -340,7 +340,7 @@ def _audit_state() -> dict:
 
     result = CheckResult(
         (["failed"], {}), [finding("CURL", "error")], {}, [Chart("", "", "", [0.0], {"a": [1.0]})], {},
-        [("a", "b")], name="forces",
+        skipped=[("a", "b")], name="forces",
     )  # fmt: skip
     end = PairThreshold(1.0, ("A", "A"), 0, (0.0,) * 3, (0.0,) * 3, 1.0, 1.0, False, 0.0)
     checks = ["forces", "curl"]

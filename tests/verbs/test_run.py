@@ -196,6 +196,7 @@ def test_every_planted_defect_is_found(good):
         "ASE_DISAGREES": changed(good, {"ase": {"ok": False, "energy_rel": 1e-3, "force_max": 0.1}}),
         "ASE_NOT_COMPARED": changed(good, {"ase": None}),
         "FORCE_JUMP": changed(good, {"cutoff": {"kind": "shifted", "energy_jump": 0.0, "force_jump": 1e-4}}),
+        "OTHER_TEMPERATURE": changed(good, system={**good.system, "dynamics": {"temperature": 1e4}}),
         "HARD_CUTOFF": good,
     }
     assert set(planted) | {"CHATTER", "sentences"} == set(TEXTS.entries)
