@@ -366,7 +366,7 @@ _WRONG_AUDITS = [
     ("checks", 5), ("checks", []), ("temperature", "x"), ("results", [{}]), ("results", None),
     ("results/0/says", 5), ("results/0/tables", [5]), ("results/0/skipped", [1]),
     ("results/0/findings", [{"code": 1}]), ("results/0/charts", [{"x": "q"}]),
-    ("results/0/charts/0/x", [1.0, 2.0]), ("cut", {}), ("failed", 5), ("failed", ["../x"]),
+    ("results/0/charts/0/x", [1.0, 2.0]), ("cut", 5), ("failed", 5), ("failed", ["../x"]),
     ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"),
 ]  # fmt: skip
 
