@@ -6,6 +6,7 @@ That of a folder which nobody resumes needs no parts: a thread writes its file a
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.pool import ThreadPool
@@ -22,166 +23,41 @@ from mdnum.errors import FolderError
 from mdnum.store import files as manifest
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
-_FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
-
-
-def _named(kind: pa.DataType, names: str) -> dict[str, pa.DataType]:
-    return dict.fromkeys(names.split(), kind)
-
-
-#: The type of a column goes by its name; float64 where it is not here, and a table may differ.
-_TYPES: Mapping[str, pa.DataType] = {
-    **_named(
-        _INT,
-        "step pairs epoch start length pairs_listed capacity occupancy lost_pairs lost_pair_steps "
-        "first_lost_step cross also history runs cluster first_bit steps horizon overflow underflow "
-        "subnormal scaled_overflow scaled_underflow frame number near frames at_risk counted between within "
-        "flips pairs_a pairs_b only_a only_b passed refused skipped atoms begin end",
-    ),
-    **_named(_SHORT, "left i j contacts iterations ball iteration atom rank rule fewest most"),
-    **_named(_BOOL, "entered ambiguous dangerous stopped differs contact inside wrong grazing began ended"),
-    **_named(
-        _TEXT,
-        "reason variant run confirmed digest program flags reduction hash failed policy state force "
-        "decision accumulate asked part curve line residue first second area code case text script",
-    ),
+_DECLARED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_TYPES = {
+    name: pa.type_for_alias(kind) for kind, names in _DECLARED["types"].items() for name in names.split()
 }
 
 
-def _columns(names: str, **types: pa.DataType) -> Mapping[str, pa.DataType]:
-    return MappingProxyType({name: types.get(name, _TYPES.get(name, _FLOAT)) for name in names.split()})
+def _columns(declared: Mapping[str, str]) -> Mapping[str, Mapping[str, pa.DataType]]:
+    """Types by table and column; that of a column goes by its name where none is declared with it."""
+    tables: dict[str, Mapping[str, pa.DataType]] = {}
+    for table, columns in declared.items():
+        words = [word.partition(":") for word in columns.split()]
+        usual = {name: _TYPES.get(name, pa.float64()) for name, _, _ in words}
+        own = {name: pa.type_for_alias(kind) for name, _, kind in words if kind}
+        tables[table] = MappingProxyType(usual | own)
+    return MappingProxyType(tables)
 
 
 #: The columns of each table; a writer may add more.
-COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
-    {
-        "series": _columns(
-            "step time potential kinetic total temperature pressure pairs entered left displacement "
-            "energy_jump ambiguous min_margin conserved",
-            entered=_SHORT,
-            ambiguous=_SHORT,
-        ),
-        "flips": _columns(
-            "step i j entered distance margin radial_speed energy_jump force_jump bound ambiguous"
-        ),
-        "epochs": _columns(
-            "epoch start length displacement skin_consumed pairs_listed capacity occupancy reason dangerous "
-            "lost_pairs lost_pair_steps first_lost_step build_ms margin",
-        ),
-        "steps": _columns(
-            "step time contacts entered left iterations reason residual stop_margin min_margin ambiguous "
-            "mean_height energy",
-            entered=_SHORT,
-            ambiguous=_SHORT,
-        ),
-        "contacts": _columns("step ball entered height margin velocity bound ambiguous"),
-        "solver": _columns("step ball iteration residual margin stopped reason"),
-        "heights": _columns("step ball y v"),
-        "separations": _columns("variant step separation"),
-        "separation": _columns(
-            "step time free imposed back cross overridden furthest energy_a energy_b energy_imposed"
-        ),
-        "cross_flips": _columns("step i j differs run entered margin bound"),
-        "ambiguous_pairs": _columns("run step i j margin bound"),
-        "around": _columns("step run ball y v contact"),
-        "neighborhood": _columns("atom x y z dx dy dz"),
-        "boundaries": _columns(
-            "below above step i j inside also margin_below margin_above bound loss_below loss_above jump "
-            "energy_below energy_above separation confirmed",
-        ),
-        "intervals": _columns("low high history digest loss_low loss_high runs gap"),
-        "points": _columns("at history loss energy"),
-        "variants": _columns(
-            "variant program flags reduction cluster first_bit steps separation seconds hash failed"
-        ),
-        "variant_separations": _columns("variant step separation"),
-        "policies": _columns(
-            "policy state force decision accumulate horizon i j margin gain closer_bits growth_rate failed"
-        ),
-        "policy_separations": _columns("policy step separation"),
-        "ambiguous": _columns("policy step i j inside margin bound exact wrong"),
-        "reach": _columns("step positive negative i j furthest"),
-        "foretold": _columns("asked step i j amplitude margin ulps"),
-        "growth": _columns("horizon step onto_positions onto_velocities size speed"),
-        "flip_contributions": _columns("step i j entered margin bound ambiguous radial_speed weight grazing"),
-        "trust": _columns("horizon"),
-        "scaling": _columns(
-            "horizon overflow underflow subnormal largest smallest scaled_overflow scaled_underflow"
-        ),
-        "curves": _columns("part curve line x y"),
-        "energies": _columns(
-            "run step time potential kinetic total entered left jumps rest", entered=_INT, left=_INT
-        ),
-        "crossings": _columns(
-            "run step i j rank entered threshold distance margin energy_jump", i=_INT, j=_INT, rank=_INT
-        ),
-        "frames": _columns(
-            "rule frame number time pairs near entered left ambiguous min_margin fewest neighbors most",
-            entered=_INT,
-            left=_INT,
-            ambiguous=_INT,
-        ),
-        "members": _columns("rule i j rank distance"),
-        "lifetimes": _columns("rule frames time at_risk survival error intermittent residence again"),
-        "neighbors": _columns("rule neighbors counted", neighbors=_INT),
-        "residues": _columns("rule residue between within"),
-        "busiest": _columns("rule i j rank flips inside first second", inside=_INT),
-        "apart": _columns("frame time time_b furthest typical atom pairs_a pairs_b only_a only_b"),
-        "differing": _columns(
-            "rule frame i j rank inside distance_a distance_b margin_a margin_b bound ambiguous", inside=_TEXT
-        ),
-        "areas": _columns("area asked passed failed refused skipped", asked=_INT, failed=_INT),
-        "failures": _columns("code area case atoms steps step text script"),
-    }
-)
-
-#: Tables that go by another world's name and have columns of their own, by world and name.
-_OWN: Mapping[tuple[str, str], Mapping[str, pa.DataType]] = MappingProxyType(
-    {
-        ("flips", "flips"): _columns(
-            "rule frame i j rank entered distance before margin margin_before bound ambiguous"
-        ),
-        ("flips", "contacts"): _columns("rule i j rank begin end began ended"),
-    }
-)
+COLUMNS = _columns(_DECLARED["columns"])
+#: Tables that go by another world's name and have columns of their own, by world.
+_OWN = {world: _columns(declared) for world, declared in _DECLARED["columns_of"].items()}
 
 
 def columns_of(world: str, table: str) -> Mapping[str, pa.DataType]:
     """The columns of a table in a folder of some world; empty for a table that is not declared."""
-    return _OWN.get((world, table)) or COLUMNS.get(table, {})
+    return _OWN.get(world, {}).get(table) or COLUMNS.get(table, {})
 
 
 #: The tables that a folder has, whether they hold a row or not, by the world that was run; folders that
 #: answer another question than what a run does or where two part go by that question.
 TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "md": ("series", "flips", "epochs"),
-        "ball": ("steps", "contacts", "solver", "heights", "separations"),
-        "demos": ("curves",),
-        "fork": ("separation", "cross_flips"),
-        "screen": (),
-        "compare": (),
-        "benign": (),
-        "map": ("boundaries", "intervals", "points"),
-        "processes": ("variants", "variant_separations"),
-        "certify": ("policies", "ambiguous", "policy_separations"),
-        "forecast": ("foretold", "reach"),
-        "audit": ("curves", "energies", "crossings"),
-        "grad": ("growth", "flip_contributions", "trust", "scaling"),
-        "flips": ("flips", "frames", "members", "contacts", "lifetimes", "neighbors", "residues", "busiest"),
-        "flips-compare": ("apart", "differing"),
-        "conform": ("areas", "failures"),
-    }
+    {world: tuple(names.split()) for world, names in _DECLARED["tables"].items()}
 )
-
 #: The verb of the command line that makes a folder of a world.
-VERBS: Mapping[str, str] = MappingProxyType(
-    {
-        **dict.fromkeys(TABLES, "fork"),
-        "md": "run", "ball": "ball", "demos": "ball --demo", "audit": "audit", "grad": "grad",
-        "conform": "conform", "flips": "flips", "flips-compare": "flips",
-    }
-)  # fmt: skip
+VERBS: Mapping[str, str] = MappingProxyType(dict.fromkeys(TABLES, "fork") | _DECLARED["verbs"])
 
 # the worlds of folders that are resumed from the rows they have
 _RESUMED = frozenset({"md"})
