@@ -50,39 +50,24 @@ fork = typer.Typer(
 )
 
 
-_STEPS = typer.Option(None, min=1, help="Steps to follow, instead of the system's own.")
+_STEPS = typer.Option(None, min=1)
 
 
-def _horizon(steps: int | None = _STEPS) -> dict[str, Any]:
+def of_a_horizon(steps: int | None = _STEPS) -> dict[str, Any]:
+    """How far runs are followed."""
     return {"steps": steps}
 
 
-def _pair(
+def of_a_pair(
     steps: int | None = _STEPS,
-    split: float | None = typer.Option(
-        None, metavar="LENGTH", help="The separation that counts as split; 0.01 of the cutoff by default."
-    ),
-    repeats: int | None = typer.Option(
-        None, min=0, metavar="K", help="Perturbed starts at most, to tell a delay from chance; 15 by default."
-    ),
-    no_counterfactual: bool = typer.Option(
-        False, "--no-counterfactual",
-        help="Do not run B under A's decisions, nor repeats: dates, but no cause.",
-    ),
-    no_back: bool = typer.Option(
-        False, "--no-back", help="Do not run A under B's decisions: half of the table of two by two."
-    ),
-    no_lyapunov: bool = typer.Option(
-        False, "--no-lyapunov", help="Do not carry a tangent along A for its Lyapunov exponent."
-    ),
-    minimal: bool = typer.Option(
-        False, "--minimal", help="The fewest decisions to override with A's that keep the runs together."
-    ),
-    pin: str | None = typer.Option(
-        None, metavar="DECISION",
-        help="Run B once more with A's decision: fork, a pair 3-75, or 3-75:600..700.",
-    ),
-) -> dict[str, Any]:  # fmt: skip
+    split: float | None = None,
+    repeats: int | None = typer.Option(None, min=0),
+    no_counterfactual: bool = False,
+    no_back: bool = False,
+    no_lyapunov: bool = False,
+    minimal: bool = False,
+    pin: str | None = None,
+) -> dict[str, Any]:
     """What was asked about a pair of runs, and nothing that was not."""
     given = {
         "steps": steps, "split": split, "repeats": repeats, "minimal": minimal or None, "pin": pin,
@@ -92,19 +77,16 @@ def _pair(
     return {name: value for name, value in given.items() if value is not None}
 
 
-_OF_A_SYSTEM = output.question(_horizon, output.changed)
+_OF_A_SYSTEM = output.question(of_a_horizon, output.changed)
 
 
 @fork.command()
-@output.question(_pair, output.changed)
+@output.question(of_a_pair, output.changed)
 def vary(
     system: str = SYSTEM_ARGUMENT,
-    choice: str | None = typer.Option(
-        None, "--vary", metavar="CHOICE", help="What to vary: precision, reduction=exact, contact=earlier; "
-        "by default what the system file has in [fork], or precision.",
-    ),
+    choice: str | None = typer.Option(None, "--vary"),
     how: Any = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Vary one choice, and find where the runs fork, where they split, and what the flips did to that."""
     return mdnum.fork(system, choice, **how)
 
@@ -158,10 +140,8 @@ def processes(system: str = SYSTEM_ARGUMENT, how: Any = None) -> Any:
 @_OF_A_SYSTEM
 def map_(
     system: str = SYSTEM_ARGUMENT,
-    along: str = typer.Argument(metavar="KEY=LOW:HIGH", help="The number and its interval."),
-    most: int | None = typer.Option(
-        None, min=1, metavar="N", help="Stop after this number of boundaries; 24 by default, 64 of a ball."
-    ),
+    along: str = typer.Argument(),
+    most: int | None = typer.Option(None, min=1),
     how: Any = None,
 ) -> Any:
     """Map where the history of decisions changes along a number."""
@@ -169,14 +149,9 @@ def map_(
 
 
 @fork.command()
-@output.question(_pair, noted=("run_a", "run_b"))
+@output.question(of_a_pair, noted=("run_a", "run_b"))
 def compare(
-    run_a: Path = typer.Argument(metavar="RUN_A", help="A run folder."),
-    run_b: Path = typer.Argument(metavar="RUN_B", help="The run folder to compare it with."),
-    replay: bool = typer.Option(
-        False, "--replay", help="Follow both again, for split and verdict; the options below are of that."
-    ),
-    how: Any = None,
+    run_a: Path = typer.Argument(), run_b: Path = typer.Argument(), replay: bool = False, how: Any = None
 ) -> Any:
     """Compare two finished runs: what was different, and where they diverge."""
     return mdnum.fork_folders(run_a, run_b, replay=replay, **how)
@@ -184,22 +159,14 @@ def compare(
 
 @fork.command()
 @_OF_A_SYSTEM
-def forecast(
-    system: str = SYSTEM_ARGUMENT,
-    length: float = typer.Argument(metavar="LENGTH", help="How far the furthest atom is displaced."),
-    how: Any = None,
-) -> Any:
+def forecast(system: str = SYSTEM_ARGUMENT, length: float = typer.Argument(), how: Any = None) -> Any:
     """Forecast which decisions a displacement of the start would flip first, from one tangent run."""
     return mdnum.fork_forecast(system, length, **how)
 
 
 @fork.command()
 @_OF_A_SYSTEM
-def benign(
-    system: str = SYSTEM_ARGUMENT,
-    choice: str = typer.Argument(metavar="CHOICE", help="What to vary; `mdnum fork choices` lists all."),
-    how: Any = None,
-) -> Any:
+def benign(system: str = SYSTEM_ARGUMENT, choice: str = typer.Argument(), how: Any = None) -> Any:
     """Find whether a choice changes anything that would be measured, with ensembles of runs."""
     return mdnum.fork_benign(system, choice, **how)
 

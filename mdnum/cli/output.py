@@ -7,13 +7,16 @@ import json
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from copy import copy
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import typer
+from typer.models import ParameterInfo
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
 from mdnum.plain import plain
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
     from mdnum.report.section import Table
     from mdnum.verbs.frame import Outcome
 
+_TEXTS: dict[str, dict[str, str | list[str]]] = tomllib.loads(
+    Path(__file__).with_name("options.toml").read_text(encoding="utf-8")
+)
 EXIT_FINE = 0
 EXIT_FINDINGS = 1
 EXIT_USAGE = 2
@@ -97,14 +103,27 @@ def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
     return {"overrides": parse_overrides(settings)}
 
 
-def _kept(
-    out: Path | None = typer.Option(
-        None, "-o", "--out", metavar="DIR", help="The new folder; one in runs by default."
-    ),
-    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+def of_a_folder(
+    out: Path | None = typer.Option(None, "-o", "--out"), no_report: bool = False
 ) -> dict[str, Any]:
     """Where the answer goes, as a verb takes it."""
     return {"out": out, "report": not no_report}
+
+
+def _described(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """Parameters of a function but `how`, as arguments and options with what options.toml says of them."""
+    texts = _TEXTS.get(function.__name__.rstrip("_"), {})
+    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+        if name == "how":
+            continue
+        info: Any = copy(parameter.default)
+        if not isinstance(info, ParameterInfo):
+            # by itself a flag could be turned off by another: --no-report and --no-no-report
+            flag = [f"--{name.replace('_', '-')}"] if parameter.annotation is bool else []
+            info = typer.Option(parameter.default, *flag)
+        said = texts.get(name, info.help)
+        info.metavar, info.help = said if isinstance(said, list) else (info.metavar, said)
+        yield parameter.replace(default=info)
 
 
 def question(
@@ -127,7 +146,7 @@ def question(
             from mdnum.store import RunFolder
 
             how: dict[str, Any] = {}
-            for group in (*groups, _kept):
+            for group in (*groups, of_a_folder):
                 how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
             folders = dict.fromkeys(given[name] for name in noted if given[name] is not None)
             # looked at before a folder is listed anew, and said where nothing is worse
@@ -149,8 +168,7 @@ def question(
             return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
 
         whole: Any = command
-        sources = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups, _kept)]
-        parameters = {name: each for one in sources for name, each in one.items() if name != "how"}
+        parameters = {each.name: each for one in (ask, *groups, of_a_folder) for each in _described(one)}
         alone = inspect.Parameter.KEYWORD_ONLY
         parameters["as_json"] = inspect.Parameter("as_json", alone, default=JSON_OPTION, annotation=bool)
         whole.__signature__ = inspect.Signature([each.replace(kind=alone) for each in parameters.values()])

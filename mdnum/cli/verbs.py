@@ -31,7 +31,7 @@ app.add_typer(fork, name="fork")
 app.add_typer(systems, name="systems")
 app.add_typer(check, name="check")
 
-_STEPS = typer.Option(None, min=1, help="Steps to run, instead of the system's own.")
+_STEPS = typer.Option(None, min=1)
 
 
 def _show_version(wanted: bool) -> None:
@@ -67,15 +67,11 @@ def _resume_run(given: Mapping[str, Any]) -> str | None:
 @app.command()
 @output.question(output.changed, noted=["resume"], remedy=_resume_run)
 def run(
-    system: str | None = typer.Argument(
-        None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
-    ),
+    system: str | None = typer.Argument(None),
     steps: int | None = _STEPS,
-    save_every: int | None = typer.Option(
-        None, min=0, metavar="K", help="Write every K-th frame to trajectory.traj; 0 writes none."
-    ),
-    resume: Path | None = typer.Option(None, metavar="DIR", help="Continue the run in this folder."),
-    no_check: bool = typer.Option(False, "--no-check", help="Do not compare with ASE."),
+    save_every: int | None = typer.Option(None, min=0),
+    resume: Path | None = None,
+    no_check: bool = False,
     how: Any = None,
 ) -> Any:
     """Simulate a system and record every flip."""
@@ -97,16 +93,10 @@ def run(
 @app.command()
 @output.question(output.changed)
 def ball(
-    system: str | None = typer.Argument(
-        None, metavar="SYSTEM", help="A ball's name from `mdnum systems list`, or the path of a TOML file."
-    ),
-    demo: str | None = typer.Option(
-        None, "--demo", metavar="NAME", help="Run a demonstration instead, or all of them: --demo all."
-    ),
+    system: str | None = typer.Argument(None),
+    demo: str | None = None,
     steps: int | None = _STEPS,
-    against: list[str] | None = typer.Option(
-        None, metavar="KEY=VALUE", help="Compare with the system with this key changed; repeatable."
-    ),
+    against: list[str] | None = None,
     how: Any = None,
 ) -> Any:
     """Bounce a ball and record every decision, or run a demonstration."""
@@ -144,31 +134,13 @@ def _balls(as_json: bool) -> int:
 @output.question(output.changed)
 def grad(
     system: str = output.SYSTEM_ARGUMENT,
-    of: str | None = typer.Option(
-        None, metavar="LOSS", help="What to differentiate: msd, vacf, potential, temperature, pressure, ..."
-    ),
-    wrt: list[str] | None = typer.Option(
-        None, metavar="NAME,NAME", help="By which parameters: epsilon, r_cut, initial.velocities, ..."
-    ),
-    steps: int | None = typer.Option(
-        None, min=1, help="The horizon; the system's own steps, but no more than 500, by default."
-    ),
-    methods: list[str] | None = typer.Option(
-        None,
-        metavar="WORD,WORD",
-        help="Ways to differentiate, or all; by default those that answer within about a minute.",
-    ),
-    replicas: int = typer.Option(
-        0, min=0, metavar="N", help="Other starts, for the standard error of the gradient; none by default."
-    ),
-    also: list[str] | None = typer.Option(
-        None, metavar="WORD,WORD", help="Further parts of the diagnosis: spectrum, edges, scaling, or all."
-    ),
-    no_half_step: bool = typer.Option(
-        False,
-        "--no-half-step",
-        help="Do not make the gradient at half the time step too; then nothing is called trusted.",
-    ),
+    of: str | None = None,
+    wrt: list[str] | None = None,
+    steps: int | None = _STEPS,
+    methods: list[str] | None = None,
+    replicas: int = typer.Option(0, min=0),
+    also: list[str] | None = None,
+    no_half_step: bool = False,
     how: Any = None,
 ) -> Any:
     """Differentiate a loss through a rollout, compare the ways of doing it, and say how far to trust it."""
@@ -184,45 +156,19 @@ def grad(
 @app.command()
 @output.question()
 def flips(
-    trajectory: str = typer.Argument(
-        metavar="TRAJECTORY",
-        help="A file that MDAnalysis or ASE reads, or the folder of a run; frames behind an @: run.xtc@100:",
-    ),
-    other: str | None = typer.Argument(
-        None, metavar="[OTHER]", help="A second trajectory of the same atoms: where do the two diverge?"
-    ),
-    topology: Path | None = typer.Option(
-        None, "-s", "--topology", metavar="FILE", help="What the atoms are, for xtc, trr, dcd, netcdf, ..."
-    ),
-    cutoffs: list[float] | None = typer.Option(
-        None, "--cutoff", metavar="R",
-        help="Inside where r < R, in the file's unit (Å, as a rule); repeatable.",
-    ),
-    pairs: list[str] | None = typer.Option(
-        None, "--pairs", metavar="A-B=R,...",
-        help='Cutoffs by pair of species, "O-H=2.5,O-O=3.5"; repeatable.',
-    ),
-    nearest: list[int] | None = typer.Option(
-        None, "--nearest", min=1, metavar="K", help="The K nearest of each atom; repeatable."
-    ),
-    most: int | None = typer.Option(
-        None, "--most", min=1, metavar="M", help="Of those inside --cutoff, only the M nearest of each atom."
-    ),
-    between: tuple[str, str] | None = typer.Option(
-        None, "--between", metavar="SEL SEL",
-        help='Pairs with one atom in each selection (MDAnalysis\'s language), "name OW" "protein".',
-    ),
-    window: int = typer.Option(
-        5, "--window", min=1, metavar="FRAMES", help="A flip reversed within so many frames is chatter."
-    ),
-    format: str | None = typer.Option(
-        None, "--format", metavar="WORD", help="The file's format, where its name does not tell."
-    ),
-    drop_repeats: bool = typer.Option(
-        False, "--drop-repeats", help="Leave out frames that are earlier ones again, bit for bit."
-    ),
+    trajectory: str = typer.Argument(),
+    other: str | None = typer.Argument(None),
+    topology: Path | None = typer.Option(None, "-s", "--topology"),
+    cutoffs: list[float] | None = typer.Option(None, "--cutoff"),
+    pairs: list[str] | None = None,
+    nearest: list[int] | None = typer.Option(None, min=1),
+    most: int | None = typer.Option(None, min=1),
+    between: tuple[str, str] | None = None,
+    window: int = typer.Option(5, min=1),
+    format: str | None = None,
+    drop_repeats: bool = False,
     how: Any = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Find every pair that entered or left a cutoff between frames, and say what that tells and what not."""
     return mdnum.flips(
         trajectory, other, topology=topology, cutoffs=cutoffs or (), pairs=pairs or (),
@@ -246,31 +192,16 @@ def _resume_audit(given: Mapping[str, Any]) -> str | None:
 @app.command()
 @output.question(noted=["resume"], remedy=_resume_audit)
 def audit(
-    calculator: str | None = typer.Argument(
-        None, metavar="CALCULATOR",
-        help="package.module:Class(argument=value), a Python file that makes a calculator, or a SYSTEM.",
-    ),
-    structure: Path | None = typer.Option(
-        None, "-s", "--structure", metavar="FILE[@N]",
-        help="A structure, the N-th of a file's (from 0; the last by default); one is built by default.",
-    ),
+    calculator: str | None = typer.Argument(None),
+    structure: Path | None = typer.Option(None, "-s", "--structure"),
     checks: list[str] | None = typer.Option(None, metavar="NAME,NAME", help=f"Only these: {_checks()}."),
-    temperature: float | None = typer.Option(
-        None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."
-    ),
-    timestep: float | None = typer.Option(
-        None, min=0.0, metavar="FS", help="Of the run; from the fastest vibration by default."
-    ),
-    steps: int | None = typer.Option(None, min=16, help="Of the run; 200 by default."),
-    time: float | None = typer.Option(
-        None, metavar="MINUTES",
-        help="Ask nothing more after that; what was not asked is listed. Exit code 3: before a verdict.",
-    ),
-    resume: Path | None = typer.Option(
-        None, metavar="DIR", help="Ask what the audit in this folder has not asked, of the same calculator."
-    ),
+    temperature: float | None = typer.Option(None, min=0.0),
+    timestep: float | None = typer.Option(None, min=0.0),
+    steps: int | None = typer.Option(None, min=16),
+    time: float | None = None,
+    resume: Path | None = None,
     how: Any = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Ask any ASE calculator: is it smooth, invariant, conservative, free of memory, does it keep energy?
 
     Runs the Python that makes the calculator, with --resume what the folder names. No other verb but
@@ -290,37 +221,18 @@ def _resume_conform(given: Mapping[str, Any]) -> str:
 @app.command()
 @output.question(noted=["resume"], remedy=_resume_conform)
 def conform(
-    pairs: str | None = typer.Argument(
-        None, metavar="[LIST]",
-        help="A name, package.module:function, or file.py:function; without one, the names are listed.",
-    ),
-    cases: int | None = typer.Option(
-        None, min=0, metavar="N",
-        help="Random cases beside those with a name; 500 by default, a share of them for slow lists.",
-    ),
-    seed: int = typer.Option(0, metavar="N", help="Of the random cases."),
-    full: bool | None = typer.Option(
-        None, "--full/--half", help="Every pair from both of its atoms, or once; found out by default."
-    ),
-    precision: str | None = typer.Option(
-        None, metavar="WORD", help="Of its arithmetic: float64 or float32; found out by default."
-    ),
-    superset: bool = typer.Option(False, "--superset", help="Pairs beyond the cutoff may be listed."),
-    limits: list[str] | None = typer.Option(
-        None, metavar="WORD,WORD",
-        help="What it does not claim to do: minimum-image, orthorhombic, along-axes, all-axes, periodic, "
-        "free, wrapped, fixed-cell, right-handed, lower-triangular, whole-cell.",
-    ),
-    no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
-    time: float | None = typer.Option(
-        None, metavar="MINUTES",
-        help="Ask nothing more after that; what was not asked is reported. Exit code 3: before a verdict.",
-    ),
-    resume: Path | None = typer.Option(
-        None, metavar="DIR", help="Resume the examination in this folder, with its options."
-    ),
+    pairs: str | None = typer.Argument(None),
+    cases: int | None = typer.Option(None, min=0),
+    seed: int = 0,
+    full: bool | None = typer.Option(None, "--full/--half"),
+    precision: str | None = None,
+    superset: bool = False,
+    limits: list[str] | None = None,
+    no_large: bool = False,
+    time: float | None = None,
+    resume: Path | None = None,
     how: Any = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale.
 
     Runs the Python of the list, with --resume of the list that the folder names. No other verb but `audit`
