@@ -15,6 +15,8 @@ T = TypeVar("T")
 class TimeUp(Exception):
     """The deadline passed while something was in progress, which has no result."""
 
+    why = "the time was up"
+
 
 class Deadline:
     """The moment at which no more work is begun.

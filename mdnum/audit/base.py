@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 from mdnum.audit.causes import cause
 from mdnum.audit.checks import CHECKS
-from mdnum.deadline import Deadline
+from mdnum.deadline import Deadline, TimeUp
 from mdnum.errors import MdnumError
 
 if TYPE_CHECKING:
@@ -27,18 +27,12 @@ Severity = Literal["info", "warning", "error"]
 Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 #: (what, why) of what was not asked, and why something was not that would have been.
 Skipped = tuple[str, str]
-TIME_UP = "the time was up"
+TIME_UP = TimeUp.why
 CALLS_UP = "the calls of this check were used up"
 
 
 def idle(done: int, total: int, info: dict[str, Any]) -> None:
     """A progress that nobody watches."""
-
-
-class TimeUp(Exception):
-    """The time that a person gave has passed: what is in progress is left."""
-
-    why = TIME_UP
 
 
 class CallsUp(TimeUp):
