@@ -93,5 +93,5 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     assert "Stopped during curl" in (copper / "out/report.html").read_text()
     # nothing was found yet
     assert call("audit", EMT, "-s", "cu.extxyz", "-o", "other", "--checks", "curl") == 130
-    assert "stopped. Continue with `mdnum audit --resume other`" in capsys.readouterr().err
+    assert "stopped. Continue it with `mdnum audit --resume other`." in capsys.readouterr().err
     assert not (copper / "other/summary.json").exists()

@@ -314,8 +314,8 @@ _OPTIONS = {
     "cases": 3, "seed": 0, "large": False, "full": None, "precision": None, "superset": None, "limits": [],
 }  # fmt: skip
 _CASE = {
-    "case": "x", "failures": [{"code": "MISSING", "text": "a", "count": 1, "step": 0}], "refused": None,
-    "ties": [0, 0], "aliased": False, "single": False, "seconds": 0.1,
+    "case": "x", "failures": [{"code": "MISSING", "text": "a", "step": 0}], "refused": None,
+    "ties": [0, 0], "aliased": False, "single": None, "seconds": 0.1,
 }  # fmt: skip
 _STILL = {"positions": [[0.0, 0, 0]], "cell": np.eye(3).tolist(), "fresh": False, "skin": None}
 _SMALL = {"name": "x", "area": "few", "pbc": [True] * 3, "r_cut": 1.0, "skin": 0.0, "stills": [_STILL]}
@@ -377,7 +377,8 @@ _WRONG_AUDITS = [
 )
 def test_answers_of_another_shape_are_told_in_a_line(tmp_path, world, where, value):
     from mdnum.audit.record import kept
-    from mdnum.verbs.conform import conform
+    from mdnum.store.answers import restored
+    from mdnum.verbs.conform import Examination, conform
 
     folder = RunFolder.create(tmp_path / "run", world=world)
     told = _audit_state() if world == "audit" else json.loads(json.dumps(_ANSWERS))
@@ -388,10 +389,13 @@ def test_answers_of_another_shape_are_told_in_a_line(tmp_path, world, where, val
     with pytest.raises(FolderError, match=r"answers\.json: ") as seen:
         kept(folder) if world == "audit" else conform(resume=folder.path, report=False)
     assert "\n" not in str(seen.value) and "its bytes" not in str(seen.value)
-    # as it was, an audit is gone on with
+    # as they were, they can be gone on with
     if world == "audit":
         atomic.write_text(folder.path / "answers.json", json.dumps(_audit_state()))
         assert kept(RunFolder.open(folder.path)).left == ["curl"]
+    else:
+        atomic.write_text(folder.path / "answers.json", json.dumps(_ANSWERS))
+        assert restored(RunFolder.open(folder.path), Examination).word == "ase"
 
 
 def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):

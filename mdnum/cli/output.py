@@ -129,7 +129,6 @@ def _described(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
 def question(
     *groups: Callable[..., dict[str, Any]],
     noted: Sequence[str] = (),
-    remedy: Callable[[Mapping[str, Any]], str | None] | None = None,
 ) -> Callable[[Callable[..., Any]], Callable[..., int]]:
     """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
 
@@ -138,7 +137,6 @@ def question(
             and the progress are one dictionary of the function's, `how`. It may return a function instead of
             an outcome, which is called with whether JSON was asked for.
         noted: parameters that are folders to be read; what is not as it was written there is said on stderr.
-        remedy: asked what to do after control-C, with everything that was given.
     """
 
     def decorate(ask: Callable[..., Any]) -> Callable[..., int]:
@@ -152,7 +150,7 @@ def question(
             # looked at before a folder is listed anew, and said where nothing is worse
             wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
             stopped = False
-            with watched(lambda: remedy({**given, **how}) if remedy else None) as progress:
+            with watched(lambda: _again({**given, **how})) as progress:
                 how["progress"] = progress
                 try:
                     outcome: Any = ask(**given, how=how)
@@ -177,6 +175,16 @@ def question(
         return command
 
     return decorate
+
+
+def _again(given: Mapping[str, Any]) -> str | None:
+    """What can be done about the folder of a command that was stopped and has a --resume."""
+    from mdnum.store import RunFolder
+
+    folder = given.get("resume") or given["out"]
+    with suppress(MdnumError):
+        return RunFolder.open(folder).again if "resume" in given and folder is not None else None
+    return None  # it was stopped before there was one
 
 
 def print_json(document: Mapping[str, Any]) -> int:
@@ -357,7 +365,7 @@ _WORDS = {
 
 
 @contextmanager
-def watched(remedy: Callable[[], str | None] | None = None) -> Iterator[ProgressBar]:
+def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
     """A progress bar around a run; control-C becomes the error that ends the command line.
 
     Args:
@@ -373,7 +381,7 @@ def watched(remedy: Callable[[], str | None] | None = None) -> Iterator[Progress
         # one that meets a compiled function as it returns comes as the cause of another error
         if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
             raise
-        raise Stopped("stopped", remedy=remedy() if remedy is not None else None) from None
+        raise Stopped("stopped", remedy=remedy()) from None
 
 
 class ProgressBar:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import typer
 import mdnum
 from mdnum.cli import output
 from mdnum.cli.fork import fork
+from mdnum.cli.output import JSON_OPTION, SET_OPTION, SYSTEM_ARGUMENT
 from mdnum.errors import InputError
 
 # rich's help formatting and tracebacks cost more than the whole of --help may take
@@ -54,18 +55,8 @@ def _top(
 # -- simulations
 
 
-def _resume_run(given: Mapping[str, Any]) -> str | None:
-    from mdnum.store.files import resumable
-
-    folder = given["resume"] or given["out"]
-    if folder is None or not folder.exists():
-        return None
-    kept = f"Continue with `mdnum run --resume {folder}`"
-    return kept if resumable(folder) else "Nothing of it was kept: give the command again"
-
-
 @app.command()
-@output.question(output.changed, noted=["resume"], remedy=_resume_run)
+@output.question(output.changed, noted=["resume"])
 def run(
     system: str | None = typer.Argument(None),
     steps: int | None = _STEPS,
@@ -133,7 +124,7 @@ def _balls(as_json: bool) -> int:
 @app.command()
 @output.question(output.changed)
 def grad(
-    system: str = output.SYSTEM_ARGUMENT,
+    system: str = SYSTEM_ARGUMENT,
     of: str | None = None,
     wrt: list[str] | None = None,
     steps: int | None = _STEPS,
@@ -183,14 +174,8 @@ def _checks() -> str:
     return ", ".join(CHECKS)
 
 
-def _resume_audit(given: Mapping[str, Any]) -> str | None:
-    folder = given["resume"] or given["out"]
-    begun = folder is not None and (folder / "answers.json").exists()
-    return f"Continue with `mdnum audit --resume {folder}`" if begun else None
-
-
 @app.command()
-@output.question(noted=["resume"], remedy=_resume_audit)
+@output.question(noted=["resume"])
 def audit(
     calculator: str | None = typer.Argument(None),
     structure: Path | None = typer.Option(None, "-s", "--structure"),
@@ -213,13 +198,8 @@ def audit(
     )  # fmt: skip
 
 
-def _resume_conform(given: Mapping[str, Any]) -> str:
-    name = given["resume"] or given["out"] or "DIR, which is the newest runs/conform-NAME-N"
-    return f"What was found is in the folder; resume it with `mdnum conform --resume {name}`"
-
-
 @app.command()
-@output.question(noted=["resume"], remedy=_resume_conform)
+@output.question(noted=["resume"])
 def conform(
     pairs: str | None = typer.Argument(None),
     cases: int | None = typer.Option(None, min=0),
@@ -284,7 +264,7 @@ def _lists(as_json: bool) -> int:
 
 @app.command()
 def report(
-    folder: Path = typer.Argument(metavar="DIR", help="A run folder."), as_json: bool = output.JSON_OPTION
+    folder: Path = typer.Argument(metavar="DIR", help="A run folder."), as_json: bool = JSON_OPTION
 ) -> int:
     """Write the report of a run folder again."""
     from mdnum.store import RunFolder
@@ -296,7 +276,7 @@ def report(
 
 
 @app.command()
-def doctor(as_json: bool = output.JSON_OPTION) -> int:
+def doctor(as_json: bool = JSON_OPTION) -> int:
     """Test the numbers this installation computes."""
     from mdnum.doctor import diagnose
 
@@ -318,7 +298,7 @@ def doctor(as_json: bool = output.JSON_OPTION) -> int:
 
 
 @systems.command("list")
-def list_systems(as_json: bool = output.JSON_OPTION) -> int:
+def list_systems(as_json: bool = JSON_OPTION) -> int:
     """List the systems that come with mdnum."""
     from mdnum import systems
 
@@ -333,9 +313,7 @@ def list_systems(as_json: bool = output.JSON_OPTION) -> int:
 
 @systems.command()
 def show(
-    system: str = output.SYSTEM_ARGUMENT,
-    settings: list[str] | None = output.SET_OPTION,
-    as_json: bool = output.JSON_OPTION,
+    system: str = SYSTEM_ARGUMENT, settings: list[str] | None = SET_OPTION, as_json: bool = JSON_OPTION
 ) -> int:
     """Print a system file with every default filled in."""
     text = _load(system, settings).to_toml(beside=False)
@@ -344,22 +322,14 @@ def show(
 
 @systems.command("check")
 def check_system(
-    system: str = output.SYSTEM_ARGUMENT,
-    settings: list[str] | None = output.SET_OPTION,
-    as_json: bool = output.JSON_OPTION,
+    system: str = SYSTEM_ARGUMENT, settings: list[str] | None = SET_OPTION, as_json: bool = JSON_OPTION
 ) -> int:
     """Read a system file and its structure, and say whether it can be run."""
     loaded = _load(system, settings)
     from mdnum.verbs.check import structure_findings
 
     found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
-    document = {
-        "system": loaded.name,
-        "ok": True,
-        **_size(loaded),
-        "path": loaded.path,
-        "findings": found,
-    }
+    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path, "findings": found}
     words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
     output.print_document(document, words, as_json)
     if not as_json:
@@ -369,9 +339,9 @@ def check_system(
 
 @systems.command()
 def copy(
-    system: str = output.SYSTEM_ARGUMENT,
+    system: str = SYSTEM_ARGUMENT,
     target: Path = typer.Argument(Path(), metavar="[DIR]", help="Where to; here by default."),
-    as_json: bool = output.JSON_OPTION,
+    as_json: bool = JSON_OPTION,
 ) -> int:
     """Copy a system file and its structure, to change and run."""
     from mdnum import systems
@@ -403,9 +373,7 @@ def _compared(question: str, title: str, help: str) -> Callable[..., int]:
 
     @check.command(question, help=help)
     def compare(
-        system: str = output.SYSTEM_ARGUMENT,
-        settings: list[str] | None = output.SET_OPTION,
-        as_json: bool = output.JSON_OPTION,
+        system: str = SYSTEM_ARGUMENT, settings: list[str] | None = SET_OPTION, as_json: bool = JSON_OPTION
     ) -> int:
         from mdnum.verbs.check import check
 

@@ -699,8 +699,11 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
         seen = f"is not empty (it holds {present[0]!r})"
         raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
     made = manifest.load(path)
-    stopped = made is not None and not made.finished
-    remedy = _again(path) if stopped or manifest.resumable(path) else "Choose another folder, or remove it"
+    remedy = "Choose another folder, or remove it"
+    if manifest.resumable(path):
+        remedy = f"{_again(path)}, or choose another folder"
+    elif made is not None and not made.finished:
+        remedy = _again(path)
     raise FolderError("already holds a run", remedy=remedy, where=str(path))
 
 
@@ -710,7 +713,7 @@ def _again(path: Path) -> str:
     world = made.world if made is not None else "conform" if (path / "answers.json").exists() else "md"
     verb = f"mdnum {VERBS.get(world, 'run')}"
     if manifest.resumable(path):
-        return f"Continue it with `{verb} --resume {path}`, or choose another folder"
+        return f"Continue it with `{verb} --resume {path}`"
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
         return f"Nothing of it was kept: give the `{verb}` command again"
     return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
