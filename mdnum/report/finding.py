@@ -43,28 +43,18 @@ _ORDER = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing a person should know about a result.
+    """One thing a person should know about a result."""
 
-    Attributes:
-        code: stable name, for scripts.
-        severity: error: do not use the numbers; warning: look before you do; info: good to know, which
-            changes neither the exit code nor the tone.
-        title: one line, without a capital or a full stop.
-        text: what was seen, with its numbers.
-        remedy: what to do, empty if nothing.
-        values: the numbers in it, by name, plain.
-        section: title of the section of the page that shows it, empty if none does.
-        cause: code of the finding that this one may follow from, empty if none.
-    """
-
-    code: str
+    code: str  # stable name, for scripts
+    # error: do not use the numbers; warning: look before you do; info: good to know, which changes neither
+    # the exit code nor the tone
     severity: Severity
-    title: str
-    text: str
-    remedy: str = ""
-    values: Mapping[str, Any] = field(default_factory=dict)
-    section: str = ""
-    cause: str = ""
+    title: str  # one line, without a capital or a full stop
+    text: str  # what was seen, with its numbers
+    remedy: str = ""  # what to do, empty if nothing
+    values: Mapping[str, Any] = field(default_factory=dict)  # the numbers in it, by name, plain
+    section: str = ""  # title of the section of the page that shows it, empty if none does
+    cause: str = ""  # code of the finding that this one may follow from, empty if none
 
 
 class _Fields(string.Formatter):
@@ -170,20 +160,13 @@ def _entries(path: Path) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to think of a result.
+    """What to think of a result."""
 
-    Attributes:
-        tone: the worst severity; "good" (or "info", where nothing was to be good) if there is neither error
-            nor warning.
-        headline: one sentence, which names the worst thing on its page.
-        evidence: what it rests on, a sentence each.
-        findings: errors first.
-    """
-
+    # the worst severity; with neither error nor warning "good", or "info" where nothing was to be good
     tone: Tone
-    headline: str
-    evidence: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    headline: str  # one sentence, which names the worst thing on its page
+    evidence: tuple[str, ...]  # what it rests on, a sentence each
+    findings: tuple[Finding, ...]  # errors first
 
     @property
     def text(self) -> str:

@@ -131,20 +131,13 @@ class Verb:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What every verb returns.
+    """What every verb returns."""
 
-    Attributes:
-        folder: what was written.
-        summary: what summary.json says: numbers, findings, headline and verdict.
-        page: what report.html and the terminal show.
-        result: what the verb computed, as Python has it; None where a folder was only read.
-    """
-
-    folder: Path
-    summary: Mapping[str, Any]
+    folder: Path  # that was written
+    summary: Mapping[str, Any]  # content of summary.json: numbers, findings, headline and verdict
     verdict: Verdict
-    page: Page
-    result: Any = None
+    page: Page  # what report.html and the terminal show
+    result: Any = None  # what the verb computed, as Python has it; None where a folder was only read
 
 
 class Interrupted(KeyboardInterrupt):

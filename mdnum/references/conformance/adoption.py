@@ -26,28 +26,18 @@ from mdnum.references.conformance.suite import Examiner, examine
 
 
 class NeighborListConformance:
-    """Tests of a neighbor list; subclass it under a name that pytest collects, and say which list.
+    """Tests of a neighbor list; subclass it under a name that pytest collects, and say which list."""
 
-    Attributes:
-        pairs: a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with
-            `allocate` and `update` (`KeptList`), or a word that `load` knows.
-        full: every pair from both of its atoms (True) or once (False); None to find out.
-        unit: roundoff of its arithmetic, 2**-53 or 2**-24; None to find out.
-        superset: pairs beyond the cutoff may be listed.
-        limits: what it does not claim to do; such cases are not asked.
-        cases: random cases.
-        seed: of the random cases; change it now and then.
-        large: ask about 5,000 and 100,000 atoms, too; 100,000 unless that would take too long.
-    """
-
+    # a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with `allocate` and
+    # `update` (`KeptList`), or a word that `load` knows
     pairs: ClassVar[Any] = None
-    full: ClassVar[bool | None] = None
-    unit: ClassVar[float | None] = None
-    superset: ClassVar[bool | None] = None
-    limits: ClassVar[ListLimits | None] = None
-    cases: ClassVar[int] = 200
-    seed: ClassVar[int] = 0
-    large: ClassVar[bool] = False
+    full: ClassVar[bool | None] = None  # every pair from both of its atoms or once; None to find out
+    unit: ClassVar[float | None] = None  # roundoff of its arithmetic, 2**-53 or 2**-24; None to find out
+    superset: ClassVar[bool | None] = None  # pairs beyond the cutoff may be listed
+    limits: ClassVar[ListLimits | None] = None  # what it does not claim to do; such cases are not asked
+    cases: ClassVar[int] = 200  # random ones
+    seed: ClassVar[int] = 0  # of the random cases; change it now and then
+    large: ClassVar[bool] = False  # ask about 5,000 atoms, too, and 100,000 unless that would take too long
 
     def subject(self) -> PairList:
         """The list with what the class says about it."""

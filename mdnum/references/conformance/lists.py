@@ -47,43 +47,25 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """What a list does not claim to do; such cases are not asked, and are counted.
+    """What a list does not claim to do; such cases are not asked, and are counted."""
 
-    Attributes:
-        minimum_image: one image of a pair at most: no cell narrower than two cutoffs (and skins).
-        orthorhombic: no cell with other than right angles.
-        along_axes: no cell whose vectors point elsewhere than along x, y and z (lengths may be negative: no).
-        all_axes: no cell that repeats along some axes only.
-        periodic: no free atoms.
-        free: no periodic box.
-        wrapped: no atoms outside the box.
-        fixed_cell: no box that changes during the list's life.
-        right_handed: no left-handed cell.
-        lower_triangular: no cell that is not lower triangular.
-        whole_cell: no cell that lacks a vector, even along an axis that does not repeat.
-        fixed_atoms: a list in use cannot be given other atoms: `allocate` is called again.
-        atoms: no fewer atoms.
-        most_atoms: no more atoms.
-        least_cutoff: no shorter cutoff: a library for one unit of length.
-        roomy: no box of more cells of r_cut than this along all axes together.
-    """
-
-    minimum_image: bool = False
-    orthorhombic: bool = False
+    minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
+    orthorhombic: bool = False  # no cell with other than right angles
+    # no cell whose vectors point elsewhere than along x, y and z (nor backward)
     along_axes: bool = False
-    all_axes: bool = False
-    periodic: bool = False
-    free: bool = False
-    wrapped: bool = False
-    fixed_cell: bool = False
-    right_handed: bool = False
-    lower_triangular: bool = False
-    whole_cell: bool = False
-    fixed_atoms: bool = True
-    atoms: int = 0
-    most_atoms: float = np.inf
-    least_cutoff: float = 0.0
-    roomy: float = np.inf
+    all_axes: bool = False  # no cell that repeats along some axes only
+    periodic: bool = False  # no free atoms
+    free: bool = False  # no periodic box
+    wrapped: bool = False  # no atoms outside the box
+    fixed_cell: bool = False  # no box that changes during the list's life
+    right_handed: bool = False  # no left-handed cell
+    lower_triangular: bool = False  # no cell that is not lower triangular
+    whole_cell: bool = False  # no cell that lacks a vector, even along an axis that does not repeat
+    fixed_atoms: bool = True  # a list in use cannot be given other atoms: `allocate` is called again
+    atoms: int = 0  # no fewer atoms
+    most_atoms: float = np.inf  # no more atoms
+    least_cutoff: float = 0.0  # no shorter cutoff: a library for one unit of length
+    roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
         """Why a case is not asked, or None when it is."""
