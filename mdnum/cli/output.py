@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import typer
@@ -23,7 +22,7 @@ from mdnum.plain import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
     from mdnum.report.finding import Finding
     from mdnum.report.section import Table
@@ -400,27 +399,20 @@ class ProgressBar:
 
     def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 10.0):
         self._stream = sys.stderr if stream is None else stream
-        self._delay = delay
-        self._pause = pause
+        self._pause = delay if self._stream.isatty() else pause
         self._began = time.monotonic()
         self._lock = threading.Lock()
         self._bar: Progress | None = None
-        self._task: TaskID | None = None
         self._timer: threading.Timer | None = None
         self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
         self._closed = False
 
     def __enter__(self) -> Self:
         self._began = time.monotonic()
-        if self._stream.isatty():
-            self._after(self._delay, self._start)
-        else:
-            self._after(self._pause, self._print)
+        self._wait()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._lock:
             self._closed = True
             if self._timer is not None:
@@ -439,62 +431,53 @@ class ProgressBar:
         """Whether the bar has appeared."""
         return self._bar is not None
 
-    def _after(self, seconds: float, action: Callable[[], None]) -> None:
-        self._timer = threading.Timer(seconds, action)
+    def _wait(self) -> None:
+        self._timer = threading.Timer(self._pause, self._show)
         self._timer.daemon = True
         self._timer.start()
 
-    def _print(self) -> None:
+    def _show(self) -> None:
+        """Begins to draw at a terminal; elsewhere prints a line, and waits until it is time for another."""
         with self._lock:
             if self._closed:
                 return
-            step, steps, info = self._last
-            phase = str(info.get("phase", "run"))
-            line = f"mdnum: {_WORDS.get(phase, phase)}"
-            if _counts(steps, info):
-                line += f", {describe(step, steps, info)}"
+            if self._stream.isatty():
+                self._bar = _drawn(self._stream)
+                self._draw()
+                return
+            seconds = f"({time.monotonic() - self._began:.0f} s)"
             with suppress(OSError, ValueError):  # whoever read it has gone
-                print(f"{line} ({time.monotonic() - self._began:.0f} s)", file=self._stream, flush=True)
+                line = ", ".join(filter(None, self._words()))
+                print(f"mdnum: {line} {seconds}", file=self._stream, flush=True)
             self._pause = min(2 * self._pause, 60.0)
-            self._after(self._pause, self._print)
+            self._wait()
 
-    def _start(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
-
-        with self._lock:
-            if self._closed:
-                return
-            self._bar = Progress(
-                SpinnerColumn(),
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=None),
-                TextColumn("{task.fields[line]}"),
-                console=Console(file=self._stream),
-                transient=True,
-                expand=True,
-            )
-            self._task = self._bar.add_task("", total=None, line="")
-            self._bar.start()
-            self._draw()
-
-    def _draw(self) -> None:
-        if self._bar is None or self._task is None:
-            return
+    def _words(self) -> tuple[str, str]:
+        """The phase, and the numbers beside it where it counts."""
         step, steps, info = self._last
         phase = str(info.get("phase", "run"))
-        counting = _counts(steps, info)
-        self._bar.update(
-            self._task,
-            description=_WORDS.get(phase, phase),
-            total=steps if counting else None,
-            completed=step,
-            line=describe(step, steps, info) if counting else "",
-        )
+        counts = steps > 0 and (phase == "run" or "unit" in info)
+        return _WORDS.get(phase, phase), describe(step, steps, info) if counts else ""
+
+    def _draw(self) -> None:
+        if self._bar is not None:
+            (step, steps, _), (phase, line) = self._last, self._words()
+            total = steps if line else None
+            self._bar.update(self._bar.task_ids[0], description=phase, total=total, completed=step, line=line)
 
 
-def _counts(steps: int, info: dict[str, Any]) -> bool:
-    return steps > 0 and (info.get("phase", "run") == "run" or "unit" in info)
+def _drawn(stream: TextIO) -> Progress:
+    """A bar that is there until it is stopped."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+
+    bar = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=None),
+        TextColumn("{task.fields[line]}"), console=Console(file=stream), transient=True, expand=True,
+    )  # fmt: skip
+    bar.add_task("", total=None, line="")
+    bar.start()
+    return bar
 
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count, listed, many, number
-from mdnum.store import RunFolder, answers, files
+from mdnum.store import COLUMNS, RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Outcome, Progress, Verb, View
@@ -204,20 +204,15 @@ def conform(
         summary = _summary(found, _write_scripts(folder, found), options.seed)
         if interrupted:
             summary |= {"status": "stopped", "interrupted": True}
-        names = ("area", "asked", "passed", "failed", "refused", "skipped")
-        tables = {"areas": _columns(summary["areas"], names)}
-        if found.failed:
-            names = ("code", "area", "case", "atoms", "steps", "step", "text", "script")
-            tables["failures"] = _columns(summary["failures"], names)
+        tables = {
+            name: [{column: row[column] for column in COLUMNS[name]} for row in summary[name]]
+            for name in ("areas", "failures")
+        }
         frame.store(folder, summary, tables)
         outcome = frame.finish(folder, report=report, result=found, progress=progress)
         if interrupted:
             raise frame.Interrupted(outcome)
         return outcome
-
-
-def _columns(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    return {name: np.array([row[name] for row in rows], None if rows else int) for name in names}
 
 
 def _script(code: str) -> str:
@@ -329,9 +324,8 @@ def judge(view: View) -> Verdict:
     headline = TEXTS(said, **values)
     if left:
         few = "too_few" if summary["status"] == frame.UNDECIDED and not wrong else "so_far"
-        headline = TEXTS(
-            few, headline=headline, done=summary["questions"] - left, questions=summary["questions"]
-        )
+        questions = summary["questions"]
+        headline = TEXTS(few, headline=headline, done=questions - left, questions=questions)
     findings = [*_failures(summary), *_conduct(summary, answered)]
     best = "info" if summary["status"] == frame.UNDECIDED else "good"
     return conclude(findings, _evidence(view), headline=headline, best=best, judged=True)
@@ -388,9 +382,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
         rounding = all(row["text"].startswith("within rounding") for row in rows)
         ends = any("exit" in row["text"].lower() for row in rows)
         variants = ["rounding"] * rounding + ["exit"] * ends
-        yield TEXTS.finding(
-            code, *variants, seen=seen, **values, cause=cause
-        )  # fmt: skip
+        yield TEXTS.finding(code, *variants, seen=seen, **values, cause=cause)
 
 
 def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
@@ -419,10 +411,9 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
         variants = ["time"] * (not summary["asked"]) + ["first"] * bool(reasons)
         yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values)
     elif reasons:
-        others = [one for one in summary["refusals"] if one["answers"]]
         also = " ".join(
             TEXTS("answers", exception=one["why"].rstrip(". "), case=one["case"], how=listed(one["answers"]))
-            for one in others
+            for one in summary["refusals"] if one["answers"]
         )  # fmt: skip
         variants = ["many"] * (total > 0.2 * summary["asked"]) + ["also"] * bool(also)
         yield TEXTS.finding("REFUSES", *variants, **values, also=also)
@@ -432,12 +423,10 @@ def page(view: View, verdict: Verdict) -> Page:
     """Everything else that is shown."""
     summary = view.summary
     skipped, silent = _total(summary, "skipped"), summary["silent"]
-    kinds = many(len(summary["failures"]), "kind")
+    kinds, wrong = many(len(summary["failures"]), "kind"), summary["wrong"] - silent
     keys = [
         Key("Right", count(_total(summary, "passed")), f"of {many(summary['asked'], 'case')}"),
-        Key(
-            "Wrong", count(summary["wrong"] - silent), f"{kinds}, shrunk" if summary["wrong"] > silent else ""
-        ),
+        Key("Wrong", count(wrong), f"{kinds}, shrunk" if wrong else ""),
         Key("No answer", count(silent), "ends the process, takes too long or raises"),
         Key("Not asked", count(skipped), "outside of what it claims"),
     ]
@@ -458,16 +447,10 @@ def page(view: View, verdict: Verdict) -> Page:
         ]
         table = Table(("script", "reproduces it", "atoms", "steps", "what is wrong"), rows)
         # a name of a file, wherever else the table would have it
-        codes = [
-            Code(
-                f"{row['code']}: {row['case']} ({row['area']})",
-                read_text(view.folder.path / Path(row["script"]).name),
-            )
-            for row in summary["failures"]
-        ]  # fmt: skip
-        sections.insert(
-            1, Section("Failures, reproduced", [TEXTS("brought_down"), table, *codes], terminal=True)
-        )
+        scripts = [read_text(view.folder.path / Path(row["script"]).name) for row in summary["failures"]]
+        titles = [f"{row['code']}: {row['case']} ({row['area']})" for row in summary["failures"]]
+        parts = [TEXTS("brought_down"), table, *map(Code, titles, scripts)]
+        sections.insert(1, Section("Failures, reproduced", parts, terminal=True))
     about = ", ".join(filter(None, [summary["about"] or "A neighbor list", package]))
     return view.page(f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections)
 
@@ -527,10 +510,8 @@ def _conventions(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if counted and not_counted:
         yield "At exactly the cutoff", f"{count(counted)} pairs count, {count(not_counted)} do not"
     elif counted or not_counted:
-        yield (
-            "At exactly the cutoff",
-            "counts as inside (r ≤ r_cut)" if counted else "does not count (r < r_cut)",
-        )
+        inside = "counts as inside (r ≤ r_cut)" if counted else "does not count (r < r_cut)"
+        yield "At exactly the cutoff", inside
     if summary["keeps_order"] is not None:
         yield "Asked again", "same rows, same order" if summary["keeps_order"] else "other order of rows"
     if summary["found_out"]:

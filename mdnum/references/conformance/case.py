@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -16,23 +18,7 @@ from mdnum.references.oracle import PairSet
 
 #: What a case is about, by the name of its area; in the order in which they are asked and reported.
 AREAS: Mapping[str, str] = MappingProxyType(
-    {
-        "few": "no atom, one, two",
-        "boxes": "orthorhombic, skewed, thin, huge, tiny, turned, left-handed",
-        "axes": "axes that do not repeat, and what their cell vectors hold",
-        "images": "cells narrower than two cutoffs: a pair counts once for each image",
-        "outside": "atoms on the faces of the box, just outside it and many boxes away",
-        "ties": "pairs at the cutoff and within a few ulps of it",
-        "coincident": "atoms in one place, or in one place through the box",
-        "crowded": "many neighbors on few atoms: capacities and caps",
-        "large": "thousands of atoms with a pair set that is known in closed form",
-        "random": "boxes, cutoffs and coordinates drawn at random",
-        "reuse": "the same list asked again: other atoms, fewer, more, the same",
-        "motion": "a list in use while atoms move",
-        "wrapping": "a list in use while atoms leave the box and come back on its other side",
-        "strain": "a list in use while the box changes",
-        "rule": "a list in use while a pair comes inside by the smallest of motions",
-    }
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["areas"]
 )
 
 Pbc = tuple[StrictBool, StrictBool, StrictBool]
