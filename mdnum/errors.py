@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 # control characters, what turns or hides text, and halves of characters that no terminal can be given
 _CONTROL = re.compile(
@@ -91,15 +92,8 @@ class NumericalError(MdnumError):
         folder: the run folder that holds everything up to that number.
     """
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        remedy: str | None = None,
-        where: str | None = None,
-        folder: Path | None = None,
-    ):
-        super().__init__(message, remedy=remedy, where=where)
+    def __init__(self, message: str, *, folder: Path | None = None, **more: Any):
+        super().__init__(message, **more)
         self.folder = folder
 
 

@@ -42,15 +42,13 @@ _WRITTEN_ANEW = "report.html"
 _FURTHER = re.compile(r"reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 # what may be in a folder whose writing came to nothing
 _NOTHING_YET = (
-    "system.toml",
-    "structure.extxyz",
-    "provenance.json",
-    "log.txt",
-    manifest.NAME,
-    _LOCK,
-    "parts",
-)
+    "system.toml", "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK, "parts",
+)  # fmt: skip
 _RESTORE = "Restore it from a copy, or run again in a new folder"
+# what values of another kind or form than those that were written lead to
+_OF_WRONG_VALUES = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
 # what people do with system.toml and log.txt changes no number that was recorded
 _EDITED = ("system.toml", "log.txt")
 
@@ -63,15 +61,11 @@ class RunFolder:
     whatever came later and returns the state, so that the run continues as if it had never stopped.
 
     Use `create` for a new run, `open` for one that is there (to read it, or to resume it).
-
-    Attributes:
-        path: the folder.
-        world: which tables it has, a key of `TABLES`.
     """
 
     def __init__(self, path: Path, world: str = "md"):
         self.path = path
-        self.world = world
+        self.world = world  # which tables it has, a key of `TABLES`
         self._streams: dict[str, TableStream] = {}
         self._frames = FrameFile(path / "trajectory.traj")
         self._log: TextIO | None = None
@@ -654,15 +648,7 @@ def restoring(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except _OF_WRONG_VALUES as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
             f"holds what mdnum does not write there ({type(error).__name__} {seen})",

@@ -179,14 +179,16 @@ def conform(
         kept.save()
         due = 0.0
 
+        def summarized() -> dict[str, Any]:
+            found.seconds = state.seconds
+            return _summary(found, _write_scripts(folder, found), options.seed)
+
         def saved(urgent: bool) -> None:
             """Keeps an answer; scripts and summary follow now and then."""
             nonlocal due
             kept.save(urgent)
             if (now := monotonic()) >= due:
-                found.seconds = state.seconds
-                stopped = _summary(found, _write_scripts(folder, found), state.options.seed)
-                folder.write_summary(stopped | {"status": "stopped"})
+                folder.write_summary(summarized() | {"status": "stopped"})
                 # most of the time is for asking
                 due = monotonic() + max(1.0, 20 * (monotonic() - now))
 
@@ -200,8 +202,7 @@ def conform(
             interrupted = True
             examiner.session.close()
         kept.save()
-        found.seconds = state.seconds
-        summary = _summary(found, _write_scripts(folder, found), options.seed)
+        summary = summarized()
         if interrupted:
             summary |= {"status": "stopped", "interrupted": True}
         tables = {

@@ -183,18 +183,13 @@ def end_on_sigterm(stack: ExitStack) -> None:
 
 
 class Keep(TypedDict, total=False):
-    """Keyword arguments of every question that is asked of a system.
+    """Keyword arguments of every question that is asked of a system."""
 
-    Attributes:
-        out: the new folder; default runs/<verb>-<name>-<n>.
-        overrides: dotted keys of the system file to values, such as {"cutoff.kind": "switched"}.
-        report: write report.html; default True.
-        progress: called now and then with what is done, of how much, and a dictionary that names the phase.
-    """
-
-    out: str | Path | None
+    out: str | Path | None  # the new folder; default runs/<verb>-<name>-<n>
+    # dotted keys of the system file to values, such as {"cutoff.kind": "switched"}
     overrides: Mapping[str, Any] | None
-    report: bool
+    report: bool  # write report.html; default True
+    # called now and then with what is done, of how much, and a dictionary that names the phase
     progress: Progress | None
 
 
@@ -215,10 +210,9 @@ def keywords_checked(verb: V, more: Iterable[str] = ()) -> V:
         UnknownKeyword: with the nearest name that it has, and all of them.
     """
     parameters = inspect.signature(verb).parameters.values()
-    known = [one.name for one in parameters if one.kind not in (one.VAR_KEYWORD, one.POSITIONAL_ONLY)]
-    known += [
-        name for one in parameters if one.kind is one.VAR_KEYWORD for name in (*Keep.__annotations__, *more)
-    ]
+    known = [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
+    if len(known) < len(parameters):
+        known += [*Keep.__annotations__, *more]
 
     @functools.wraps(verb)
     def checked(*args: Any, **kwargs: Any) -> Any:

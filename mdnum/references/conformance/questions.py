@@ -94,11 +94,8 @@ def _boxes() -> Named:
     yield "large numbers", gas(24, 4e9, 17), 4e9, True, 1e9
     ulp = float(np.nextafter(4.0, 5.0))
     places = np.array([[0.0, 1, 1], [3.75, 1, 1], [2.0, 0, 0], [2.0, 3.5, 0], [0, 0, 2], [0, 0.5, 2]])
-    for edge, name in (
-        (4.0, "exactly 4"),
-        (ulp, "4 and an ulp"),
-        (float(np.nextafter(4.0, 0.0)), "an ulp below 4"),
-    ):
+    below = float(np.nextafter(4.0, 0.0))
+    for edge, name in ((4.0, "exactly 4"), (ulp, "4 and an ulp"), (below, "an ulp below 4")):
         yield f"pairs through faces, edges {name}", places, edge
 
 
@@ -160,19 +157,12 @@ def _outside() -> Named:
     yield "skewed slab, a thousand boxes over", tilted, skewed, (True, True, False)
     beyond = np.where([True, False, True], 4.0 * shifts, 0.0)
     yield "slab, lattice vectors added", inside + beyond, 4.0, (True, False, True)
+    below, above, least = np.nextafter(4.0, 0.0), np.nextafter(4.0, 9.0), -np.spacing(4.0)
     for place, word in (
-        (0.0, "0"),
-        (4.0, "L"),
-        (-0.0, "-0"),
-        (-1e-52, "-1e-52"),
-        (-1e-17, "-1e-17"),
-        (-1e-9, "-1e-9"),
-        (float(np.nextafter(4.0, 0.0)), "an ulp below L"),
-        (float(np.nextafter(4.0, 9.0)), "an ulp above L"),
-        (-4.0, "-L"),
-        (8.0, "2 L"),
-        (float(-np.spacing(4.0)), "minus an ulp of L"),
-    ):
+        (0.0, "0"), (4.0, "L"), (-0.0, "-0"), (-1e-52, "-1e-52"), (-1e-17, "-1e-17"), (-1e-9, "-1e-9"),
+        (below, "an ulp below L"), (above, "an ulp above L"), (-4.0, "-L"), (8.0, "2 L"),
+        (least, "minus an ulp of L"),
+    ):  # fmt: skip
         near = np.array([[0.5, 2, 2], [3.5, 2, 2], [2, 0.5, 2], [2, 3.5, 2], [2, 2, 0.5], [2, 2, 3.5]])
         on = np.array([[place, 2, 2], [2, place, 2], [2, 2, place], [place, place, place]])
         yield f"atoms at {word}", np.vstack([on, near, [[0.4, 0.4, 0.4]]]), 4.0

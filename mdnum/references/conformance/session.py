@@ -248,16 +248,13 @@ class RemoteSession:
     """As `Session`, of a list that `load` finds by its word, in another process.
 
     A new one is started after each that ended: a crash is a finding and not an end.
-
-    Attributes:
-        starts: how many were started.
-        most: seconds that an answer may take, where that is less than usual.
     """
 
-    most = np.inf
+    most = np.inf  # seconds that an answer may take, where that is less than usual
+    starts = 0  # how many were started
 
     def __init__(self, tested: PairList, reuse: bool = False, deadline: Deadline | None = None):
-        self.tested, self.reuse, self.starts = tested, reuse, 0
+        self.tested, self.reuse = tested, reuse
         self.deadline = deadline or Deadline()
         self._process: subprocess.Popen[bytes] | None = None
         # what a library prints is no part of the report; its last words before a crash are
@@ -357,8 +354,7 @@ def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Eve
         elapsed = time.monotonic() - began
         now = _processor_seconds(process.pid)
         spent = elapsed if used is None or now is None else now - used
-        waits = spent < _IDLE * elapsed
-        waits = waits and elapsed >= seconds
+        waits = elapsed >= seconds and spent < _IDLE * elapsed
         if spent >= seconds or waits or elapsed >= _MOST * seconds or deadline.passed:
             late.append(", in which it computed nothing" if waits else " of processor time")
             process.kill()

@@ -62,11 +62,6 @@ class Examiner:
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
         deadline: after which that process is ended, and what it was asked raises `TimeUp`.
-
-    Attributes:
-        report: what was found out, of the cases that it was given to `take`.
-        opening: what became of the plainest questions.
-        refused: the smallest refused case by kind of exception.
     """
 
     def __init__(
@@ -76,9 +71,9 @@ class Examiner:
         self.session: Session | RemoteSession = (
             RemoteSession(tested, reuse, deadline) if apart and tested.word else Session(tested, reuse)
         )
-        self.report = Report(tested)
-        self.refused: dict[str, RefusalKind] = {}
-        self.opening: list[tuple[Case, CallOutcome]] = []
+        self.report = Report(tested)  # what was found out, of the cases that it was given to `take`
+        self.refused: dict[str, RefusalKind] = {}  # the smallest refused case by kind of exception
+        self.opening: list[tuple[Case, CallOutcome]] = []  # what became of the plainest questions
         with suppress(TimeUp):
             self._find_conventions()
 
