@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import os
@@ -20,6 +21,7 @@ from command_line import Recorder, call, printed
 import mdnum
 from mdnum.cli import main, output
 from mdnum.cli.output import ProgressBar, describe
+from mdnum.cli.verbs import app, check, fork, systems
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
 from mdnum.store.files import default_folder
@@ -185,6 +187,18 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]):
     assert all(verb in out for verb in ("run", "systems", "check", "report", "doctor"))
     assert call() == 2
     assert "Usage: mdnum" in capsys.readouterr().out
+
+
+def test_every_option_says_what_it_is():
+    """A name that is misspelled in options.toml would leave an option without a word."""
+    named = set()
+    for group in (app, fork, systems, check):
+        for one in group.registered_commands:
+            assert one.callback is not None
+            for name, parameter in inspect.signature(one.callback).parameters.items():
+                assert parameter.default.help, (one.callback.__name__, name)
+                named.add(name)
+    assert {name for texts in output._TEXTS.values() for name in texts} <= named
 
 
 @pytest.mark.usefixtures("strangers_folder")
