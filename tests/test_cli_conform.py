@@ -423,7 +423,7 @@ class KeptRounds(Kept):
         # it says so; nothing is rounded; half precision is no single one
         ("declared", "", None),
         ("rounds_nothing", "", None),
-        ("rounds_too_much", "", "error"),
+        pytest.param("rounds_too_much", "", "error", marks=pytest.mark.slow),
     ],
 )
 def test_a_list_that_rounds_positions_to_float32_is_a_warning(
