@@ -2,13 +2,15 @@
 
 A run that was killed, a copy that was cut and a frame whose head is damaged all look like the end of the file
 to MDAnalysis's readers of dcd, trr and some text formats, which leave the rest out without a word. A number
-cut in the middle is read as another one.
+cut in the middle is read as another one. Amber's NetCDF with fewer records than its head names, which is what
+a run that was killed leaves, is no file at all to them: it is read here (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
 
 import bz2
 import gzip
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -17,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import netcdf_file
 
 from mdnum.reading import CHECK, check_claim, reading
-from mdnum.trajectories.binary import TrrFile, head_of, opened
+from mdnum.trajectories.binary import TrrFile, opened
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
 from mdnum.trajectories.topology import (
@@ -27,6 +30,7 @@ from mdnum.trajectories.topology import (
     AtomTable,
     Boxes,
     atoms_in,
+    box_of,
     file_of,
     formats_of,
     read_topology,
@@ -291,7 +295,7 @@ def left_over(trajectory: Any) -> str | None:
         return None
     elif "NCDF" in words:
         # a run that was killed has not always come to saying in the head what it wrote
-        head = head_of(path)
+        head = netcdf_of(path)
         rest, frame = (head.rest, head.record) if head is not None else (0, 0)
     elif found := _text(trajectory):
         if trajectory.ts.frame != trajectory.n_frames - 1:
@@ -352,3 +356,116 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
     """(file, format) behind MDAnalysis's reader where it reads text by lines."""
     path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
     return None if word is None or path is None else (path, word)
+
+
+# ---- Amber's NetCDF
+
+
+class NetcdfFile(netcdf_file):
+    """A NetCDF file in classic format, of which whole records are read, however many its head names."""
+
+    # where the first record begins, bytes
+    _begin = sys.maxsize
+
+    def _read_var(self) -> Any:
+        found: Any = super()._read_var()
+        if found[2][:1] == (None,):
+            self._begin = min(self._begin, int(found[-2]))
+        return found
+
+    @property
+    def record(self) -> int:
+        """Bytes of a record; 0 without any."""
+        return int(vars(self)["_recsize"])
+
+    @property
+    def records(self) -> int | None:
+        """How many there should be; None where the writer did not get to say."""
+        count = int(vars(self)["_recs"])
+        return None if count < 0 else count
+
+    @property
+    def whole(self) -> int:
+        """How many there are from beginning to end."""
+        room = max(self._behind, 0) // self.record
+        return room if self.records is None else min(room, self.records)
+
+    # what scipy reads
+    _recs = whole
+
+    @property
+    def rest(self) -> int:
+        """Bytes behind them."""
+        return self._behind - self.whole * self.record
+
+    @property
+    def _behind(self) -> int:
+        return Path(self.filename).stat().st_size - self._begin
+
+    @property
+    def cut(self) -> bool:
+        """Whether the file ends before its head says."""
+        return self.records is not None and self.whole < self.records
+
+
+def netcdf_of(path: str | Path) -> NetcdfFile | None:
+    """A NetCDF file in classic format; None for another file, or where the head itself is cut."""
+    try:
+        file = NetcdfFile(str(path))
+    except (OSError, TypeError, ValueError, KeyError, IndexError):
+        return None
+    # arrays keep what they need of it
+    file._mm_buf = None
+    return file if file.record else None
+
+
+class NetcdfTrajectory(Trajectory):
+    """An Amber NetCDF file that ends early, in Å and ps."""
+
+    format = "NCDF"
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+        super().__init__(path, topology, frames)
+        file = netcdf_of(path)
+        atoms = 0 if file is None else file.dimensions.get("atom")
+        if file is None or "coordinates" not in file.variables or not atoms:
+            raise self._refused("it is no Amber NetCDF file, or one that ends in its head")
+        self._file, self._count = file, file.whole + 1
+        if not file.whole:
+            raise self._unreadable(0, self._ends)
+        self.bits = 8 * file.variables["coordinates"].itemsize()
+        self.time = "ps" if "time" in file.variables else "frame"
+        self._has(atoms)
+        self.notes = self.table.notes
+
+    @contextmanager
+    def _reader(self) -> Iterator[Callable[[int], dict[str, np.ndarray]]]:
+        names = {"coordinates", "velocities", "time", "cell_lengths", "cell_angles"}
+        variables = {name: one for name, one in self._file.variables.items() if name in names and one.isrec}
+
+        def get(number: int) -> dict[str, np.ndarray]:
+            if number >= self._file.whole:
+                raise ValueError(self._ends)
+            return {name: _scaled(one, number) for name, one in variables.items()}
+
+        yield get
+
+    @property
+    def _ends(self) -> str:
+        return f"the file ends in it, and its head tells of {self._file.records or 0:,} frames"
+
+    def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
+        box, velocities = Box(), raw.get("velocities")
+        if {"cell_lengths", "cell_angles"} <= set(raw):
+            box = box_of(np.concatenate([raw["cell_lengths"], raw["cell_angles"]]).astype(np.float32))
+        velocities = None if velocities is None else velocities.astype(np.float64)
+        time, x = float(raw.get("time", number)), raw["coordinates"].astype(np.float64)
+        return Frame(number, time, x, box, velocities)
+
+
+def _scaled(variable: Any, number: int) -> np.ndarray:
+    """The value of a variable in a record."""
+    values, scale = np.array(variable[number]), getattr(variable, "scale_factor", None)
+    values = values.astype(values.dtype.newbyteorder("="))
+    # rounded once, as MDAnalysis does
+    return values if scale is None else (values * np.float64(scale)).astype(values.dtype)

@@ -353,8 +353,8 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     known: set[str] = set(MDAnalysis._READERS)
     if format is not None and word in own:
         return own[word]
-    if word in _NETCDF and (head := binary.head_of(file)) is not None and head.cut:
-        return binary.NetcdfTrajectory
+    if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) is not None and head.cut:
+        return mdanalysis_source.NetcdfTrajectory
     if format is not None and word.upper() in known:
         return library
     by_ase = suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None)

@@ -23,8 +23,9 @@ from trajectories.files import checked, images, read, text_of, universe_of, writ
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.binary import XtcFile, head_of
+from mdnum.trajectories.binary import XtcFile
 from mdnum.trajectories.frame import FrameError, UnreadableFrame
+from mdnum.trajectories.mdanalysis_source import netcdf_of
 from mdnum.trajectories.trajectory import Trajectory, open_trajectory, select
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
@@ -192,7 +193,7 @@ def test_a_file_that_was_cut_or_damaged_is_read_up_to_there(tmp_path, small, kin
 @pytest.mark.parametrize("name", ["NCDF", "NCDFtruncoct", "TRJ_NCBOX", "PFncdf_Trj"])
 def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
     path = getattr(datafiles, name)
-    head = head_of(path)
+    head = netcdf_of(path)
     assert head is not None and not head.cut and head.rest == 0
     data, whole = Path(path).read_bytes(), list(open_trajectory(path).frames())
     assert len(whole) == head.records
@@ -217,7 +218,7 @@ def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
 def test_amber_files_without_a_whole_frame_or_with_more_than_their_head_names(
     tmp_path,
 ):
-    head, data = head_of(datafiles.NCDF), bytearray(Path(datafiles.NCDF).read_bytes())
+    head, data = netcdf_of(datafiles.NCDF), bytearray(Path(datafiles.NCDF).read_bytes())
     assert head is not None
     path = tmp_path / "a.nc"
     for size in (len(data) - head.whole * head.record + 100, 300, 2):
