@@ -31,6 +31,7 @@ from mdnum.errors import InputError
 from mdnum.reading import FrameError, UnreadableFrame
 from mdnum.trajectories.collective import Collective
 from mdnum.trajectories.frame import Frame, FrameCheck
+from mdnum.trajectories.lattice import shortest
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.repeats import Repeats, digest
@@ -455,9 +456,7 @@ def _changed(before: Frame, after: Frame) -> float:
     if before is after:
         return 0.0
     old, new = np.diff(before.positions, axis=0), np.diff(after.positions, axis=0)
-    apart = new - old
-    if after.box.pbc.all():
-        apart -= np.rint(np.linalg.solve(after.box.matrix.T, apart.T).T) @ after.box.matrix
+    apart, _ = shortest(new - old, after.box)
     turned = np.abs(np.linalg.norm(new, axis=1) - np.linalg.norm(old, axis=1))
     return float(np.minimum(turned, np.linalg.norm(apart, axis=1)).max(initial=0.0))
 

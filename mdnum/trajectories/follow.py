@@ -25,7 +25,7 @@ from mdnum.trajectories.search import image_distances
 from mdnum.trajectories.separation import (
     Flight,
     Separation,
-    explained,
+    common_shift,
     flight_of,
     growth,
     odd_flight,
@@ -51,8 +51,8 @@ _FLUX_MOVE = 2e-3
 # frames whose displacements are compared with velocities
 _FLIGHTS = 12
 # share of the spread of displacements that a common shift explains: of one within the resolution of the
-# files, and of one beside another difference; atoms that are examined first for it
-_SHIFT_ALONE, _SHIFT_MOSTLY, _SOME = 0.5, 0.99, 200
+# files, and of one beside another difference
+_SHIFT_ALONE, _SHIFT_MOSTLY = 0.5, 0.99
 # times that differ by less than this, relative, are the same
 _SAME_TIME = 1e-6
 
@@ -431,14 +431,12 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
         if found.beyond is None and now.furthest > allowed:
             found.beyond = at
         # what a file writes less often is not missing; before its first step there may be none
+        expected = all(side.speeds is not None for side in sides)
         written = a.velocities is not None and b.velocities is not None
-        if found.beyond is None and found.velocities is None and (written or not at):
-            expected = [side.speeds is not None for side in sides]
-            kind = velocities_differ(a, b, atoms, sum(map(ComparedSide.speed_bound, sides, (a, b))), expected)
-            if kind is not None:
-                found.velocities = {"frame": at, **kind}
-            elif all(expected):
-                found.velocities_same = at
+        if expected and found.beyond is None and found.velocities is None and (written or not at):
+            how = velocities_differ(a, b, atoms, sum(map(ComparedSide.speed_bound, sides, (a, b))))
+            found.velocities = how and {"frame": at, **how}
+            found.velocities_same = found.velocities_same if how else at
         # formats that round positions may round the box as much
         tolerance = sum(side.distance_bound for side in sides)
         if found.other_box is None and not same_lattice(a.box, b.box, tolerance):
@@ -476,20 +474,16 @@ def _apart(
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)
-    chosen = np.arange(len(a.positions)) if atoms is None else atoms
-    if now.furthest <= allowed or len(chosen) < 4:
+    if now.furthest <= allowed or len(a.positions if atoms is None else atoms) < 4:
         return now, allowed
-    some = chosen[:: max(len(chosen) // _SOME, 1)]
-    if found.shift is None:
-        share, rest = explained(a, b, some)
-        found.other |= rest.furthest > 2 * allowed
-        if share < _SHIFT_ALONE:
-            return now, allowed
-    share, rest = explained(a, b, chosen)
+    rest = separation(a, b, atoms, common_shift(a, b, atoms))
     # the shift is off by as much as a position
     allowed_rest = 2 * sum(side.position_bound(rest.periods) for side in sides)
     if found.shift is None:
-        if share < (_SHIFT_ALONE if rest.furthest <= allowed_rest else _SHIFT_MOSTLY):
+        found.other |= rest.furthest > allowed_rest
+        # of the squares of displacements
+        explained = 1 - (rest.typical / now.typical) ** 2
+        if explained < (_SHIFT_ALONE if rest.furthest <= allowed_rest else _SHIFT_MOSTLY):
             return now, allowed
         # before, rounding may have hidden that it is one
         found.shift, found.beyond = found.frames, found.beyond if found.other else None

@@ -104,6 +104,21 @@ def lattice_of(box: Box) -> ReducedLattice:
     return ReducedLattice(vectors, pbc, inverse, widths, combination)
 
 
+def shortest(
+    moved: Float[np.ndarray, "atoms 3"], box: Box
+) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+    """(displacements through the nearest image, whole lattice vectors taken off); all of them with a bad box.
+
+    The nearest of all for an atom that moved by less than half the width of the box.
+    """
+    try:
+        lattice = lattice_of(box)
+    except InputError:
+        return moved, np.zeros_like(moved)
+    whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
+    return moved - whole @ lattice.vectors, whole
+
+
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
     """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
     span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)

@@ -28,7 +28,8 @@ from jaxtyping import Float, Int
 
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.history import Strides
-from mdnum.trajectories.resolution import Resolution, shortest, unrounded
+from mdnum.trajectories.lattice import shortest
+from mdnum.trajectories.resolution import Resolution, unrounded
 
 # the family: exponents p and s, and the frames' distance over τ
 _P = np.linspace(0.8, 2.4, 9)[:, None, None]
@@ -77,7 +78,7 @@ class Motion:
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
-        moves = np.array([shortest(b.positions - a.positions, b.box) for a, b in pairs])
+        moves = np.array([shortest(b.positions - a.positions, b.box)[0] for a, b in pairs])
         if len(moves) < 4 or not atoms or not grid > 0 or not np.isfinite(moves).all():
             return None
 

@@ -20,7 +20,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.frame import AtomIndices, Box, Frame
+from mdnum.trajectories.frame import AtomIndices, Frame
+from mdnum.trajectories.lattice import shortest
 
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
@@ -365,7 +366,7 @@ def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "ato
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, np.zeros_like(sample[0].positions)
     for before, after in pairwise(sample):
-        total = total + shortest(after.positions - before.positions, after.box)
+        total = total + shortest(after.positions - before.positions, after.box)[0]
         lag += 1
         moves = total - total.mean(axis=0)
         if np.sqrt((moves**2).mean()) >= _CLEAR * size:
@@ -396,15 +397,6 @@ def unrounded(variance: float, size: float) -> float:
         else:
             low = middle
     return low
-
-
-def shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "atoms 3"]:
-    """Displacements without whole periods: atoms that were wrapped have not moved far."""
-    matrix = np.where(box.pbc[:, None], box.matrix, np.eye(3))
-    if not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
-        return d
-    parts = np.linalg.solve(matrix.T, d.T).T
-    return d - np.where(box.pbc, np.round(parts), 0.0) @ matrix
 
 
 def _rounded(places: Places, steps: Float[np.ndarray, "3 3"]) -> Places:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.trajectories.frame import AtomIndices, Box, Frame
-from mdnum.trajectories.lattice import lattice_of
+from mdnum.trajectories.lattice import shortest
 
 # displacements over what velocities say above which they contradict; correlations above which velocities keep
 # their directions from frame to frame, and displacements lie along them
@@ -19,8 +20,6 @@ _TOO_FAR, _KEPT, _ALONG = 1.1, 0.8, 0.9
 _STEPS = 3.0
 # velocities that differ by less than this share of their root mean square may have been rounded otherwise
 _SAME_SPEED = 1e-4
-# correlation from which on velocities are parallel; standard errors up to which there is none
-_PARALLEL, _UNRELATED = 0.99, 4.0
 # the steepest power law that is told from an exponential; how much smaller squares are of what fits better
 _STEEPEST, _BETTER = 4.0, 2.0
 
@@ -41,28 +40,18 @@ class Separation:
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all atoms alike, taken off before, length
 
 
-def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
-    """From one frame to another, up to lattice vectors of the second's box.
-
-    The nearest image is found along reduced lattice vectors: for an atom that moved by less than half the
-    width of the box it is the nearest of all. Where the frames repeat along different axes, only those along
-    which both do have images.
-    """
-    return _displaced(start, end)[0]
+def displacements(start: Frame, end: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "atoms 3"]:
+    """From one frame to another, up to lattice vectors of the second's box that both have."""
+    return _displaced(start, end, 0.0, atoms)[0]
 
 
 def _displaced(
-    start: Frame, end: Frame, shift: Float[np.ndarray, "3"] | float = 0.0, atoms: AtomIndices = None
+    start: Frame, end: Frame, shift: Float[np.ndarray, "3"] | float, atoms: AtomIndices
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
     """(displacements less a shift, whole lattice vectors taken off)."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
-    moved = y - x - shift
-    shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
-    if not shared.periodic:
-        return moved, np.zeros_like(moved)
-    lattice = lattice_of(shared)
-    whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
-    return moved - whole @ lattice.vectors, whole
+    shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
+    return shortest(y - x - shift, Box(end.box.matrix, shared))
 
 
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
@@ -99,51 +88,12 @@ def separation(
 
 def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
     """The displacement that most atoms have in common, up to lattice vectors, length."""
-    shift = _displaced(one, other, atoms=atoms)[0][0]
+    shift = displacements(one, other, atoms)[0]
     for _ in range(2):
         # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
         # median they do not
         shift = shift + np.median(_displaced(one, other, shift, atoms)[0], axis=0)
     return shift
-
-
-def velocities_differ(
-    a: Frame, b: Frame, atoms: AtomIndices, bound: float, expected: Sequence[bool]
-) -> dict[str, Any] | None:
-    """How velocities of two frames differ; None where either has none, or they agree within the bound.
-
-    Args:
-        bound: how far the difference of two velocities can be off, length per time.
-        expected: whether the file of each has velocities at all.
-
-    Returns:
-        the kind: "zero" (none in one, or not written yet), "common" (one vector for all atoms), "scaled",
-        "drawn" (uncorrelated) or "other"; which side has none; the factor from A to B and the correlation.
-    """
-    rows = slice(None) if atoms is None else atoms
-    u, v = (None if one.velocities is None else one.velocities[rows] for one in (a, b))
-    still = [one is None or not one.any() for one in (u, v)]
-    if all(still) or not all(expected):
-        return None
-    if any(still) or u is None or v is None:
-        return {"kind": "zero", "side": "AB"[still.index(True)]}
-    apart = v - u
-    bound = bound + _SAME_SPEED * float(np.sqrt((u**2).sum(axis=1).mean()))
-    if np.sqrt((apart**2).sum(axis=1)).max() <= bound:
-        return None
-    factor = float(np.vdot(u, v) / np.vdot(u, u))
-    alike = float(np.vdot(u, v) / np.sqrt(np.vdot(u, u) * np.vdot(v, v)))
-    rest = np.sqrt(((apart - np.median(apart, axis=0)) ** 2).sum(axis=1))
-    kind = "scaled" if abs(alike) > _PARALLEL and abs(factor - 1) > 1 - _PARALLEL else "other"
-    kind = "drawn" if abs(alike) * np.sqrt(u.size) < _UNRELATED else kind
-    kind = "common" if len(u) > 2 and rest.max() <= 2 * bound else kind
-    return {"kind": kind, "factor": factor, "correlation": alike}
-
-
-def explained(a: Frame, b: Frame, atoms: AtomIndices) -> tuple[float, Separation]:
-    """(share of the squares of displacements that a common shift explains, separation without it)."""
-    rest = separation(a, b, atoms, common_shift(a, b, atoms))
-    return 1.0 - (rest.typical / max(separation(a, b, atoms).typical, np.finfo(float).tiny)) ** 2, rest
 
 
 # ---- velocities
@@ -153,6 +103,28 @@ def velocities_of(frame: Frame) -> Frame:
     """A frame whose positions are the velocities of another, which has them."""
     assert frame.velocities is not None
     return Frame(frame.index, frame.time, frame.velocities, Box())
+
+
+def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> dict[str, Any] | None:
+    """How velocities of two frames differ by more than a vector that all atoms have in common.
+
+    Args:
+        bound: how far the difference of two velocities can be off, length per time.
+
+    Returns:
+        None where neither has any, or they agree; kind "zero" and the side that has none, or kind "other" and
+        the factor from A to B, by least squares, and the correlation.
+    """
+    rows = slice(None) if atoms is None else atoms
+    u, v = (np.zeros((1, 3)) if one.velocities is None else one.velocities[rows] for one in (a, b))
+    if not (u.any() and v.any()):
+        return {"kind": "zero", "side": "B" if u.any() else "A"} if u.any() or v.any() else None
+    rest = v - u - np.median(v - u, axis=0) * (len(u) > 2)
+    if np.sqrt((rest**2).sum(axis=1)).max() <= 2 * bound + _SAME_SPEED * np.sqrt((u**2).sum(axis=1).mean()):
+        return None
+    products = float(np.vdot(u, u)), float(np.vdot(u, v)), float(np.vdot(v, v))
+    correlation = products[1] / math.sqrt(products[0] * products[2])
+    return {"kind": "other", "factor": products[1] / products[0], "correlation": correlation}
 
 
 class Flight(NamedTuple):
