@@ -135,17 +135,17 @@ class FrameCheck:
         if labels is not None and frame.labels is not None:
             others = np.flatnonzero(labels != frame.labels)
             others = others if atoms is None else np.intersect1d(others, atoms)
-            if others.size:
+            if others.size and (self.species or not frame.identified):
                 atom = int(others[0])
-                self.retyped = self.retyped or (frame.index, atom)
                 remedy = "Write all frames in one order of atoms, or leave out those that differ with"
                 remedy += " @START:STOP: pairs are followed by the place of their atoms in the file"
                 if frame.identified:
                     remedy = "Use --cutoff or --nearest, which need no species, or leave out others"
                     remedy += " with @START:STOP: by its id it is the same atom, of another type there"
-                if self.species or not frame.identified:
-                    message = f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one"
-                    raise refused(f"{message} looked at{_and_others(others.size)}", remedy)
+                message = f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one"
+                raise refused(f"{message} looked at{_and_others(others.size)}", remedy)
+            if others.size:
+                self.retyped = self.retyped or (frame.index, int(others[0]))
         if (frame.box.pbc != pbc).any():
             raise refused(
                 f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",

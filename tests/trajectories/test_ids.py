@@ -46,6 +46,7 @@ def test_types_that_change_matter_to_rules_of_species_alone(tmp_path):
     assert found["frames"] == 1
     assert "frame 1: atom 10 is 2, and 1 in the first one" in found["stopped"]
     assert "one order of atoms" not in found["stopped"] and "--cutoff" in found["stopped"]
+    assert found["retyped"] is None and "TYPES_CHANGE" not in codes(found)
 
 
 @pytest.mark.parametrize("kind", ["lammpstrj", "extxyz"])
@@ -87,6 +88,16 @@ def test_rows_in_any_order_and_elements_that_change(tmp_path, kind):
         if exchanged:
             assert "frame 3: atom 4 is H, and O in the first one" in kept["stopped"]
     assert counts[0] == counts[1] == counts[2] and sum(counts[0]) > 0
+
+
+def test_where_reading_stops_nothing_is_followed_as_one_atom(tmp_path):
+    """Elements change and there are no ids."""
+    x = np.random.default_rng(0).uniform(1, 8, (3, 4, 3))
+    images = [Atoms("ArNeArNe" if k < 2 else "NeArArNe", x[k], cell=[9] * 3, pbc=True) for k in range(3)]
+    ase.io.write(tmp_path / "run.extxyz", images)
+    found = flips(tmp_path / "run.extxyz", tmp_path / "out", cutoffs=[4.0])
+    assert found["frames"] == 2 and "frame 2: atom 0 is Ne" in found["stopped"]
+    assert found["retyped"] is None and codes(found).count("TYPES_CHANGE") == 0
 
 
 def test_an_id_that_is_gone_ends_the_file(tmp_path):

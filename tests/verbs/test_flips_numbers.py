@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ import ase
 import numpy as np
 import pytest
 from ase.io import write
+from command_line import call
 
 import mdnum
 from mdnum.report.section import Table
+from mdnum.store import files as manifest
 from mdnum.verbs.flips_shared import FlipsView, average
 from mdnum.verbs.frame import Outcome
 
@@ -172,3 +175,31 @@ def test_one_frame_has_no_rates(tmp_path: Path) -> None:
     words = " ".join([*(f"{key.value} {key.note}" for key in found.page.keys), *rows(found).values()])
     assert " per ps" not in words and "per frame" not in words and "longer than seen" not in words
     assert "nan" not in words and "inf" not in words
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_a_folder_of_another_version_ends_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], other: bool
+) -> None:
+    write(tmp_path / "a.traj", gas(1, 6, 20, 0.3))
+    write(tmp_path / "b.traj", gas(2, 6, 20, 0.3))
+    second = (tmp_path / "b.traj",) * other
+    mdnum.flips(tmp_path / "a.traj", *second, cutoffs=[3.0], report=False, out=tmp_path / "out")
+    folder = tmp_path / "out"
+    whole = json.loads((folder / "summary.json").read_text())
+    rule = whole["rules"][0]
+
+    def reported(summary: dict[str, Any]) -> tuple[int, str]:
+        (folder / "summary.json").write_text(json.dumps(summary))
+        manifest.update(folder, manifest.listed_files(folder, ["summary.json"]))
+        capsys.readouterr()
+        return call("report", str(folder)), capsys.readouterr().err
+
+    for key in ("resolution", "repeats", "times" if other else "flight"):
+        code, err = reported({name: value for name, value in whole.items() if name != key})
+        assert code and err.count("\n") == 1 and f"'{key}'" in err and "another version" in err
+    key = "growth" if other else "pairs_least"
+    kept = {name: value for name, value in rule.items() if name != key}
+    code, err = reported(whole | {"rules": [kept]})
+    assert code and err.count("\n") == 1 and f"'{key}'" in err
+    assert reported(whole) == (0, "")
