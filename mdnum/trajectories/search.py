@@ -386,43 +386,6 @@ def _compared(old, new, made):
     return total
 
 
-def exchanged(before: Found, now: Found, old: Placed, new: Placed, who: Participants) -> Changed:
-    """The same where no pair has more than one image within reach: nothing is sorted or looked up.
-
-    Every pair inside at one frame is measured at the other.
-    """
-    parts = []
-    for found, at in ((before, new), (now, old)):
-        chosen = np.empty(len(found.i) + 1, np.int32)
-        chosen = chosen[
-            : _outside(at.positions, at.lattice, who.species, who.squares, found.i, found.j, chosen)
-        ]
-        ids = (found.i[chosen].astype(np.int64), found.j[chosen].astype(np.int64))
-        parts.append((*ids, np.zeros(len(chosen), np.int64), np.full(len(chosen), found is now)))
-    return Changed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
-
-
-@numba.njit(cache=True, nogil=True)
-def _outside(x, lattice, species, square, i, j, chosen):
-    """Number the pairs whose rounded image is not inside; the one that is inside is always a rounded one."""
-    several = square.shape[0] > 1
-    count, block = 0, 1024
-    y, flags, squares = np.empty((3, block)), np.empty(block, np.uint8), np.empty(block)
-    limits = np.full(block, square[0, 0])
-    for begin in range(0, i.shape[0], block):
-        i_here, j_here = i[begin : begin + block], j[begin : begin + block]
-        near_squares(x, i_here, j_here, lattice, y, squares)
-        if several:
-            for k in range(i_here.shape[0]):
-                limits[k] = square[species[i_here[k]], species[j_here[k]]]
-        for k in range(i_here.shape[0]):
-            flags[k] = not squares[k] < limits[k]
-        for k in range(i_here.shape[0]):
-            chosen[count] = begin + k
-            count += flags[k]
-    return count
-
-
 def image_distances(
     placed: Placed,
     i: Int[np.ndarray, "pairs"],

@@ -27,7 +27,6 @@ from mdnum.trajectories.search import (
     Found,
     NeighborRows,
     compared,
-    exchanged,
     image_distances,
     nearest,
     ranks,
@@ -274,11 +273,6 @@ class Tracker:
     def _flips(self, before: Moment, now: Moment) -> FlipTable:
         """The flips between two moments that were searched for, or can be."""
         who = self._who
-        reach = who.radius + 8.0 * max(before.rounding, now.rounding)
-        if not self.rule.directed and all(one.lattice.narrowest >= 2.000002 * reach for one in (before, now)):
-            # no pair has two images inside, nor one that rounding could miss
-            found = before.found or self._searched(before), now.found or self._searched(now)
-            return self._table(before, now, exchanged(*found, before, now, who))
         parts = [compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)]
         for kind in np.flatnonzero(before.own != now.own):
             atoms = np.flatnonzero(who.both & (who.species == kind))
