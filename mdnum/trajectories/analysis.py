@@ -8,16 +8,10 @@ those of one process to the last bit. What two parts found at the frame that bot
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field
 from itertools import chain
-from multiprocessing import parent_process
-from shutil import rmtree
-from tempfile import mkdtemp, mkstemp
 from typing import Any
 
 import numpy as np
@@ -40,9 +34,6 @@ from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_
 from mdnum.trajectories.topology import AtomTable, formats_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
 from mdnum.trajectories.trajectory import SAMPLE
-
-# flips that a process holds before it writes them down
-_BLOCK = 100_000
 
 
 @dataclass(frozen=True)
@@ -86,61 +77,16 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """What one process found with one rule, frames counted from the first that it examined.
+    """What one process found with one rule, frames counted from the first that it examined."""
 
-    From a process to its parent flips go through a file, into which they are written as they come: a pipe
-    would keep the parent waiting, and new pages of memory can cost more than what is done in them.
-    """
-
-    folder: str | None = None  # where the file is to be; None where flips are to be kept in memory
-    flips: list[FlipTable] = field(default_factory=list)  # of frames that have any, and are not in the file
-    held: int = 0  # rows of them
+    flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
     first: Members | None = None  # the pairs inside at the first; of later parts, at the frame before it
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
-    path: str | None = None  # of the file: blocks of rows, column after column in each
-    blocks: list[int] = field(default_factory=list)  # rows of each
 
-    def add(self, flips: FlipTable) -> None:
-        """The flips of the next frame."""
-        self.flips.append(flips)
-        self.held += len(flips)
-        if self.held >= _BLOCK:
-            self._write()
-
-    def _write(self) -> None:
-        if self.folder is None or not self.held:
-            return
-        if self.path is None:
-            number, self.path = mkstemp(dir=self.folder)
-            os.close(number)
-        # a frame's column is short: many of them are written at once
-        with open(self.path, "ab", buffering=1 << 20) as file:
-            for name in vars(FlipTable.none()):
-                file.writelines(getattr(one, name).data for one in self.flips)
-        self.blocks.append(self.held)
-        self.flips, self.held = [], 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        self._write()
-        return vars(self)
-
-    def __len__(self) -> int:
-        return sum(self.blocks) + self.held
-
-    def move(self, columns: Sequence[np.ndarray]) -> None:
-        """Moves the flips to where they are wanted."""
-        at = 0
-        with nullcontext() if self.path is None else open(self.path, "rb") as file:
-            for rows in self.blocks:
-                for column in columns:
-                    wanted = column[at : at + rows]
-                    if file is None or file.readinto(wanted.data) < wanted.nbytes:
-                        raise OSError("the file ends in which a process left its flips")
-                at += rows
-        for name, column in zip(vars(FlipTable.none()), columns, strict=True):
-            np.concatenate([column[:0], *(getattr(one, name) for one in self.flips)], out=column[at:])
-        self.flips, self.held, self.blocks = [], 0, []
+    def end(self, last: Members) -> None:
+        """After its last frame; one table is sent to the parent faster than many."""
+        self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
 
 
 @dataclass(frozen=True)
@@ -247,8 +193,6 @@ class NeighborFlips(AnalysisBase):
         self._library: LibraryFrames | None = None
         self._done = 0
         self._to_the_end = False
-        # of what other processes found, as long as there are any
-        self._folder: str | None = None
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
         """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
@@ -259,12 +203,7 @@ class NeighborFlips(AnalysisBase):
             UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
             FrameError: likewise, a frame that holds what cannot be right.
         """
-        try:
-            super().run(*args, **kwargs)
-        finally:
-            if self._folder is not None:
-                rmtree(self._folder, ignore_errors=True)
-                self._folder = None
+        super().run(*args, **kwargs)
         failure = self.results.failure
         if failure is not None:
             kind = UnreadableFrame if failure.read else FrameError
@@ -288,7 +227,6 @@ class NeighborFlips(AnalysisBase):
                         remedy="Use backend='serial', or make it an "
                         "MDAnalysis.transformations.TransformationBase with parallelizable=True",
                     )
-            self._folder = mkdtemp(prefix="mdnum-flips-")
         return super()._configure_backend(backend, *args, **kwargs)
 
     def _setup_computation_groups(
@@ -356,7 +294,7 @@ class NeighborFlips(AnalysisBase):
             self.results.failures, done = [failure], max(self._done, 0)
             self.frames, self.times = self.frames[:done], self.times[:done]
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
-            part.last = tracker.members() if part.rows else None
+            part.end(tracker.members())
         # what a process sends back is what it found, not what it needed for that; an open file cannot be sent
         self._trackers = []
         self._library = None
@@ -367,9 +305,7 @@ class NeighborFlips(AnalysisBase):
         self._trackers = [
             Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
         ]
-        # in the process that was asked, or sent to nobody knows where and how often it is read: in memory
-        folder = None if parent_process() is None or "distributed" in sys.modules else self._folder
-        self.results.parts = [[_ProcessPart(folder) for _ in self.rules]]
+        self.results.parts = [[_ProcessPart() for _ in self.rules]]
         self.results.bounds, self.results.digests = [[]], [[]]
         if self._at:
             # the frame before the first of this part
@@ -383,7 +319,7 @@ class NeighborFlips(AnalysisBase):
         bound, found = self._examined(self._ts)
         for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
             if len(flips):
-                part.add(flips)
+                part.flips.append(flips)
             part.first = tracker.members() if part.first is None else part.first
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
@@ -467,21 +403,20 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     Raises:
         InputError: two processes found other pairs at the frame between them: the file changed meanwhile.
     """
-    columns = [np.empty(sum(map(len, parts)), none.dtype) for none in vars(FlipTable.none()).values()]
-    table, at, done, last = FlipTable(*columns), 0, 0, None
+    tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
             raise InputError(
                 f"two processes found other pairs at the frame between them (number {done - 1} of all)",
                 remedy="The file was changed while it was read; run again",
             )
-        # a part after the first has counted the frame before its own too
-        end = at + len(part)
-        part.move([column[at:end] for column in columns])
-        table.frame[at:end] += done - (done > 0)
-        at = end
+        for table in part.flips:
+            # a part after the first has counted the frame before its own too
+            table.frame[:] += done - (done > 0)
+        tables += part.flips
         done += len(part.rows)
         last = last if part.last is None else part.last
+    table = FlipTable.concatenate(tables)
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
     initial, none = parts[0].first if parts else None, Members.none()
     pairs, near = rows[:, :2].T.astype(np.int64)
