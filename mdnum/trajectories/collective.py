@@ -1,7 +1,7 @@
 """Where all atoms together do not move: damage that leaves finite numbers.
 
-A counter that overflowed puts one coordinate of every atom at one value, a unit that changed shrinks them, an
-offset that was misread shifts them. Planar and straight systems, drift, and wrapping are none of it.
+A counter that overflowed puts one coordinate of every atom at one value, an offset that was misread shifts
+them. Planar and straight systems, drift, and wrapping are none of it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-# shares of their extent in every frame before, and in the one before, to which atoms do not shrink together
-_COLLAPSED, _SQUEEZED = 0.02, 0.3
+# share of their extent in every frame before to which atoms do not shrink together
+_COLLAPSED = 0.02
+# share of the atoms that do not come to one coordinate at once, and how many times those of any frame before
+_ALIKE, _MORE = 0.2, 3.0
 # a system that drifts goes about as far in every interval: how many times further it does not go at once, or
 # than what is far between its first two frames
 _SUDDEN = 10.0
@@ -26,7 +28,7 @@ class Collective:
 
     least: Float[np.ndarray, "3"] | None = None  # the smallest of `spreads` in any of them, length
     last: Float[np.ndarray, "some 3"] | None = None  # positions in the last one
-    side: float = 0.0  # its shortest lattice vector, length; 0 without any
+    alike: float = 0.0  # the largest share of atoms that had one coordinate
     drift: float | None = None  # the longest shift of all atoms between two of them, length
 
     def refuse(self, x: Float[np.ndarray, "some 3"], atoms: int, side: float, far: float) -> str | None:
@@ -38,20 +40,21 @@ class Collective:
             side: the shortest lattice vector, length; 0 without any.
             far: what is far between two frames in this box, length; 0 without one.
         """
-        now, least, last, before = spreads(x), self.least, self.last, self.side
-        self.least, self.last, self.side = now if least is None else np.minimum(now, least), x.copy(), side
+        now, least, last, alike = spreads(x), self.least, self.last, self.alike
+        share, axis, value = max(_most_alike(column, k) for k, column in enumerate(x.T))
+        self.least, self.last = now if least is None else np.minimum(now, least), x.copy()
+        self.alike = max(alike, share)
         if least is None or last is None:
             return None
-        factor = _squeezed(last, x)
-        if factor is None and least[2] > 0.2 * side > 0 and (shrunk := _squeezed(x, last)) is not None:
-            # what fills a box cannot grow; what is in empty space may fly apart
-            factor = 1 / shrunk
-        if factor is not None and 0.5 * before <= side <= 2 * before:
-            return f"all atoms are where they were a frame before, but {factor:.2g} times as far apart"
         constant = [f"{'xyz'[k]} = {x[0, k]:g}" for k in range(3) if (x[:, k] == x[0, k]).all()]
         # what was unwrapped may be wrapped
         if (place := _flat(now, np.minimum(least, side or np.inf), atoms, bool(constant))) is not None:
             return f"all atoms lie {', '.join([place, *constant])}, and in no frame before"
+        there = x[:, axis] == value
+        # of a sheet that becomes flat the digits of the file may be left
+        thick = atoms * np.var(last[there, axis]) > 4 * least[1] * least[2]
+        if thick and share > max(_ALIKE, _MORE * alike) and share * len(x) > _FEW:
+            return f"{there.mean():.0%} of all atoms have {'xyz'[axis]} = {value:g}, as in no frame before"
         far = far or 1e4 * float(now[2])
         shift = _shift(last, x, far)
         if shift > (_SUDDEN * far if self.drift is None else max(_SUDDEN * self.drift, far)):
@@ -82,15 +85,14 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     return "in a plane" if thin and thick else None
 
 
-def _squeezed(before: np.ndarray, now: np.ndarray) -> float | None:
-    """The factor by which a picture of the frame before has shrunk; None where this is none of it."""
-    a, b = before - before.mean(axis=0), now - now.mean(axis=0)
-    # a picture has twelve numbers, which fit few atoms whatever they did
-    if len(now) <= 4 * _FEW or np.sum(b**2) > _SQUEEZED**2 * np.sum(a**2):
-        return None
-    matrix = np.linalg.pinv(a.T @ a) @ (a.T @ b)
-    factor = float(np.linalg.norm(matrix, 2))
-    return factor if factor < _SQUEEZED and np.sum((b - a @ matrix) ** 2) < 0.2 * np.sum(b**2) else None
+def _most_alike(column: Float[np.ndarray, "some"], axis: int) -> tuple[float, int, float]:
+    """(share of atoms with the most frequent coordinate, the axis, the coordinate).
+
+    Less the share with the second: in a crystal one is as frequent as the other.
+    """
+    values, counts = np.unique(column, return_counts=True)
+    *_, second, first = np.sort(np.append(counts, 0))
+    return (first - second) / len(column), axis, float(values[np.argmax(counts)])
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:

@@ -108,12 +108,6 @@ class DcdBoxes:
 
 def _plausible(frames: Examined, fit: list[str]) -> list[str]:
     """The conventions that neither the boxes nor the atoms contradict."""
-    # a barostat that keeps the shape keeps the angles, and scales all elements of a matrix alike
-    cells = np.array([cell for _, _, cell in frames])
-    if (np.ptp(cells[:, _SIZES], axis=0) > 1e-4 * cells[0, _SIZES]).any():
-        others, scaled = cells[:, _OTHERS], cells[:, _OTHERS] / cells[:, :1]
-        for kept, left in ((others, fit[:1]), (scaled, fit[1:])):
-            fit = left if (np.ptp(kept, axis=0) <= 1e-6 * np.abs(kept[0])).all() else fit
     gone: dict[str, list[float]] = {name: [] for name in fit}
     for (before, start, _), (number, end, cell) in pairwise(frames):
         moved = end - start - np.median(end - start, axis=0)

@@ -7,6 +7,7 @@ every other pair of that frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -115,23 +116,24 @@ class FrameCheck:
     collective: Collective = field(default_factory=Collective)
 
     def __call__(self, frame: Frame) -> Frame:
+        for what, remedy in self._wrong(frame):
+            raise FrameError(f"frame {frame.index}{what}", frame=frame.index, remedy=remedy, where=self.where)
+        return frame
+
+    def _wrong(self, frame: Frame) -> Iterator[tuple[str, str]]:
+        """(what is wrong, what to do); each where all before are not."""
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels
-
-        def refused(message: str, remedy: str) -> FrameError:
-            return FrameError(
-                f"frame {frame.index}{message}", frame=frame.index, remedy=remedy, where=self.where
+        failed = "The simulation or the writing of it failed from the first frame on"
+        if frame.index:
+            failed = (
+                f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
             )
 
         def place(atom: int) -> str:
             return f"atom {atom} is at ({', '.join(f'{value:g}' for value in frame.positions[atom])})"
 
-        failed = (
-            f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
-            if frame.index
-            else "The simulation or the writing of it failed from the first frame on"
-        )
         if labels is not None and frame.labels is not None:
             others = np.flatnonzero(labels != frame.labels)
             others = others if atoms is None else np.intersect1d(others, atoms)
@@ -142,46 +144,38 @@ class FrameCheck:
                 if frame.identified:
                     remedy = "Use --cutoff or --nearest, which need no species, or leave out others"
                     remedy += " with @START:STOP: by its id it is the same atom, of another type there"
-                message = f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one"
-                raise refused(f"{message} looked at{_and_others(others.size)}", remedy)
+                what = f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one looked at"
+                yield f"{what}{_and_others(others.size)}", remedy
             if others.size:
                 self.retyped = self.retyped or (frame.index, int(others[0]))
         if (frame.box.pbc != pbc).any():
-            raise refused(
-                f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
+            what = f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}"
+            yield (
+                what,
                 "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
             )
         x = frame.positions if atoms is None else frame.positions[atoms]
-        if len(frame.box.broken):
-            axis = frame.box.broken[0]
+        for axis in frame.box.broken:
             vector = frame.box.matrix[axis].tolist()
-            raise refused(
-                f": the box repeats along {'abc'[axis]}, but its vector there is {vector}",
-                "Give the frames a box, or say that this direction does not repeat",
-            )
+            what = f": the box repeats along {'abc'[axis]}, but its vector there is {vector}"
+            yield what, "Give the frames a box, or say that this direction does not repeat"
         if not np.isfinite(frame.furthest_of(atoms)):
             bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-            raise refused(f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed)
+            yield f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed
         if (found := far_out(frame, atoms, self.radius, self.bits)) is not None:
-            atom, many, why = found
-            raise refused(
-                f": {place(atom)}, {why}{_and_others(many)}",
-                f"{failed}; an atom that did fly off is left out with --between",
-            )
+            what = f": {place(found[0])}, {found[2]}{_and_others(found[1])}"
+            yield what, f"{failed}; an atom that did fly off is left out with --between"
         # one atom may well be at the origin; two cannot be at one place
         zero = np.flatnonzero(x[:, 0] == 0)
         zero = zero[~x[zero].any(axis=1)]
         if zero.size > 1:
             some = f"atom {_named(zero[0], atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
             some = "all coordinates are 0" if zero.size == len(x) else some
-            raise refused(
-                f": {some}, as where coordinates were never written",
-                "Leave the frame out with @START:STOP, or the atoms with --between",
-            )
+            what = f": {some}, as where coordinates were never written"
+            yield what, "Leave the frame out with @START:STOP, or the atoms with --between"
         some, far = x[:: max(1, len(x) // _SOME)], _LEAP_BOXES * frame.box.longest
         if (why := self.collective.refuse(some, len(x), frame.box.shortest, far)) is not None:
-            raise refused(f": {why}", failed)
-        return frame
+            yield f": {why}", failed
 
 
 def _repeats(pbc: np.ndarray) -> str:

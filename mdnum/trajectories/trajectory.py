@@ -9,7 +9,6 @@ float32 (`Trajectory.bits`).
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 import zlib
@@ -301,7 +300,11 @@ def open_trajectory(
         RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
-        raise _no_trajectory(file)
+        raise InputError(
+            "this folder holds results, and no trajectory",
+            remedy="Give the trajectory itself; a run keeps one with --save-every 1 (or another number)",
+            where=str(file),
+        )
     if file.is_dir() and file.suffix != ".bundle":
         raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
     for one in (file, None if topology is None else Path(topology).expanduser()):
@@ -318,20 +321,6 @@ def open_trajectory(
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
     return opened
-
-
-def _no_trajectory(folder: Path) -> InputError:
-    """Why a folder that mdnum wrote holds no trajectory."""
-    try:
-        world = json.loads((folder / "summary.json").read_text()).get("world", "md")
-    except (ValueError, AttributeError, OSError):
-        world = "md"
-    message = "this run folder has no trajectory"
-    remedy = "Run again with --save-every 1 (or another number of steps)"
-    if world != "md":
-        message = "this folder holds results, and no trajectory"
-        remedy = f"Give the trajectory itself; `mdnum report {folder}` shows what the folder holds"
-    return InputError(message, remedy=remedy, where=str(folder))
 
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:

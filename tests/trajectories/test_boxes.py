@@ -290,15 +290,6 @@ def test_atoms_that_are_wrapped_tell_it_where_few_are_near_the_boundary(tmp_path
     assert boxes_agree(opened)
 
 
-@pytest.mark.parametrize("convention", ["matrix", "cosines"])
-def test_a_barostat_that_keeps_the_shape_tells_it(tmp_path, convention):
-    matrix, x = lattice(convention, 20.0), np.array([[9.0, 9, 9], [10.0, 9, 9], [9.0, 10, 9]])
-    cells = [numbers(matrix * (1 + 0.002 * k), convention) for k in range(5)]
-    opened, frames = read(dcd(tmp_path / "a.dcd", cells, [x] * 5))
-    np.testing.assert_allclose(frames[4].box.matrix, matrix * 1.008, atol=1e-3)
-    assert boxes_agree(opened)
-
-
 def test_small_positive_elements_of_a_matrix_are_no_degrees(tmp_path):
     matrix = np.array([[30.0, 9.0, 6.0], [9.0, 31.0, 5.0], [6.0, 5.0, 33.0]])
     x = packed(matrix, 4.0, 200)
