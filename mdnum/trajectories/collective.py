@@ -41,7 +41,7 @@ class Collective:
             far: what is far between two frames in this box, length; 0 without one.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
-        share, axis, value = max(_most_alike(column, k) for k, column in enumerate(x.T))
+        share, axis, value = _most_alike(x)
         self.least, self.last = now if least is None else np.minimum(now, least), x.copy()
         self.alike = max(alike, share)
         if least is None or last is None:
@@ -50,11 +50,14 @@ class Collective:
         # what was unwrapped may be wrapped
         if (place := _flat(now, np.minimum(least, side or np.inf), atoms, bool(constant))) is not None:
             return f"all atoms lie {', '.join([place, *constant])}, and in no frame before"
-        there = x[:, axis] == value
-        # of a sheet that becomes flat the digits of the file may be left
-        thick = atoms * np.var(last[there, axis]) > 4 * least[1] * least[2]
-        if thick and share > max(_ALIKE, _MORE * alike) and share * len(x) > _FEW:
-            return f"{there.mean():.0%} of all atoms have {'xyz'[axis]} = {value:g}, as in no frame before"
+        if share > max(_ALIKE, _MORE * alike):
+            there = x[:, axis] == value
+            # of a sheet that becomes flat the digits of the file may be left
+            thick = atoms * np.var(last[there, axis]) > 4 * least[1] * least[2]
+            if thick and np.count_nonzero(there) > _FEW:
+                return (
+                    f"{there.mean():.0%} of all atoms have {'xyz'[axis]} = {value:g}, as in no frame before"
+                )
         far = far or 1e4 * float(now[2])
         shift = _shift(last, x, far)
         if shift > (_SUDDEN * far if self.drift is None else max(_SUDDEN * self.drift, far)):
@@ -85,14 +88,18 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     return "in a plane" if thin and thick else None
 
 
-def _most_alike(column: Float[np.ndarray, "some"], axis: int) -> tuple[float, int, float]:
+def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
     """(share of atoms with the most frequent coordinate, the axis, the coordinate).
 
     Less the share with the second: in a crystal one is as frequent as the other.
     """
-    values, counts = np.unique(column, return_counts=True)
+    repeated = np.count_nonzero(np.diff(np.sort(x, axis=0), axis=0) == 0, axis=0)
+    axis = int(np.argmax(repeated))
+    if repeated[axis] < _FEW:
+        return 0.0, axis, 0.0
+    values, counts = np.unique(x[:, axis], return_counts=True)
     *_, second, first = np.sort(np.append(counts, 0))
-    return (first - second) / len(column), axis, float(values[np.argmax(counts)])
+    return float(first - second) / len(x), axis, float(values[np.argmax(counts)])
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
