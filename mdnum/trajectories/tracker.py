@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import AtomIndices, Box, Frame
+from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
 from mdnum.trajectories.lattice import (
     INSIDE,
     Participants,
@@ -344,21 +343,8 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
     """The positions of some atoms, copied, and the largest coordinate: not finite where one is not."""
-    out = np.empty((len(labels), 3))
-    return out, _take(np.require(positions, np.float64, ["C", "W"]), labels, out)
-
-
-@numba.njit(cache=True, nogil=True)
-def _take(positions, labels, out):
-    most0, most1, most2, finite = 0.0, 0.0, 0.0, 0
-    for at in range(labels.shape[0]):
-        i = labels[at]
-        x0, x1, x2 = positions[i, 0], positions[i, 1], positions[i, 2]
-        out[at, 0], out[at, 1], out[at, 2] = x0, x1, x2
-        most0, most1, most2 = max(most0, abs(x0)), max(most1, abs(x1)), max(most2, abs(x2))
-        # nan is larger than nothing
-        finite += int(x0 - x0 == 0.0 and x1 - x1 == 0.0 and x2 - x2 == 0.0)
-    return max(most0, most1, most2) if finite == labels.shape[0] else np.inf
+    x = np.take(np.asarray(positions, np.float64), labels, axis=0)
+    return x, furthest(x)
 
 
 def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarray | None:
