@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.bits import digit_order
 from mdnum.errors import InputError
 from mdnum.trajectories.lattice import (
     DIRECTED,
@@ -61,12 +62,6 @@ class NeighborRows(NamedTuple):
     count: Int[np.ndarray, "atoms"]
     other: Int[np.ndarray, "pairs"]  # neighbors, in no order; an atom appears once for each of its images
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
-
-    @classmethod
-    def room(cls, atoms: int, pairs: int, stored: int) -> NeighborRows:
-        """Room for so many."""
-        first, count = np.zeros((2, atoms), np.int64)
-        return cls(first, count, np.empty(pairs, np.int32), np.empty(stored))
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
         """(i, j) of all rows, one row after the other."""
@@ -192,29 +187,12 @@ def _memory() -> float:
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
     """Pairs by their first atom, the lower one unless they are directed."""
-    rows = NeighborRows.room(atoms, len(found.i), len(found.value))
-    _into_rows(found, rows)
-    return rows
-
-
-@numba.njit(cache=True, nogil=True)
-def _into_rows(found, rows):
-    """A counting sort."""
-    i, j, directed, count = found.i, found.j, found.kind == DIRECTED, rows.count
-    for k in range(i.shape[0]):
-        count[i[k] if directed else min(i[k], j[k])] += 1
-    total = 0
-    for a in range(count.shape[0]):
-        rows.first[a] = total
-        total += count[a]
-        count[a] = 0
-    for k in range(i.shape[0]):
-        a = i[k] if directed else min(i[k], j[k])
-        at = rows.first[a] + count[a]
-        rows.other[at] = j[k] if directed else max(i[k], j[k])
-        if directed:
-            rows.square[at] = found.value[k]
-        count[a] += 1
+    i, j, directed = found.i, found.j, found.kind == DIRECTED
+    low, high = (i, j) if directed else (np.minimum(i, j), np.maximum(i, j))
+    room = np.empty((4, len(i)), np.int64)
+    room[0] = low
+    order, count = digit_order(room, len(i), atoms), np.bincount(low, minlength=atoms)
+    return NeighborRows(np.cumsum(count) - count, count, high[order], found.value[order if directed else []])
 
 
 # ---- the nearest few
@@ -241,7 +219,7 @@ def nearest(
     if not lattice.periodic.any():
         everything = float(np.linalg.norm(np.ptp(positions, axis=0))) * (1 + 1e-9) + 1e-300 if atoms else 0.0
     radius = reach if np.isfinite(reach) else _guess(placed, who, rule.most, everything)
-    made = NeighborRows.room(atoms, 0, 0)
+    made = NeighborRows(*np.zeros((2, atoms), np.int64), np.empty(0, np.int32), np.empty(0))
     last_in, first_out = np.full(atoms, reach), np.full(atoms, reach)
     close, smallest, one = 0, np.inf, np.zeros(atoms, np.int64)
     while True:
