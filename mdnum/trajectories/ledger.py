@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -126,45 +125,21 @@ class LedgerRows:
         count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
         if self._keys.shape[1] < count:
             self._keys = np.empty((4, count + count // 8), np.int64)
-        order = _ordered(changed, self.labels, self.atoms, ranks, thresholds.directed, self._keys)
-        *columns, ambiguous = _rows(changed, *distances, self.labels, order, thresholds, bound)
-        columns = [np.full(count, frame), *columns, np.full(count, bound), ambiguous]
-        return FlipTable(*columns)
-
-
-@numba.njit(cache=True, nogil=True)
-def _ordered(changed, labels, atoms, ranks, directed, room):
-    """Numbers of the flips, sorted by the file's numbers and rank."""
-    count, keys = changed.i.shape[0], room[0]
-    for k in range(count):
-        one, other = labels[changed.i[k]], labels[changed.j[k]]
-        if not directed:
-            one, other = min(one, other), max(one, other)
-        keys[k] = (one * atoms + other) * ranks + changed.rank[k]
-    return digit_order(room, count, atoms * atoms * ranks)
-
-
-@numba.njit(cache=True, nogil=True)
-def _rows(changed, distances, distances_before, labels, order, of, bound):
-    """The columns, in order."""
-    count = order.shape[0]
-    i, j, rank = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    distance, before = np.empty(count), np.empty(count)
-    margin, margin_before = np.empty(count), np.empty(count)
-    entered, ambiguous = np.empty(count, np.bool_), np.empty(count, np.bool_)
-    for at in range(count):
-        k = np.uint64(order[at])
-        a, b, yes = changed.i[k], changed.j[k], changed.entered[k]
-        one, other = labels[a], labels[b]
-        if of.directed:
-            limit = of.last_in[a] if yes else of.first_out[a]
-            old_limit = of.old_first_out[a] if yes else of.old_last_in[a]
+        i, j = self.labels[changed.i], self.labels[changed.j]
+        if not thresholds.directed:
+            i, j = np.minimum(i, j), np.maximum(i, j)
+        self._keys[0, :count] = (i * self.atoms + j) * ranks + changed.rank
+        order = digit_order(self._keys, count, self.atoms**2 * ranks)
+        distance, before = (one[order] for one in distances)
+        a, b, entered = changed.i[order], changed.j[order], changed.entered[order]
+        if thresholds.directed:
+            limit = np.where(entered, thresholds.last_in[a], thresholds.first_out[a])
+            old_limit = np.where(entered, thresholds.old_first_out[a], thresholds.old_last_in[a])
         else:
-            one, other = min(one, other), max(one, other)
-            limit = of.radii[of.species[a], of.species[b]]
-            old_limit = limit
-        i[at], j[at], rank[at], entered[at] = one, other, changed.rank[k], yes
-        distance[at], before[at] = distances[k], distances_before[k]
-        margin[at], margin_before[at] = limit - distance[at], old_limit - before[at]
-        ambiguous[at] = abs(margin[at]) <= bound or abs(margin_before[at]) <= bound
-    return i, j, rank, entered, distance, before, margin, margin_before, ambiguous
+            limit = old_limit = thresholds.radii[thresholds.species[a], thresholds.species[b]]
+        margin, margin_before = limit - distance, old_limit - before
+        ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
+        return FlipTable(
+            np.full(count, frame), i[order], j[order], changed.rank[order], entered, distance, before,
+            margin, margin_before, np.full(count, bound), ambiguous,
+        )  # fmt: skip
