@@ -313,7 +313,7 @@ def _findings(view: ComparisonView) -> Iterator[Finding]:
         yield TEXTS.finding("STOPPED", frames=frames, error=summary["stopped"])
     if summary["interrupted"]:
         yield TEXTS.finding("INTERRUPTED", frames=frames)
-    for name, repeats in zip((view.name, summary["other"]), summary["repeats"], strict=True):
+    for name, repeats in zip((view.name, summary["other"]), summary.get("repeats", ()), strict=False):
         yield from view.repeated(repeats, name)
     if summary["shift"] is not None:
         shift = view.shift

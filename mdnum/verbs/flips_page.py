@@ -166,7 +166,8 @@ def _between(view: FlipsView, one: Rule) -> Iterator[Limit]:
 
 def _others(view: FlipsView) -> Iterator[Finding]:
     summary, leaps = view.summary, view.summary["leaps"]
-    if (other := summary["alternative_box"]) is not None:
+    # older folders have none of these
+    if (other := summary.get("alternative_box")) is not None:
         counts = [
             {"rule": view.rule(one), "ours": one["pairs_first"], "theirs": pairs}
             for one, pairs in zip(summary["rules"], other["pairs"], strict=True)
@@ -175,8 +176,8 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         values = {"ours": view.box(summary["box"]), "box": view.box(other["box"]), "frame": other["frame"]}
         told = "; ".join(TEXTS("box_pairs", **one) for one in counts)
         yield TEXTS.finding(other["code"], *same, pairs=told, **values)
-    yield from view.repeated(summary["repeats"])
-    if summary["retyped"]:
+    yield from view.repeated(summary.get("repeats"))
+    if summary.get("retyped"):
         yield TEXTS.finding("TYPES_CHANGE", **dict(zip(("frame", "atom"), summary["retyped"], strict=True)))
     if leaps:
         others = leaps["frames"] - 1

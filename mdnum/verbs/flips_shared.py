@@ -190,9 +190,9 @@ class FlipsView(View):
             text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
         return f"{text}, repeating along {listed(axes)}"
 
-    def repeated(self, repeats: Mapping[str, Any], file: str = "") -> Iterator[Finding]:
+    def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
         """The finding on frames that repeat earlier ones, if any do; of one of two files by its name."""
-        if not repeats["frames"]:
+        if not repeats or not repeats["frames"]:
             return
         ranges, examined = repeats["ranges"], self.summary["frames"]
         still, told = all(one["still"] for one in ranges), []

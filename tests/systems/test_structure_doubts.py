@@ -105,6 +105,7 @@ def test_velocities_of_another_name_are_said_to_be_ignored(tmp_path: Path, colum
     )
 
 
+@pytest.mark.slow
 def test_the_command_line_and_a_run_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = made(tmp_path, actual=0.64)
     code = call("systems", "check", str(path))

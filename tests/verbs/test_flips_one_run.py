@@ -279,7 +279,7 @@ def test_laws_of_growth(law: str, exponent: float | None, noise: float, hidden: 
         (lambda p, rng: p - 2 * p.mean(axis=0) + 0.3, None, None, None),
     ],
 )
-@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("joined", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_restart_with_other_velocities_is_named(
     tmp_path: Path,
     change: Any,
