@@ -219,7 +219,8 @@ def nearest(
     if not lattice.periodic.any():
         everything = float(np.linalg.norm(np.ptp(positions, axis=0))) * (1 + 1e-9) + 1e-300 if atoms else 0.0
     radius = reach if np.isfinite(reach) else _guess(placed, who, rule.most, everything)
-    made = NeighborRows(*np.zeros((2, atoms), np.int64), np.empty(0, np.int32), np.empty(0))
+    none = np.zeros(atoms, np.int64)
+    made = NeighborRows(none, none.copy(), np.empty(0, np.int32), np.empty(0))
     last_in, first_out = np.full(atoms, reach), np.full(atoms, reach)
     close, smallest, one = 0, np.inf, np.zeros(atoms, np.int64)
     while True:
