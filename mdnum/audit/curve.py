@@ -379,7 +379,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
             break
     bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
     if len(bends) < 2 or bends[-1] < bends[-2] / _NARROWER**1.6:
-        return _third(curve, *place, room) if seconds >= _SEEN else []
+        return _third(curve, *place, room, float(noise[1])) if seconds >= _SEEN else []
     return _kink(curve, left, right, room)
 
 
@@ -424,12 +424,11 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
 
 
-def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """A place where the third derivative of the energy jumps, by the force's second from both sides.
 
-    Of several widths of the two pieces, the one at which half of it agrees best counts.
+    Of several widths of the two pieces, the one at which half of it agrees best counts; `noise` is the force's.
     """
-    noise = float(scatter(curve, left, right, room)[:, 1].max())
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]
     middle = 0.5 * (left + right)
@@ -448,8 +447,7 @@ def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
     bent, error = min(values, key=lambda one: one[1])
     if abs(bent) <= _SURE * error:
         return []
-    found = measure(curve, middle - reach, middle + reach, room, exact=False)
-    return [replace(found, order=SMOOTH, third=-bent)]
+    return [Jump(middle - reach, middle + reach, 0.0, 0.0, 0.0, (np.inf,) * 3, SMOOTH, False, -bent)]
 
 
 def _same(one: Jump, other: Jump) -> bool:

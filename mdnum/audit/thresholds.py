@@ -37,7 +37,7 @@ from mdnum.audit.subject import CalculatorSubject
 STEP = 0.025
 #: For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
 #: that stands out of it. A pair whose share is less than the fewest is not walked.
-_CALLS, _FEWEST_CALLS, WALKING_CALLS = 4000, 900, 4300
+_CALLS, _FEWEST_CALLS, WALKING_CALLS = 4200, 900, 4700
 #: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
 STEPS = 2.5
 #: Distances are walked down to where two particles cost so many kT.
