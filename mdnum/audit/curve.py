@@ -9,7 +9,7 @@ the mismatch falls while one zooms in tells what is there, whatever the curve lo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
@@ -427,7 +427,10 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """A place where the third derivative of the energy jumps, by the force's second from both sides.
 
-    Of several widths of the two pieces, the one at which half of it agrees best counts; `noise` is the force's.
+    Of several widths of the two pieces, that at which half of it agrees best counts.
+
+    Args:
+        noise: of the force.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

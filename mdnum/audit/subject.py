@@ -91,8 +91,8 @@ class Repeats:
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
         """Take note of what a new object (its number `which`) answered to its first question."""
-        bits = hashlib.blake2b(b"|".join(array.tobytes() for array in _bits(atoms)), digest_size=16)
-        before, first = self._known.setdefault((bits.digest(), what), (value, which))
+        key = hashlib.blake2b(b"|".join(array.tobytes() for array in bits(atoms)), digest_size=16)
+        before, first = self._known.setdefault((key.digest(), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
             self.new.differ += 1
@@ -355,36 +355,11 @@ class CalculatorSubject:
             chance.typical = rms(now[1])
         return True
 
-    def returned(self, atoms: Atoms) -> dict[str, Any]:
-        """The very objects that the calculator gives back and keeps, by name; elsewhere copies are given.
-
-        Raises:
-            CalculatorError: as for `energy`.
-        """
-        asked = self._ask(atoms)
-        energies = self._answer(lambda: self._energies(asked), asked, "energy")
-        found = {"energy": energies[0], "forces": self._answer(asked.get_forces, asked, "forces")}
-        results = getattr(self.calculator, "results", None)
-        return found | ({f"results[{key!r}]": results[key] for key in results} if results else {})
-
-    def writes(self, atoms: Atoms) -> list[str]:
-        """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
-
-        Raises:
-            CalculatorError: as for `energy`.
-        """
-        self.forget()
-        asked = self._ask(atoms)
-        self._answer(lambda: self._energies(asked), asked, "energy")
-        self._answer(asked.get_forces, asked, "forces")
-        both = zip(("positions", "numbers", "cell", "periods"), _bits(atoms), _bits(asked), strict=True)
-        return [word for word, before, after in both if before.tobytes() != after.tobytes()]
-
     def _ask(self, atoms: Atoms) -> Atoms:
         asked = _bare(atoms) if self.copies else atoms
-        bits = _bits(asked)
+        now = bits(asked)
         same = self._last is not None and all(
-            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(bits, self._last, strict=True)
+            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(now, self._last, strict=True)
         )
         if not same:
             if self.forgets and self._nearly(asked):
@@ -392,7 +367,7 @@ class CalculatorSubject:
             self.meter.count()
         calculator = self.calculator
         self._seen += not same or self._seen == 0
-        self._last = bits
+        self._last = now
         self._answer(lambda: setattr(asked, "calc", calculator), asked, "an answer")
         return asked
 
@@ -486,7 +461,8 @@ def rms(forces: np.ndarray) -> float:
     return float(np.sqrt(np.mean(forces**2))) if forces.size else 0.0
 
 
-def _bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
+def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
+    """Positions, numbers, cell and periods, which stay as they are where the atoms change."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 
