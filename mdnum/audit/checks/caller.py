@@ -163,8 +163,10 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
         for put, state in kept:
             put(state)
     told: dict[str, tuple[str, Severity, bool]] = {
-        "asked": ("asked", "error", True), "made": ("made", "warning", True), "drawn": ("asked", "info", False),
-    }  # fmt: skip
+        "asked": ("asked", "error", True),
+        "made": ("made", "warning", True),
+        "drawn": ("asked", "info", False),
+    }
     for variant, (when, severity, seeded) in told.items():
         pairs = {name: states[when, name] for name in generators}
         names = [
