@@ -152,7 +152,6 @@ class Jump:
     energy: float
     force: float
     curvature: float
-    doubt: tuple[float, float, float]  # how large each of the three could look where nothing jumps
     # 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt
     order: int
     exact: bool  # whether low and high are neighbors among the doubles
@@ -241,7 +240,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
                 doubt += (high - low) * (_bend(curve, low, -1, room) + _bend(curve, high, 1, room))
     jumps, doubts = np.array([*values, curvature]).tolist(), np.array([*spread, doubt]).tolist()
     order = next((k for k in range(3) if abs(jumps[k]) > _SURE * doubts[k]), SMOOTH)
-    return Jump(low, high, jumps[0], jumps[1], jumps[2], (doubts[0], doubts[1], doubts[2]), order, exact)
+    return Jump(low, high, jumps[0], jumps[1], jumps[2], order, exact)
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
@@ -450,7 +449,7 @@ def _third(curve: Curve, left: float, right: float, room: float, noise: float) -
     bent, error = min(values, key=lambda one: one[1])
     if abs(bent) <= _SURE * error:
         return []
-    return [Jump(middle - reach, middle + reach, 0.0, 0.0, 0.0, (np.inf,) * 3, SMOOTH, False, -bent)]
+    return [Jump(middle - reach, middle + reach, 0.0, 0.0, 0.0, SMOOTH, False, -bent)]
 
 
 def _same(one: Jump, other: Jump) -> bool:

@@ -77,7 +77,6 @@ class PairThreshold:
     order: int  # the lowest derivative of the energy that jumps, 0 for the energy itself; 6 or smoother is 6
     # of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before
     jumps: tuple[float, float, float]
-    doubt: tuple[float, float, float]  # how large each of them could look where nothing jumps
     inside: float  # the last distance before it that gives another answer
     outside: float  # the first one beyond it; the next double where a value jumps
     dies: bool  # whether the two do not interact beyond it
@@ -263,7 +262,7 @@ def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairW
 def _at_jump(pair: Pair, jump: Jump) -> PairThreshold:
     return PairThreshold(
         jump.high if jump.exact else jump.at, pair.species, jump.order,
-        (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
+        (jump.energy, jump.force, jump.curvature), jump.low, jump.high, False,
         jump.high - jump.low, jump.third,
     )  # fmt: skip
 
@@ -363,7 +362,7 @@ def _with_end(
         order, third = SMOOTH, better[-1].third
         if better[-1].radius - edge[1] > better[-1].located:
             radius, located = better[-1].radius, better[-1].located
-    last = PairThreshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
+    last = PairThreshold(radius, pair.species, order, jumps, *edge, True, located, third)
     return [one for one in found if one not in same] + [last]
 
 

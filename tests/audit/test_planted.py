@@ -320,13 +320,24 @@ def test_a_planted_mistake_is_found(name: str, make, atoms: Atoms, expected: dic
         assert not {"TRANSLATION", "IMAGES", "FACES", "ORDER", "CELL_ULP"} & set(found)
 
 
-def test_an_energy_that_alone_is_cut_is_seen():
-    both, check = subject(planted.CutEnergy), SmoothnessCheck()
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (planted.CutEnergy, {"TWO_ENERGIES": "error"}),
+        # the difference changes, and not at once
+        (planted.Entropy, {}),
+        (planted.TwoEnergies, {}),
+    ],
+)
+def test_an_energy_that_alone_is_cut_is_seen_where_thresholds_are_known(make, expected):
+    """Forces are asked before, and know of no threshold."""
+    check = SmoothnessCheck()
     check.neighbors, check.routes = 8, 0
-    assert not codes(check(both))
-    result = CHECKS["forces"]()(both)
-    assert codes(result) == {"TWO_ENERGIES": "error"}
-    assert "between Ar-Ar at 3.4 Å, by 0.01 eV" in values(result, "TWO_ENERGIES")["places"]
+    result = check(subject(make))
+    assert codes(result) == expected
+    if expected:
+        told = values(result, "TWO_ENERGIES")
+        assert told["places"] == "between Ar-Ar at 3.4 Å, by 0.01 eV" and told["variants"] == ["wrong"]
 
 
 @pytest.mark.parametrize(("name", "what"), [("invariance", "lattice"), ("state", "sheared")])

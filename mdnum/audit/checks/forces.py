@@ -401,7 +401,7 @@ def _two_energies(
         free, other = subject.energies(there)
         return 0.0 if other is None else other - free
 
-    # where it may not change: between ways to write a structure down, and at a threshold of two particles
+    # where it may not change
     rng = np.random.default_rng(0)
     kinds = (invariance.translated, invariance.imaged, invariance.permuted)
     changes: list[tuple[str, float]] = []
@@ -411,10 +411,6 @@ def _two_energies(
                 changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
         except CalculatorError:
             continue  # reported elsewhere
-    for walk in subject.known["walks"].walks if "walks" in subject.known else ():
-        for one in walk.thresholds:
-            sides = [offset(walk.pair.at(place)) for place in (one.inside, one.outside)]
-            changes.append((f"between {walk.pair.name} at {one.radius:.8g} Å", abs(sides[1] - sides[0])))
     forward, back = (offset(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
     slope_of_offset = (forward - back) / (2 * _STEP)
     worst = max(subject.repeats.offsets.values(), key=lambda one: abs(one.change))

@@ -62,6 +62,7 @@ class SmoothnessCheck(AuditCheck):
                 *_jumps(walks, around, kT),
                 *_at_cutoff(around, kT),
                 *_among_many(around, kT, walks.not_walked),
+                *_logged(subject, walks),
                 *(one for crowded in crowds for one in _caps(crowded, kT)),
                 *(one for walk in walks.walks for one in reach(walk, kT)),
             ],
@@ -201,6 +202,23 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
         energy=1e3 * energy, kT=energy / kT, alone=ORDERS[threshold.order], measured=around.measured,
         places=len(around.lower),
     )  # fmt: skip
+
+
+def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
+    """A finding where `energy`, which a run logs, jumps at a threshold where `free_energy` does not."""
+    jumps: list[tuple[float, float, str, str]] = []
+    for walk in walks.walks:
+        for one in walk.thresholds:
+            sides = [subject.energies(walk.pair.at(at)) for at in (one.inside, one.outside)]
+            before, after = (np.nan if other is None else other - free for free, other in sides)
+            where = f"between {walk.pair.name} at {one.radius:.8g} Å, by {abs(after - before):.3g} eV"
+            jumps.append((after - before, before, walk.pair.name, where))
+    kT = subject.kT
+    if wrong := [one for one in jumps if abs(one[0]) > _LARGE * (kT or 1.0)]:
+        change, offset, pair, _ = max(wrong, key=lambda one: abs(one[0]))
+        values = {"formula": pair, "offset": offset, "change": change, "kT": abs(change) / kT if kT else None}
+        places = "; ".join(where for *_, where in wrong)
+        yield finding("TWO_ENERGIES", "error", "wrong", places=places, **values)
 
 
 def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
