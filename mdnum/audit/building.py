@@ -184,36 +184,26 @@ def meant_for(calculator: Any, words: str) -> list[str]:
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
-    found = list(_symbols(getattr(module, "parameters", None), False))
-    holders = [calculator]
-    for name in _MODELS:
-        value = getattr(calculator, name, None)
-        holders += value[:1] if isinstance(value, list | tuple) else [value]
-    for holder in filter(None, holders):
-        for name in (*_NAMES, *_NUMBERS):
-            found += _symbols(getattr(holder, name, None), name in _NUMBERS)
-    found = list(dict.fromkeys(found))
+    found = list(dict.fromkeys([*_symbols(getattr(module, "parameters", None)), *_symbols(calculator)]))
     if len(found) > _MANY:
         found.sort(key=lambda one: (*_FIRST, one).index(one))
     path = Path(words.partition(".py")[0] + ".py")
     text = path.read_text(errors="replace") if path.is_file() else ""
+    name = words.rpartition("/")[2]
     spoken = {name.lower(): chemical_symbols[k] for k, name in enumerate(atomic_names) if k}
-    texts = (words.rpartition("/")[2], type(calculator).__doc__, text)
-    for word in re.findall(r"[A-Za-z]+", " ".join(filter(None, texts))):
-        if word.lower() in spoken and word.lower() not in _WORDS:
-            found.append(spoken[word.lower()])
+    said = re.findall(r"[a-z]+", f"{name} {type(calculator).__doc__ or ''} {text}".lower())
+    found += [spoken[word] for word in said if word in spoken and word not in _WORDS]
     # symbols of two letters alone: others are as often something else
-    quoted = re.findall(r"""["']([A-Z][a-z])["']""", text)
-    named = re.findall(r"(?<![A-Za-z])[A-Z][a-z](?![a-z])", texts[0])
-    found += [one for one in (*named, *quoted) if one in atomic_numbers]
-    return list(dict.fromkeys(found))
+    written = re.findall(r"(?<![A-Za-z])[A-Z][a-z](?![a-z])", name)
+    written += re.findall(r"""["']([A-Z][a-z])["']""", text)
+    return list(dict.fromkeys([*found, *(one for one in written if one in atomic_numbers)]))
 
 
-def _symbols(value: Any, numbers: bool) -> Iterator[str]:
-    """Symbols of elements in an attribute, at any depth; keys of a dictionary where all of them are."""
+def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
+    """Symbols of elements in a value or its attributes; keys of a dictionary where all of them are."""
     from ase.data import chemical_symbols
 
-    value = value.tolist() if hasattr(value, "tolist") else getattr(value, "zs", value)
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, str) and value in chemical_symbols[1:]:
         yield value
     elif isinstance(value, int) and numbers and 0 < value < _LAST_ELEMENT:
@@ -222,11 +212,13 @@ def _symbols(value: Any, numbers: bool) -> Iterator[str]:
         keys = [one for key in value for one in (key if isinstance(key, tuple) else (key,))]
         if all(one in chemical_symbols[1:] for one in keys if isinstance(one, str)):
             yield from _symbols(keys, numbers)
-        for item in value.values():
-            yield from _symbols(item, numbers)
+        yield from _symbols([*value.values()], numbers, depth)
     elif isinstance(value, list | tuple | set):
         for item in sorted(value) if isinstance(value, set) else value:
-            yield from _symbols(item, numbers)
+            yield from _symbols(item, numbers, depth)
+    elif depth and not isinstance(value, float):
+        for name in (*_NAMES, *_NUMBERS, *_MODELS):
+            yield from _symbols(getattr(value, name, None), name in _NUMBERS, depth - 1)
 
 
 def water(edge: int = 4) -> Atoms:

@@ -414,18 +414,12 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     if loud and smooth:  # forces alone have lost what the energy they belong to still has
         severity = "error" if share > _SMALL else "warning"
     yield finding(
-        "LOW_PRECISION",
-        severity,
+        "LOW_PRECISION", severity,
         ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
         "format" if whose else "forces" if smooth and not summed else None,
-        tests=("rounding",),
-        change=change,
-        whose=whose,
-        format=narrow[whose] if whose else None,
-        energy=noise.energy,
-        ulps=float(ulps),
-        digits=round(max(-np.log10(max(share, eps)), 0)),
-    )
+        tests=("rounding",), change=change, whose=whose, format=narrow[whose] if whose else None,
+        energy=noise.energy, ulps=float(ulps), digits=round(max(-np.log10(max(share, eps)), 0)),
+    )  # fmt: skip
 
 
 def _quantized(
@@ -443,12 +437,7 @@ def _quantized(
         bound = 0.5 * sizes["forces"] or 2.0 ** -read["forces"].bits * typical
         values["forces_share"] = sizes["forces"] / typical
     return finding(
-        "QUANTIZED",
-        "error" if bound > _SMALL * typical else "warning",
-        *variants,
-        **values,
-        length=stairs.length,
-        points=len(stairs.energies),
-        different=len(np.unique(stairs.energies)),
+        "QUANTIZED", "error" if bound > _SMALL * typical else "warning", *variants, **values,
+        length=stairs.length, points=len(stairs.energies), different=len(np.unique(stairs.energies)),
         share=stairs.share,
-    )
+    )  # fmt: skip

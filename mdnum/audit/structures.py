@@ -46,13 +46,14 @@ def read_structure(words: str | Path) -> Atoms:
     with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
         chosen = list(ase_images(path, which))
     if len(chosen) != 1:
+        several = f"means {len(chosen)} structures, and an audit is about one structure"
         raise InputError(
-            f"means {len(chosen)} structures, and an audit is about one structure",
+            several if chosen else f"cannot be read: the file has no structure {which}",
             where=text,
             remedy="Name one by its number: file@0 is the first, file@-1 the last",
         )
     atoms = chosen[0]
-    if not isinstance(atoms, Atoms) or len(atoms) == 0:
+    if not len(atoms):
         raise InputError("holds no atoms", where=text, remedy="Name another file, or another index: file@0")
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():

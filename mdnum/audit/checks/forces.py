@@ -140,15 +140,10 @@ class ForcesCheck(AuditCheck):
             one
             for place, one in found.items()
             # as much as a force of the drowned size does along a direction in which more atoms move
-            if one.agrees
-            and max(one.error, one.gap) > _DROWNED * scale * float(np.linalg.norm(wanted[place][1]))
+            if one.agrees and max(one.error, one.gap) > _DROWNED * scale * np.linalg.norm(wanted[place][1])
         ]
         first = min(found)
-        observed = [
-            *drowned,
-            *_judged(slopes, scale, places),
-            *wrong_sums,
-        ]
+        observed = [*drowned, *_judged(slopes, scale, places), *wrong_sums]
         if not self.brief:
             if not any(one.severity == "error" for one in drowned):
                 observed += precision(worker, atoms, noise)
@@ -257,16 +252,11 @@ def slope(
     # a difference that grows like 1/h down to the smallest h shows a step of the energy
     sizes = 2 * _LADDER[-4:] * (central - force)[-4:]
     steady = np.ptp(sizes) < 0.3 * abs(sizes[-1]) and abs(sizes[-1]) > noise.allowed.energy
+    doubt += noise.force * float(np.sqrt(np.sum(line**2)))  # a force has its own rounding
     return Slope(
-        what,
-        float(better[best + 1]),
-        # a force has its own rounding
-        doubt + noise.force * float(np.sqrt(np.sum(line**2))),
-        force,
-        float(_LADDER[best + 2]),
-        np.abs(central - force),
+        what, float(better[best + 1]), doubt, force, float(_LADDER[best + 2]), np.abs(central - force),
         float(sizes[-1]) if steady else 0.0,
-    )
+    )  # fmt: skip
 
 
 def _best(
@@ -366,17 +356,10 @@ def _row(one: Slope) -> dict[str, Any]:
 def _chart(slopes: list[Slope]) -> Chart:
     """Difference of forces and differences by step: a valley where all is well, a plateau where it is not."""
     shown = slopes[:_DIRECTIONS]
-    worst = _worst(slopes)
-    if worst not in shown:
-        shown = [*shown, worst]
-    return Chart(
-        "Forces against differences of the energy, by step",
-        "step (Å)",
-        "difference (eV/Å)",
-        _LADDER[::-1].tolist(),
-        {one.direction: one.gaps[::-1].tolist() for one in shown},
-        log_y=True,
-    )
+    shown += [one for one in [_worst(slopes)] if one not in shown]
+    lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
+    title = "Forces against differences of the energy, by step"
+    return Chart(title, "step (Å)", "difference (eV/Å)", _LADDER[::-1].tolist(), lines, log_y=True)
 
 
 # -- calculators that know two energies: the one forces belong to, and the one that a run logs
