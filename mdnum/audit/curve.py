@@ -247,8 +247,7 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
     """Power with which the force vanishes toward an edge beyond which it is zero; None where unclear.
 
     Args:
-        edge: where it ends, approached from below.
-        room: without another threshold below it.
+        edge: where it ends, approached from below through room without another threshold.
     """
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
@@ -427,9 +426,6 @@ def _third(curve: Curve, left: float, right: float, room: float, noise: float) -
     """A place where the third derivative of the energy jumps, by the force's second from both sides.
 
     Of several widths of the two pieces, that at which half of it agrees best counts.
-
-    Args:
-        noise: of the force.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -166,8 +166,7 @@ def account(
 
     Args:
         subject: another object than the run's; asked three times for each crossing and once more.
-        step: at its end.
-        crossed: those of this step, by their share.
+        crossed: those of the step that ends with this number, by their share.
         smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
             force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
 
@@ -264,7 +263,6 @@ def hidden_jumps(
     """Search the steps that leave most unexplained: is it all at single places of their way?
 
     Args:
-        probe: another object than the run's.
         rest: energy that each step leaves unexplained; nan where that is not known.
         crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
         noise: that an energy may differ by, eV.
@@ -372,7 +370,6 @@ def balance(
 
     Args:
         probe: another object than the run's.
-        limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
         noise: that an energy may differ by, eV.
     """
@@ -456,8 +453,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
     sums over blocks instead.
 
     Args:
-        time: after each increment.
-        increments: at least 16.
+        increments: at least 16, each before its time.
     """
     sums = [float(np.sum(block)) for block in np.array_split(increments, _BLOCKS)]
     whole = float(time[-1] - time[0])

@@ -97,10 +97,6 @@ def along_a_line(
 ) -> NoiseFloor:
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
-    Args:
-        atoms: with no threshold nearby.
-        rng: picks the line.
-
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
     """
@@ -187,14 +183,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """The largest change of the energy in other orders of the atoms, eV, and what rounding makes of it.
 
-    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise.
-
-    The rounding of a sum is drawn anew wherever its terms are others, while terms that are missing in another
-    order change smoothly along a line.
-
-    Args:
-        atoms: a structure away from thresholds.
-        noise: along a line there, in one order.
+    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise
+    along a line. The rounding of a sum is drawn anew wherever its terms are others, while terms that are
+    missing in another order change smoothly along a line.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -256,12 +247,9 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """The largest change of energy and of a force component when all atoms are moved at random.
+    """The largest change of energy and of a force component when all atoms are moved at random by some Å.
 
-    Rounding coordinates of another image or of a turned structure moves atoms like this.
-
-    Args:
-        size: of the moves, Å: of the order of an ulp of the largest coordinate.
+    Rounding coordinates of another image or of a turned structure moves atoms by an ulp of the largest.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(_DRAWS):

@@ -48,11 +48,8 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     any order of the atoms; what depends on all of the order, such as neighbors that are dropped, shows
     nearly everywhere or elsewhere in another order.
 
-    Args:
-        allowed: what an answer may differ by.
-
     Returns:
-        None where no place stands out, or nearly all do.
+        None where no place stands out by more than is allowed, or nearly all do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:

@@ -186,7 +186,6 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
     Args:
         words: the calculator as it was named.
         pairs: names of structures without "-before" and "-after".
-        units: of the calculator.
     """
     return _SCRIPT.format(
         making="\n".join(_making(words)), pairs=list(pairs), folder=STRUCTURES, energy=units.energy,

@@ -117,12 +117,7 @@ class Repeats:
 
 
 def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
-    """Whether an answer that ought to be another one differs from it by more than any rounding.
-
-    Args:
-        change: of the energy, eV.
-        force: change of a force component, eV/Å.
-    """
+    """Whether a change of the energy (eV) or of a force component (eV/Å) is more than any rounding."""
     energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
@@ -142,9 +137,7 @@ def not_repeatable(
 
     Args:
         how: it came up, a variant of the sentences.
-        energy: by which answers differ, eV.
-        force: by which they differ, eV/Å.
-        typical: root mean square force, eV/Å.
+        energy, force: by which answers differ, eV and eV/Å; typical: root mean square force, eV/Å.
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
@@ -172,7 +165,8 @@ class CalculatorSubject:
     representable distances near an atom at the origin: where the bits differ, the cache is dropped first.
     Bits that do not differ are answered from the cache, so that energy and forces cost one calculation;
     `forget` makes the next question a calculation. The calculator is attached to the atoms that it is asked
-    about, as in a run: some answer in no other way.
+    about, as in a run: some answer in no other way. Each question may raise a `CalculatorError`: the
+    calculator raised, or answered with nan, and the structure has been saved.
 
     Args:
         name: what the person called it.
@@ -247,20 +241,13 @@ class CalculatorSubject:
         self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
-        """Potential energy in eV: the one the forces belong to where the calculator knows two.
-
-        Raises:
-            CalculatorError: the calculator raised, or answered with nan; the structure has been saved.
-        """
+        """Potential energy in eV: the one the forces belong to where the calculator knows two."""
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """(the energy that forces belong to, the one that a run logs), eV.
 
         ASE calls the first `free_energy` and the second `energy`; None where the calculator knows one alone.
-
-        Raises:
-            CalculatorError: as for `energy`.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -273,11 +260,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Forces in eV/Å.
-
-        Raises:
-            CalculatorError: as for `energy`, or forces of another shape than the positions.
-        """
+        """Forces in eV/Å; of another shape than the positions they raise as well."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -331,9 +314,6 @@ class CalculatorSubject:
 
         Returns:
             Whether the answer is another one by more than rounding.
-
-        Raises:
-            CalculatorError: as for `energy`.
         """
         repeats, chance = self.repeats, self.repeats.chance
         if not repeats.asks_again:

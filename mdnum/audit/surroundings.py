@@ -163,7 +163,6 @@ def walk_surroundings(
     """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
 
     Args:
-        ways: counts crossings and routes.
         crossings: of known thresholds in the structure that are measured.
         routes: through the structure on which others are searched.
     """
@@ -377,7 +376,6 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
     """Crowd an atom of each species that the calculator takes alone.
 
     Args:
-        ways: counts them.
         most: neighbors given to the center.
 
     Returns:

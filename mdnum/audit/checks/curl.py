@@ -104,9 +104,6 @@ def agreed(tried: Sequence[Loop]) -> Loop:
     """The loop with the smallest error, which is raised where a loop of another radius disagrees.
 
     A curl is the same on every small circle; what a jump of the forces does to the work around one is not.
-
-    Args:
-        tried: the same plane at several radii.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]

@@ -453,7 +453,6 @@ def run(
     Args:
         start: with velocities and constraints; left as it is.
         timestep: internal time.
-        each: called with the step reached.
 
     Returns:
         the run, and the structure with velocities at its end.

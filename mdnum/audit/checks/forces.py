@@ -225,10 +225,8 @@ def slope(
     """The derivative of the energy along a line by differences, with its error, beside that of the forces.
 
     Args:
-        line: displacement per Å of step.
-        forces: the calculator's at `atoms`.
-        noise: of the energy there.
-        what: the direction in words.
+        line: displacement per Å of step; `what` names it.
+        forces: the calculator's at `atoms`, where `noise` is that of the energy.
     """
     plus, minus = (
         np.array([subject.energy(displaced(atoms, sign * step * line)) for step in _LADDER])
@@ -269,8 +267,7 @@ def _best(
 
     Args:
         gaps: difference minus force at each step, the longest first.
-        error: of the differences, estimated.
-        rounding: the part of it that noise explains.
+        error: of the differences, estimated; rounding: the part of it that noise explains.
     """
     best = int(np.argmin(error))
     wrong = abs(gaps[best])
@@ -374,8 +371,7 @@ def _two_energies(
     differ by a constant at most, what they find holds for both. What has been asked so far counts as well.
 
     Args:
-        atoms: a structure away from thresholds.
-        line: a displacement of it, per Å; along: the slope along it.
+        along: the slope along the line, a displacement per Å of a structure away from thresholds.
     """
     if subject.energies(atoms)[1] is None:
         return
