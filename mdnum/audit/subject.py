@@ -26,9 +26,6 @@ from mdnum.units import METAL, Units
 _MOST_SAVED = 20
 #: k_B times 300 K, eV.
 _ROOM_TEMPERATURE = 0.025852
-#: Of two energies of one structure: differences of their difference that rounding explains, of doubles and of
-#: numbers of single precision.
-_ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
 #: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
 #: answers to one question that differ by more are no rounding.
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
@@ -55,15 +52,6 @@ class RepeatCounts:
     typical: float = 0.0  # root mean square force where forces were compared last, eV/Å
 
 
-@dataclass
-class EnergyOffset:
-    """By how much the two energies of a calculator differ for one composition."""
-
-    formula: str
-    first: float  # energy minus free energy where it was asked for first, eV
-    change: float = 0.0  # the largest change of it that rounding does not explain, eV; signed
-
-
 class Repeats:
     """A few numbers of each answer of all objects of a calculator, compared where a question recurs.
 
@@ -71,23 +59,11 @@ class Repeats:
         new: what new objects answered to the first question they were asked: nothing can be remembered there.
         chance: answers that stuck out, asked for again of the same object; of those that differ, the ones
             that rounding does not explain, and the largest difference of a force component.
-        offsets: the difference of two energies by composition.
     """
 
     def __init__(self):
         self.new, self.chance = RepeatCounts(), RepeatCounts()
-        self.offsets: dict[bytes, EnergyOffset] = {}
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
-
-    def offset(self, atoms: Atoms, value: float, other: float) -> None:
-        """Take note of the energy that forces belong to, and of the one that a run logs."""
-        key = np.sort(atoms.numbers).tobytes()
-        kept = self.offsets.setdefault(key, EnergyOffset(atoms.get_chemical_formula(), other - value))
-        single = float(np.float32(value)) == value and float(np.float32(other)) == other
-        rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(abs(value), abs(other))
-        change = other - value - kept.first
-        if abs(change) > max(rounding, abs(kept.change)):
-            kept.change = change
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
         """Take note of what a new object (its number `which`) answered to its first question."""
@@ -255,8 +231,6 @@ class CalculatorSubject:
         assert energy is not None
         if self._seen == 1:
             self.repeats.compare(asked, self._object, "energy", energy)
-        if other is not None:
-            self.repeats.offset(asked, energy, other)
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:

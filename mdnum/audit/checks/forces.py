@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -54,6 +55,9 @@ _SAME = 0.01
 #: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
 #: between two ways of writing one structure down, above the other is an error.
 _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
+#: Of two energies of one structure: changes of their difference that rounding explains, of doubles and of
+#: numbers of single precision.
+_ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
 #: Å to either side, for the derivative of that difference, and the error of it, roughly.
 _STEP, _CENTRAL = 1e-3, 1e-3
 
@@ -368,40 +372,42 @@ def _two_energies(
     """A finding where `energy` and `free_energy` differ by what is not constant.
 
     Every other check is about the free energy, which forces belong to by ASE's definition; where the two
-    differ by a constant at most, what they find holds for both. What has been asked so far counts as well.
+    differ by a constant at most, what they find holds for both.
 
     Args:
         along: the slope along the line, a displacement per Å of a structure away from thresholds.
     """
-    if subject.energies(atoms)[1] is None:
+    energies = subject.energies(atoms)
+    if energies[1] is None:
         return
 
-    def offset(there: Atoms) -> float:
+    def change(there: Atoms) -> float:
         free, other = subject.energies(there)
-        return 0.0 if other is None else other - free
+        return 0.0 if other is None else other - free - offset
 
+    offset, kT = energies[1] - energies[0], subject.kT
     # where it may not change
     rng = np.random.default_rng(0)
     kinds = (invariance.translated, invariance.imaged, invariance.permuted)
-    changes: list[tuple[str, float]] = []
+    changes: dict[str, float] = {}
     for same in (one for kind in kinds for one in islice(kind(atoms, rng), 1)):
-        try:
-            with subject.trying():
-                changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
-        except CalculatorError:
-            continue  # reported elsewhere
-    forward, back = (offset(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
+        with suppress(CalculatorError), subject.trying():  # reported elsewhere
+            changes[f"with {same.what}"] = change(same.atoms)
+    forward, back = (change(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
     slope_of_offset = (forward - back) / (2 * _STEP)
-    worst = max(subject.repeats.offsets.values(), key=lambda one: abs(one.change))
-    if abs(worst.change) <= max(noise.allowed.energy, _SMALL_OFFSET * subject.kT):
+    moved = [change(displaced(atoms, sign * _LADDER[0] * line)) for sign in (1, -1)]
+    worst = max([*changes.values(), *moved], key=abs)
+    single = all(float(np.float32(energy)) == energy for energy in energies)
+    rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(map(abs, energies))
+    if abs(worst) <= max(noise.allowed.energy, _SMALL_OFFSET * kT, rounding):
         return
     limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
     free = along.agrees
     other = abs(along.difference - along.force + slope_of_offset) <= limit
     belong = "both" if free and other else "free" if free else "energy" if other else "neither"
-    wrong = [f"{what}, by {size:.3g} eV" for what, size in changes if size > _LARGE_OFFSET * subject.kT]
+    wrong = [f"{what}, by {abs(by):.3g} eV" for what, by in changes.items() if abs(by) > _LARGE_OFFSET * kT]
     yield finding(
         "TWO_ENERGIES", "error" if wrong else "warning", belong, "wrong" if wrong else None,
-        formula=worst.formula, offset=worst.first, change=worst.change, places="; ".join(wrong),
-        kT=abs(worst.change) / subject.kT if subject.kT else None,
+        formula=atoms.get_chemical_formula(), offset=offset, change=worst, places="; ".join(wrong),
+        kT=abs(worst) / kT if kT else None,
     )  # fmt: skip
