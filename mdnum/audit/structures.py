@@ -236,12 +236,11 @@ def group(atoms: Atoms) -> int | None:
     bonded, by their covalent radii, and to no others.
     """
     numbers = atoms.numbers
-    for size in range(2, len(atoms) // 2 + 1):
-        if len(atoms) % size == 0 and np.array_equal(numbers[size:], numbers[:-size]):
-            if len(set(numbers[:size])) == 1:
-                return None
-            expected = np.arange(len(atoms)).reshape(-1, size)
-            found = sorted(molecules(atoms), key=lambda one: one[0])
-            alike = len(found) == len(expected) and all(map(np.array_equal, found, expected))
-            return size if alike else None
-    return None
+    if len(set(numbers)) < 2:
+        return None
+    found = sorted(molecules(atoms), key=lambda one: one[0])
+    size = len(found[0])
+    species = np.resize(numbers[:size], len(numbers))
+    if size < 2 or len(found) < 2 or not np.array_equal(species, numbers) or len(set(species[:size])) == 1:
+        return None
+    return size if all(np.array_equal(one, one[0] + np.arange(size)) for one in found) else None

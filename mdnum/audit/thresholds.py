@@ -95,10 +95,6 @@ class Beyond:
     reached: float  # the farthest distance that was asked about, length
     force: float  # there, eV/Å
     left: float  # energy that is lost beyond it, as it decays there, eV; inf where it does not decay
-    nodes: Float[np.ndarray, "nodes"]  # distances asked about in all intervals
-    # energies, forces: there, eV and eV/Å
-    energies: Float[np.ndarray, "nodes"]
-    forces: Float[np.ndarray, "nodes"]
 
 
 @dataclass(frozen=True)
@@ -240,10 +236,6 @@ def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairW
     if pair.moves == "atom":
         thresholds = [one for one in thresholds if not _of_others(pair, one, thresholds)]
     values = curve.many(distance)
-    reach = distance[-1]
-    if further:
-        distance = np.append(distance, further.nodes)
-        values = np.hstack([values, np.array([further.energies, further.forces])])
     # forces are sums over the atoms of a particle
     quantum = digits(values[0]).quantum, len(pair.second) * digits(values[1]).quantum
     if any(quantum):
@@ -255,7 +247,7 @@ def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairW
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if ended and thresholds else None, left_out, len(curve.known),
-        quantum, knots, seen, further, float(reach),
+        quantum, knots, seen, further, float(distance[-1]),
     )  # fmt: skip
 
 
@@ -399,7 +391,7 @@ def _beyond(
         return None
     curve = (replace(pair, box=2.5 * _WIDEST) if pair.box else pair).curve(subject)
     farthest = min(start * _RATIO**_MOST, _WIDEST) if pair.box else start * _RATIO**_MOST
-    low, found, asked = start, [], [np.array([])]
+    low, found = start, []
     edge: tuple[float, float] | None = None
     left, force = np.inf, 0.0
     while low * _RATIO <= farthest:
@@ -424,7 +416,6 @@ def _beyond(
                     break
         except CalculatorError:
             break
-        asked.append(nodes)
         low, force = high, float(forces[-1])
         left = _left(nodes, forces)
         if left < _NOTHING * subject.kT:
@@ -439,9 +430,7 @@ def _beyond(
             found = _with_end(pair, curve, edge, found, max(low - 0.5, start))
         else:
             edge, left = None, 0.0
-    nodes = np.unique(np.concatenate(asked))[1:]
-    energies, forces = curve.many(nodes) if len(nodes) else np.zeros((2, 0))
-    return Beyond(tuple(found), edge, reached, force, left, nodes, energies, forces)
+    return Beyond(tuple(found), edge, reached, force, left)
 
 
 def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:

@@ -67,7 +67,7 @@ class SmoothnessCheck(AuditCheck):
                 *(one for walk in walks.walks for one in reach(walk, kT)),
             ],
             tables=_tables(walks, around, crowds, kT),
-            charts=_charts(walks, crowds, subject),
+            charts=_charts(walks, subject),
             numbers=numbers,
             limits={
                 "largest_energy_jump": (_SMALL * kT, _ENERGY),
@@ -356,18 +356,12 @@ def _tables(
     }
 
 
-def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubject) -> list[Chart]:
+def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
     found: list[Chart] = []
     for walk in walks.walks[:_DRAWN]:
         found.append(_energies(walk, subject.kT))
         sharp = [one for one in walk.thresholds if one.order <= 1]
         found += [_close_up(walk, one, subject) for one in sharp[:1]]
-    for one in crowds:
-        if one.kept:
-            title = f"{one.species} with {one.neighbors} neighbors: what jumps when another passes the k-th"
-            k, forces = zip(*one.jumps, strict=True)
-            what, kept = "largest jump of a force (eV/Å)", {"kept": float(one.kept)}
-            found.append(Chart(title, "k", what, [float(n) for n in k], {"force": list(forces)}, kept))
     return found
 
 
