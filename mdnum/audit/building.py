@@ -261,18 +261,17 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
     Of a calculator that fails on atoms without neighbors, the distance from which on it does.
     """
-    curve = pair.curve(subject)
+    curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
-    for distance in _DISTANCES:
+    for distance in distances:
         try:
-            known[float(distance)] = curve(float(distance))
+            known[distance] = curve(distance)
         except CalculatorError:
             if known:
                 break
     if not known:
         return None, None
-    places = list(known)
-    energy_far = known[places[0]][0] if places[0] == _DISTANCES[0] else None
+    energy_far = known[distances[0]][0] if distances[0] in known else None
 
     def felt(distance: float) -> bool:
         try:
@@ -281,16 +280,13 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
             return False
         return energy_far is None or max(abs(energy - energy_far), abs(force)) > 1e-12
 
-    inside = next((one for one in places if felt(one)), None)
-    if inside is None or inside == _DISTANCES[0]:
-        cutoff = None
-    else:
-        low, high = inside, float(_DISTANCES[list(_DISTANCES).index(inside) - 1])
+    cutoff, inside = None, next((one for one in known if felt(one)), distances[0])
+    if inside != distances[0]:
+        low, cutoff = inside, distances[distances.index(inside) - 1]
         for _ in range(4):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if felt(middle) else (low, middle)
-        cutoff = high
-    least = min((one for one in places if one > 0.8), key=lambda one: known[one][0])
+            middle = 0.5 * (low + cutoff)
+            low, cutoff = (middle, cutoff) if felt(middle) else (low, middle)
+    least = min((one for one in known if one > 0.8), key=lambda one: known[one][0])
     bound = energy_far is not None and known[least][0] < energy_far - 1e-9
     return cutoff, least if bound else None
 

@@ -9,8 +9,9 @@ a force that is not the energy's derivative.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from ase import Atoms
@@ -241,16 +242,18 @@ class HiddenJumps:
         return found
 
     @property
-    def rank(self) -> tuple[int, int] | None:
+    def rank(self) -> tuple[int, int]:
         """(k, at how many jumps the k-th and next neighbors change places), the most frequent k."""
-        counts = Counter(k for jump in self.jumps for k in {k for _, k in jump.ties})
-        return counts.most_common(1)[0] if counts else None
+        return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
-    def radius(self) -> tuple[float, int] | None:
+    def radius(self) -> tuple[float, int]:
         """(radius, at how many jumps a pair passes it), the most frequent pair threshold."""
-        counts = Counter(jump.radius for jump in self.jumps if jump.radius is not None)
-        return counts.most_common(1)[0] if counts else None
+        return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
+
+
+def _most_frequent(values: Iterable[Any]) -> tuple[Any, int]:
+    return next(iter(Counter(values).most_common(1)), (0, 0))
 
 
 def hidden_jumps(

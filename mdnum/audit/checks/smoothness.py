@@ -126,11 +126,10 @@ def figures(
     worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
     says = ["walked" if walks.walks else "not_walked"]
     values: dict[str, Any] = numbers | {
-        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs),
-        "energy": 1e3 * numbers["largest_energy_jump"], "kT": numbers["largest_energy_jump_kT"],
-        "force": force, "derivative": ORDERS[order] if order is not None else "",
-        "knots": knots, "not_walked": ", ".join(walks.not_walked), "neighbors": numbers["neighbors_tried"],
-        "kept": min(capped, default=0),
+        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs), "energy": 1e3 * step,
+        "kT": numbers["largest_energy_jump_kT"], "force": force, "kept": min(capped, default=0),
+        "derivative": ORDERS[order] if order is not None else "", "not_walked": ", ".join(walks.not_walked),
+        "neighbors": numbers["neighbors_tried"], "knots": knots,
     }  # fmt: skip
     says += ["ends"] if cutoffs else []
     says.append(f"jumps_{worst}" if order is None or order <= SMOOTH else "jumps_at_an_end")
