@@ -198,7 +198,7 @@ def order_change(
             answers = [in_order(there, atoms, order) for order in orders]
     except CalculatorError:
         return 0.0, none  # reported elsewhere
-    energy, force = np.max([differences(base, answer) for answer in answers], axis=0)
+    energy, force = np.array([differences(base, answer) for answer in answers]).max(axis=0)
     allowed, total = noise.allowed, count * largest(base[1])
     quiet = energy <= min(allowed.energy, _NOISY * np.spacing(abs(base[0]))) and force <= allowed.force
     size = total * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])

@@ -377,15 +377,15 @@ def _two_energies(
     Args:
         along: the slope along the line, a displacement per Å of a structure away from thresholds.
     """
-    energies = subject.energies(atoms)
-    if energies[1] is None:
+    free, logged = subject.energies(atoms)
+    if logged is None:
         return
 
     def change(there: Atoms) -> float:
         free, other = subject.energies(there)
         return 0.0 if other is None else other - free - offset
 
-    offset, kT = energies[1] - energies[0], subject.kT
+    offset, kT = logged - free, subject.kT
     # where it may not change
     rng = np.random.default_rng(0)
     kinds = (invariance.translated, invariance.imaged, invariance.permuted)
@@ -397,14 +397,13 @@ def _two_energies(
     slope_of_offset = (forward - back) / (2 * _STEP)
     moved = [change(displaced(atoms, sign * _LADDER[0] * line)) for sign in (1, -1)]
     worst = max([*changes.values(), *moved], key=abs)
-    single = all(float(np.float32(energy)) == energy for energy in energies)
-    rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(map(abs, energies))
+    single = all(float(np.float32(energy)) == energy for energy in (free, logged))
+    rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(abs(free), abs(logged))
     if abs(worst) <= max(noise.allowed.energy, _SMALL_OFFSET * kT, rounding):
         return
     limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
-    free = along.agrees
     other = abs(along.difference - along.force + slope_of_offset) <= limit
-    belong = "both" if free and other else "free" if free else "energy" if other else "neither"
+    belong = ("both" if other else "free") if along.agrees else "energy" if other else "neither"
     wrong = [f"{what}, by {abs(by):.3g} eV" for what, by in changes.items() if abs(by) > _LARGE_OFFSET * kT]
     yield finding(
         "TWO_ENERGIES", "error" if wrong else "warning", belong, "wrong" if wrong else None,

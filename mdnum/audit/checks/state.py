@@ -236,10 +236,9 @@ def _again(
     if worst.refused or again.refused:
         return isinstance(worst.old, CalculatorError) and isinstance(again.old, CalculatorError)
     # both must come again: what objects in use answer, and what new ones do
-    return all(
-        force <= 0.5 * worst.force and energy <= 0.5 * worst.energy
-        for energy, force in (differences(again.old, worst.old), differences(again.new, worst.new))
-    )
+    answers: list[tuple[Any, Any]] = [(again.old, worst.old), (again.new, worst.new)]
+    changes = [differences(*two) for two in answers]
+    return all(force <= 0.5 * worst.force and energy <= 0.5 * worst.energy for energy, force in changes)
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
