@@ -73,8 +73,10 @@ class DynamicsCheck(AuditCheck):
         rng = np.random.default_rng(self.seed)
         limits, unknown = ([], "") if self.brief else _limits(subject)
         atoms = roomy(subject.atoms, FEW)
-        held = rigid(atoms) if _only_molecules(subject) else None
-        worker = subject.fresh()
+        held, worker = rigid(atoms), subject.fresh()
+        # of molecules that it takes whole alone, a calculator does not know the inner distances
+        if held is not None and subject.fresh().answers(subject.atoms[:-1]):
+            held = None
         iterations = _FEW_ITERATIONS if self.brief else _POWER_ITERATIONS
         fitting, period = fitting_timestep(worker, atoms, rng, iterations)
         start = prepared(worker, atoms, held, period, rng)
@@ -142,11 +144,6 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
     except CalculatorError as error:
         return [], f"searching thresholds, the calculator {error.message}"
     return found, "" if found else "no threshold was found"
-
-
-def _only_molecules(subject: CalculatorSubject) -> bool:
-    """Whether the calculator takes whole molecules alone, whose inner distances it does not know."""
-    return rigid(subject.atoms) is not None and not subject.fresh().answers(subject.atoms[:-1])
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,14 @@ class ForcesCheck(AuditCheck):
             progress, self.name, spread=True, required=True, most=1 if self.brief else None,
         )  # fmt: skip
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
-        wrong_sums = list(_judged_sums(sums, scale))
+        wrong_sums = [
+            finding(
+                code, "error" if row["found"] > _SMALL * scale else "warning", size=row["found"],
+                allowed=row["rounding explains"],
+            )
+            for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False)
+            if row["found"] > row["rounding explains"]
+        ]  # fmt: skip
         if wrong_sums or not all(one.agrees for one in slopes):
             # the forces at the structure itself, which all directions are compared with
             worker.again(atoms, forces=forces)
@@ -297,13 +304,6 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
         reach = float(np.max(np.linalg.norm(arms, axis=1)))
         torque, allowed = float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))), allowed * max(reach, 1.0)
         yield {"sum": "net torque (eV)", "found": torque, "rounding explains": float(allowed)}
-
-
-def _judged_sums(sums: list[dict[str, Any]], scale: float) -> Iterator[Observed]:
-    for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False):
-        if row["found"] > row["rounding explains"]:
-            severity = "error" if row["found"] > _SMALL * scale else "warning"
-            yield finding(code, severity, size=row["found"], allowed=row["rounding explains"])
 
 
 def _drowned(

@@ -278,13 +278,11 @@ class _Judge:
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
     """Ways of writing the structure down that nobody may fail on, and answers that are not numbers."""
-    groups: dict[str, list[tuple[Same, CalculatorError]]] = {}
-    for same, error in refused:
-        if error.cause is None:
-            groups.setdefault("NOT_FINITE", []).append((same, error))
-        elif same.code in _MUST_ANSWER:
-            groups.setdefault("FAILS", []).append((same, error))
-    for code, cases in groups.items():
+    empty = [one for one in refused if one[1].cause is None]
+    raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
+    for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
+        if not cases:
+            continue
         same, error = cases[0]
         values = {"what": same.what, "why": error.message, "ways": len(cases)}
         values["file"] = error.structure.name if error.structure else ""
