@@ -342,7 +342,7 @@ def _audit_state() -> dict:
         (["failed"], {}), [finding("CURL", "error")], {}, [Chart("", "", "", [0.0], {"a": [1.0]})], {},
         skipped=[("a", "b")], name="forces",
     )  # fmt: skip
-    end = PairThreshold(1.0, ("A", "A"), 0, (0.0,) * 3, (0.0,) * 3, 1.0, 1.0, False, 0.0)
+    end = PairThreshold(1.0, ("A", "A"), 0, (0.0,) * 3, 1.0, 1.0, False, 0.0)
     checks = ["forces", "curl"]
     structure = encoded(bulk("Cu"))
     state = AuditState(

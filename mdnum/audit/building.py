@@ -184,36 +184,26 @@ def meant_for(calculator: Any, words: str) -> list[str]:
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
-    found = list(_symbols(getattr(module, "parameters", None), False))
-    holders = [calculator]
-    for name in _MODELS:
-        value = getattr(calculator, name, None)
-        holders += value[:1] if isinstance(value, list | tuple) else [value]
-    for holder in filter(None, holders):
-        for name in (*_NAMES, *_NUMBERS):
-            found += _symbols(getattr(holder, name, None), name in _NUMBERS)
-    found = list(dict.fromkeys(found))
+    found = list(dict.fromkeys([*_symbols(getattr(module, "parameters", None)), *_symbols(calculator)]))
     if len(found) > _MANY:
         found.sort(key=lambda one: (*_FIRST, one).index(one))
     path = Path(words.partition(".py")[0] + ".py")
     text = path.read_text(errors="replace") if path.is_file() else ""
+    name = words.rpartition("/")[2]
     spoken = {name.lower(): chemical_symbols[k] for k, name in enumerate(atomic_names) if k}
-    texts = (words.rpartition("/")[2], type(calculator).__doc__, text)
-    for word in re.findall(r"[A-Za-z]+", " ".join(filter(None, texts))):
-        if word.lower() in spoken and word.lower() not in _WORDS:
-            found.append(spoken[word.lower()])
+    said = re.findall(r"[a-z]+", f"{name} {type(calculator).__doc__ or ''} {text}".lower())
+    found += [spoken[word] for word in said if word in spoken and word not in _WORDS]
     # symbols of two letters alone: others are as often something else
-    quoted = re.findall(r"""["']([A-Z][a-z])["']""", text)
-    named = re.findall(r"(?<![A-Za-z])[A-Z][a-z](?![a-z])", texts[0])
-    found += [one for one in (*named, *quoted) if one in atomic_numbers]
-    return list(dict.fromkeys(found))
+    written = re.findall(r"(?<![A-Za-z])[A-Z][a-z](?![a-z])", name)
+    written += re.findall(r"""["']([A-Z][a-z])["']""", text)
+    return list(dict.fromkeys([*found, *(one for one in written if one in atomic_numbers)]))
 
 
-def _symbols(value: Any, numbers: bool) -> Iterator[str]:
-    """Symbols of elements in an attribute, at any depth; keys of a dictionary where all of them are."""
+def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
+    """Symbols of elements in a value or its attributes; keys of a dictionary where all of them are."""
     from ase.data import chemical_symbols
 
-    value = value.tolist() if hasattr(value, "tolist") else getattr(value, "zs", value)
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, str) and value in chemical_symbols[1:]:
         yield value
     elif isinstance(value, int) and numbers and 0 < value < _LAST_ELEMENT:
@@ -222,11 +212,13 @@ def _symbols(value: Any, numbers: bool) -> Iterator[str]:
         keys = [one for key in value for one in (key if isinstance(key, tuple) else (key,))]
         if all(one in chemical_symbols[1:] for one in keys if isinstance(one, str)):
             yield from _symbols(keys, numbers)
-        for item in value.values():
-            yield from _symbols(item, numbers)
+        yield from _symbols([*value.values()], numbers, depth)
     elif isinstance(value, list | tuple | set):
         for item in sorted(value) if isinstance(value, set) else value:
-            yield from _symbols(item, numbers)
+            yield from _symbols(item, numbers, depth)
+    elif depth and not isinstance(value, float):
+        for name in (*_NAMES, *_NUMBERS, *_MODELS):
+            yield from _symbols(getattr(value, name, None), name in _NUMBERS, depth - 1)
 
 
 def water(edge: int = 4) -> Atoms:
@@ -269,18 +261,17 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
     Of a calculator that fails on atoms without neighbors, the distance from which on it does.
     """
-    curve = pair.curve(subject)
+    curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
-    for distance in _DISTANCES:
+    for distance in distances:
         try:
-            known[float(distance)] = curve(float(distance))
+            known[distance] = curve(distance)
         except CalculatorError:
             if known:
                 break
     if not known:
         return None, None
-    places = list(known)
-    energy_far = known[places[0]][0] if places[0] == _DISTANCES[0] else None
+    energy_far = known[distances[0]][0] if distances[0] in known else None
 
     def felt(distance: float) -> bool:
         try:
@@ -289,16 +280,13 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
             return False
         return energy_far is None or max(abs(energy - energy_far), abs(force)) > 1e-12
 
-    inside = next((one for one in places if felt(one)), None)
-    if inside is None or inside == _DISTANCES[0]:
-        cutoff = None
-    else:
-        low, high = inside, float(_DISTANCES[list(_DISTANCES).index(inside) - 1])
+    cutoff, inside = None, next((one for one in known if felt(one)), distances[0])
+    if inside != distances[0]:
+        low, cutoff = inside, distances[distances.index(inside) - 1]
         for _ in range(4):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if felt(middle) else (low, middle)
-        cutoff = high
-    least = min((one for one in places if one > 0.8), key=lambda one: known[one][0])
+            middle = 0.5 * (low + cutoff)
+            low, cutoff = (middle, cutoff) if felt(middle) else (low, middle)
+    least = min((one for one in known if one > 0.8), key=lambda one: known[one][0])
     bound = energy_far is not None and known[least][0] < energy_far - 1e-9
     return cutoff, least if bound else None
 

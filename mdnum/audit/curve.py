@@ -9,7 +9,7 @@ the mismatch falls while one zooms in tells what is there, whatever the curve lo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
@@ -152,7 +152,6 @@ class Jump:
     energy: float
     force: float
     curvature: float
-    doubt: tuple[float, float, float]  # how large each of the three could look where nothing jumps
     # 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt
     order: int
     exact: bool  # whether low and high are neighbors among the doubles
@@ -241,15 +240,14 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
                 doubt += (high - low) * (_bend(curve, low, -1, room) + _bend(curve, high, 1, room))
     jumps, doubts = np.array([*values, curvature]).tolist(), np.array([*spread, doubt]).tolist()
     order = next((k for k in range(3) if abs(jumps[k]) > _SURE * doubts[k]), SMOOTH)
-    return Jump(low, high, jumps[0], jumps[1], jumps[2], (doubts[0], doubts[1], doubts[2]), order, exact)
+    return Jump(low, high, jumps[0], jumps[1], jumps[2], order, exact)
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
     """Power with which the force vanishes toward an edge beyond which it is zero; None where unclear.
 
     Args:
-        edge: where it ends, approached from below.
-        room: without another threshold below it.
+        edge: where it ends, approached from below through room without another threshold.
     """
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
@@ -379,7 +377,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
             break
     bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
     if len(bends) < 2 or bends[-1] < bends[-2] / _NARROWER**1.6:
-        return _third(curve, *place, room) if seconds >= _SEEN else []
+        return _third(curve, *place, room, float(noise[1])) if seconds >= _SEEN else []
     return _kink(curve, left, right, room)
 
 
@@ -424,12 +422,11 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
 
 
-def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """A place where the third derivative of the energy jumps, by the force's second from both sides.
 
-    Of several widths of the two pieces, the one at which half of it agrees best counts.
+    Of several widths of the two pieces, that at which half of it agrees best counts.
     """
-    noise = float(scatter(curve, left, right, room)[:, 1].max())
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]
     middle = 0.5 * (left + right)
@@ -448,8 +445,7 @@ def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
     bent, error = min(values, key=lambda one: one[1])
     if abs(bent) <= _SURE * error:
         return []
-    found = measure(curve, middle - reach, middle + reach, room, exact=False)
-    return [replace(found, order=SMOOTH, third=-bent)]
+    return [Jump(middle - reach, middle + reach, 0.0, 0.0, 0.0, SMOOTH, False, -bent)]
 
 
 def _same(one: Jump, other: Jump) -> bool:

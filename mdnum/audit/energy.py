@@ -9,8 +9,9 @@ a force that is not the energy's derivative.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from ase import Atoms
@@ -166,8 +167,7 @@ def account(
 
     Args:
         subject: another object than the run's; asked three times for each crossing and once more.
-        step: at its end.
-        crossed: those of this step, by their share.
+        crossed: those of the step that ends with this number, by their share.
         smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
             force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
 
@@ -242,16 +242,18 @@ class HiddenJumps:
         return found
 
     @property
-    def rank(self) -> tuple[int, int] | None:
+    def rank(self) -> tuple[int, int]:
         """(k, at how many jumps the k-th and next neighbors change places), the most frequent k."""
-        counts = Counter(k for jump in self.jumps for k in {k for _, k in jump.ties})
-        return counts.most_common(1)[0] if counts else None
+        return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
-    def radius(self) -> tuple[float, int] | None:
+    def radius(self) -> tuple[float, int]:
         """(radius, at how many jumps a pair passes it), the most frequent pair threshold."""
-        counts = Counter(jump.radius for jump in self.jumps if jump.radius is not None)
-        return counts.most_common(1)[0] if counts else None
+        return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
+
+
+def _most_frequent(values: Iterable[Any]) -> tuple[Any, int]:
+    return next(iter(Counter(values).most_common(1)), (0, 0))
 
 
 def hidden_jumps(
@@ -264,7 +266,6 @@ def hidden_jumps(
     """Search the steps that leave most unexplained: is it all at single places of their way?
 
     Args:
-        probe: another object than the run's.
         rest: energy that each step leaves unexplained; nan where that is not known.
         crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
         noise: that an energy may differ by, eV.
@@ -372,7 +373,6 @@ def balance(
 
     Args:
         probe: another object than the run's.
-        limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
         noise: that an energy may differ by, eV.
     """
@@ -456,8 +456,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
     sums over blocks instead.
 
     Args:
-        time: after each increment.
-        increments: at least 16.
+        increments: at least 16, each before its time.
     """
     sums = [float(np.sum(block)) for block in np.array_split(increments, _BLOCKS)]
     whole = float(time[-1] - time[0])

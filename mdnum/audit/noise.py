@@ -97,10 +97,6 @@ def along_a_line(
 ) -> NoiseFloor:
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
-    Args:
-        atoms: with no threshold nearby.
-        rng: picks the line.
-
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
     """
@@ -187,14 +183,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """The largest change of the energy in other orders of the atoms, eV, and what rounding makes of it.
 
-    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise.
-
-    The rounding of a sum is drawn anew wherever its terms are others, while terms that are missing in another
-    order change smoothly along a line.
-
-    Args:
-        atoms: a structure away from thresholds.
-        noise: along a line there, in one order.
+    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise
+    along a line. The rounding of a sum is drawn anew wherever its terms are others, while terms that are
+    missing in another order change smoothly along a line.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -207,7 +198,7 @@ def order_change(
             answers = [in_order(there, atoms, order) for order in orders]
     except CalculatorError:
         return 0.0, none  # reported elsewhere
-    energy, force = np.max([differences(base, answer) for answer in answers], axis=0)
+    energy, force = np.array([differences(base, answer) for answer in answers]).max(axis=0)
     allowed, total = noise.allowed, count * largest(base[1])
     quiet = energy <= min(allowed.energy, _NOISY * np.spacing(abs(base[0]))) and force <= allowed.force
     size = total * float(np.ptp(atoms.positions, axis=0).max()) + abs(base[0])
@@ -256,12 +247,9 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """The largest change of energy and of a force component when all atoms are moved at random.
+    """The largest change of energy and of a force component when all atoms are moved at random by some Å.
 
-    Rounding coordinates of another image or of a turned structure moves atoms like this.
-
-    Args:
-        size: of the moves, Å: of the order of an ulp of the largest coordinate.
+    Rounding coordinates of another image or of a turned structure moves atoms by an ulp of the largest.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(_DRAWS):
@@ -414,18 +402,12 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     if loud and smooth:  # forces alone have lost what the energy they belong to still has
         severity = "error" if share > _SMALL else "warning"
     yield finding(
-        "LOW_PRECISION",
-        severity,
+        "LOW_PRECISION", severity,
         ("order_format" if whose in ("answers", "energies") else "order") if summed else None,
         "format" if whose else "forces" if smooth and not summed else None,
-        tests=("rounding",),
-        change=change,
-        whose=whose,
-        format=narrow[whose] if whose else None,
-        energy=noise.energy,
-        ulps=float(ulps),
-        digits=round(max(-np.log10(max(share, eps)), 0)),
-    )
+        tests=("rounding",), change=change, whose=whose, format=narrow[whose] if whose else None,
+        energy=noise.energy, ulps=float(ulps), digits=round(max(-np.log10(max(share, eps)), 0)),
+    )  # fmt: skip
 
 
 def _quantized(
@@ -443,12 +425,7 @@ def _quantized(
         bound = 0.5 * sizes["forces"] or 2.0 ** -read["forces"].bits * typical
         values["forces_share"] = sizes["forces"] / typical
     return finding(
-        "QUANTIZED",
-        "error" if bound > _SMALL * typical else "warning",
-        *variants,
-        **values,
-        length=stairs.length,
-        points=len(stairs.energies),
-        different=len(np.unique(stairs.energies)),
+        "QUANTIZED", "error" if bound > _SMALL * typical else "warning", *variants, **values,
+        length=stairs.length, points=len(stairs.energies), different=len(np.unique(stairs.energies)),
         share=stairs.share,
-    )
+    )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +24,7 @@ class WrongPlaces:
 
     places: tuple[int, ...]
     count: int  # of atoms
-    energy: float  # the largest change of the energy when an atom comes to such a place, eV
-    force: float  # of a force component, eV/Å
+    energy: bool  # whether the energy is another one there, or forces alone
 
     @property
     def pattern(self) -> str:
@@ -48,19 +48,14 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     any order of the atoms; what depends on all of the order, such as neighbors that are dropped, shows
     nearly everywhere or elsewhere in another order.
 
-    Args:
-        allowed: what an answer may differ by.
-
     Returns:
-        None where no place stands out, or nearly all do.
+        None where no place stands out by more than is allowed, or nearly all do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
-        with subject.trying():
-            try:
-                subject.known[key] = _wrong_places(subject, atoms, allowed)
-            except CalculatorError:
-                subject.known[key] = None
+        subject.known[key] = None
+        with suppress(CalculatorError), subject.trying():
+            subject.known[key] = _wrong_places(subject, atoms, allowed)
     return subject.known[key]
 
 
@@ -68,52 +63,45 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
     rng, count = np.random.default_rng(0), len(atoms)
     ends = [*range(min(count, 17)), *range(max(count - 8, 0), count)]
     places = list(dict.fromkeys([*ends, *rng.permutation(count)[: _PLACES - len(ends)].tolist()]))
-    found: list[dict[int, tuple[float, float]]] = []
-    for order in (np.arange(count), rng.permutation(count)):
-        there = atoms[order]
-        assert isinstance(there, Atoms)
-        changes = _at_places(subject, there, places, allowed)
-        if changes is None:
-            return None
-        found.append(changes)
-    wrong = [{place for place, change in one.items() if _matters(change, allowed)} for one in found]
+    orders = np.arange(count), rng.permutation(count)
+    found = [_at_places(subject, atoms, order, places, allowed) for order in orders]
     # where both orders tried a place, they must agree on it
     tried = found[0].keys() & found[1].keys()
-    if wrong[0] & tried != wrong[1] & tried or not wrong[0] & tried:
+    wrong = [sorted(place for place in tried if any(one[place])) for one in found]
+    if wrong[0] != wrong[1] or not wrong[0]:
         return None
-    right = sorted(wrong[0] & tried)
-    energy, force = np.max([one[place] for one in found for place in right], axis=0)
-    return WrongPlaces(tuple(right), count, energy if energy > allowed.energy else 0.0, force)
-
-
-def _matters(change: tuple[float, float], allowed: NoiseFloor) -> bool:
-    return change[0] > allowed.energy or change[1] > allowed.force
+    return WrongPlaces(tuple(wrong[0]), count, any(one[place][0] for one in found for place in wrong[0]))
 
 
 def _at_places(
-    subject: CalculatorSubject, atoms: Atoms, places: Sequence[int], allowed: NoiseFloor
-) -> dict[int, tuple[float, float]] | None:
-    """What changes when the atom in a place is exchanged with one in an ordinary place of its species."""
-    base, found = subject.fresh().both(atoms), {}
+    subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
+) -> dict[int, tuple[bool, bool]]:
+    """Whether energy and forces change when an atom is exchanged with an ordinary one of its species.
 
-    def exchanged(one: int, other: int) -> tuple[float, float]:
-        order = np.arange(len(atoms))
-        order[[one, other]] = other, one
-        return differences(base, in_order(subject.fresh(), atoms, order))
+    Returns:
+        for each place that was tried; none at all where most places of a species are no ordinary ones.
+    """
+    numbers, found = atoms.numbers[order], {}
+    base = in_order(subject.fresh(), atoms, order)
 
-    for number in set(atoms.numbers.tolist()):
-        same = [place for place in places if atoms.numbers[place] == number]
-        if len(same) < 3:
-            continue
-        for ordinary in same[:: max(len(same) // _CANDIDATES, 1)][::-1]:
+    def exchanged(one: int, other: int) -> tuple[bool, bool]:
+        there = order.copy()
+        there[[one, other]] = order[[other, one]]
+        energy, force = differences(base, in_order(subject.fresh(), atoms, there))
+        return energy > allowed.energy, force > allowed.force
+
+    for number in set(numbers.tolist()):
+        same = [place for place in places if numbers[place] == number]
+        for ordinary in same[:: max(len(same) // _CANDIDATES, 1)][::-1] if len(same) > 2 else ():
             others = [place for place in same if place != ordinary]
             few = others[:: max(len(others) // 4, 1)]
             # between ordinary places an exchange changes nothing, and most places are ordinary
-            if 2 * sum(_matters(exchanged(place, ordinary), allowed) for place in few) <= len(few):
+            if 2 * sum(any(exchanged(place, ordinary)) for place in few) <= len(few):
                 changes = {place: exchanged(place, ordinary) for place in others}
-                if 2 * sum(_matters(change, allowed) for change in changes.values()) <= len(others):
-                    found |= {ordinary: (0.0, 0.0), **changes}
+                if 2 * sum(map(any, changes.values())) <= len(others):
+                    found |= {ordinary: (False, False), **changes}
                     break
         else:
-            return None
+            if len(same) > 2:
+                return {}
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,7 @@ _WAYS = (
     "Give package.module:Class(argument=value), the path of a Python file that makes a calculator, "
     "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
 )
+_SCRIPT: str = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["script"]
 #: Where structures are kept that show a finding.
 STRUCTURES = "structures"
 
@@ -184,35 +186,11 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
     Args:
         words: the calculator as it was named.
         pairs: names of structures without "-before" and "-after".
-        units: of the calculator.
     """
     return _SCRIPT.format(
         making="\n".join(_making(words)), pairs=list(pairs), folder=STRUCTURES, energy=units.energy,
         force=f"{units.energy}/{units.length}",
     )  # fmt: skip
-
-
-_SCRIPT = '''"""Two ways of writing down one structure, and the calculator's answers to each; run it here."""
-
-import numpy as np
-from ase.io import read
-
-{making}
-
-
-for name in {pairs!r}:
-    found = []
-    for when in ("before", "after"):
-        atoms = read(f"{folder}/{{name}}-{{when}}.extxyz")
-        atoms.calc = make()
-        found.append((float(atoms.get_potential_energy()), atoms.get_forces()))
-    (first, forces), (second, others) = found
-    second /= len(others) // len(forces)
-    print(f"{{name}}: {{first!r}} and {{second!r}} {energy}, differ by {{second - first:.3g}} {energy}")
-    # the largest force has no direction and no order
-    largest, other = (np.linalg.norm(one, axis=1).max() for one in (forces, others))
-    print(f"    largest force {{largest!r}} and {{other!r}} {force}")
-'''
 
 
 def _making(words: str) -> list[str]:

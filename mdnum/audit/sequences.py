@@ -30,12 +30,9 @@ class SequenceStep(NamedTuple):
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
     """Sequences that begin with a structure, by name; those without anything in them left out."""
     sequences = {
-        "sizes": _sizes(atoms, rng),
-        "a slow drift": _slow_drift(atoms, rng),
-        "two atoms head on": _head_on(atoms),
-        "strain": _strain(atoms),
-        "wrapping": _wrapping(atoms, rng),
-    }
+        "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
+        "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
+    }  # fmt: skip
     made = {name: [SequenceStep(*step) for step in sequence] for name, sequence in sequences.items()}
     return {name: sequence for name, sequence in made.items() if sequence}
 
@@ -77,49 +74,49 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
     """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
-    there = atoms
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
-    yield "the structure", there
-    for number in range(12):
+    yield "the structure", atoms
+    for number in range(1, 13):
         # there and back, so that atoms do not run into one another
-        there = displaced(there, (0.04 if number < 6 else -0.04) * heading)
-        yield f"all atoms moved by 0.04 Å, {number + 1} times", there
+        there = displaced(atoms, 0.04 * min(number, 12 - number) * heading)
+        yield f"all atoms moved by 0.04 Å, {number} times", there
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
     """One atom, then two, move toward another in steps: what a criterion without its half misses."""
     if len(atoms) < 2:
         return
-    yield "the structure", atoms
     distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
-    other = 1 + int(np.argmax(np.linalg.norm(distances, axis=1)))
-    line = distances[other - 1] / np.linalg.norm(distances[other - 1])
-    for moving, word in (((0,), "one atom"), ((0, other), "two atoms")):
-        there = atoms
-        for number in range(5):
-            step = np.zeros((len(atoms), 3))
-            for who in moving:
-                step[who] = (0.09 if who == 0 else -0.09) * line
-            there = displaced(there, step)
-            yield f"{word} moved by 0.09 Å toward another, {number + 1} times", there
+    lengths = np.linalg.norm(distances, axis=1)
+    other = int(np.argmax(lengths))
+    step = np.zeros((len(atoms), 3))
+    step[0] = 0.09 * distances[other] / lengths[other]
+    for words in ("one atom", "two atoms"):
         yield "the structure", atoms
+        for number in range(1, 6):
+            there = displaced(atoms, number * step)
+            yield f"{words} moved by 0.09 Å toward another, {number} times", there
+        step[1 + other] = -step[0]
+    yield "the structure", atoms
 
 
 def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
     """The cell changes with the atoms, and without them."""
     if not atoms.pbc.any():
         return
-    yield "the structure", atoms
-    for scaled, word in ((True, "cell and atoms"), (False, "the cell alone")):
-        there = atoms
-        for number in range(4):
-            there = there.copy()
-            there.set_cell(there.cell.array * 0.985, scale_atoms=scaled)
-            yield f"{word} shrank by 1.5 %, {number + 1} times", there
+
+    def strained(matrix: np.ndarray, scaled: bool = True) -> Atoms:
+        there = atoms.copy()
+        there.set_cell(atoms.cell.array @ matrix, scale_atoms=scaled)
+        return there
+
+    for scaled, words in ((True, "cell and atoms"), (False, "the cell alone")):
         yield "the structure", atoms
-    sheared = atoms.copy()
-    sheared.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]), scale_atoms=True)
+        for number in range(1, 5):
+            yield f"{words} shrank by 1.5 %, {number} times", strained(0.985**number * np.eye(3), scaled)
+    yield "the structure", atoms
+    sheared = strained(np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]))
     yield "cell and atoms were sheared by 5 %", sheared
     yield "the structure", atoms
 
@@ -142,7 +139,7 @@ def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Ato
 def _scaled(atoms: Atoms, factor: float) -> Atoms:
     there = atoms.copy()
     there.set_cell(factor * atoms.cell.array)
-    there.positions = factor * atoms.positions
+    there.positions *= factor
     return there
 
 

@@ -46,13 +46,14 @@ def read_structure(words: str | Path) -> Atoms:
     with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
         chosen = list(ase_images(path, which))
     if len(chosen) != 1:
+        several = f"means {len(chosen)} structures, and an audit is about one structure"
         raise InputError(
-            f"means {len(chosen)} structures, and an audit is about one structure",
+            several if chosen else f"cannot be read: the file has no structure {which}",
             where=text,
             remedy="Name one by its number: file@0 is the first, file@-1 the last",
         )
     atoms = chosen[0]
-    if not isinstance(atoms, Atoms) or len(atoms) == 0:
+    if not len(atoms):
         raise InputError("holds no atoms", where=text, remedy="Name another file, or another index: file@0")
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():
@@ -235,12 +236,11 @@ def group(atoms: Atoms) -> int | None:
     bonded, by their covalent radii, and to no others.
     """
     numbers = atoms.numbers
-    for size in range(2, len(atoms) // 2 + 1):
-        if len(atoms) % size == 0 and np.array_equal(numbers[size:], numbers[:-size]):
-            if len(set(numbers[:size])) == 1:
-                return None
-            expected = np.arange(len(atoms)).reshape(-1, size)
-            found = sorted(molecules(atoms), key=lambda one: one[0])
-            alike = len(found) == len(expected) and all(map(np.array_equal, found, expected))
-            return size if alike else None
-    return None
+    if len(set(numbers)) < 2:
+        return None
+    found = sorted(molecules(atoms), key=lambda one: one[0])
+    size = len(found[0])
+    species = np.resize(numbers[:size], len(numbers))
+    if size < 2 or len(found) < 2 or not np.array_equal(species, numbers) or len(set(species[:size])) == 1:
+        return None
+    return size if all(np.array_equal(one, one[0] + np.arange(size)) for one in found) else None

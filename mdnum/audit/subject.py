@@ -26,9 +26,6 @@ from mdnum.units import METAL, Units
 _MOST_SAVED = 20
 #: k_B times 300 K, eV.
 _ROOM_TEMPERATURE = 0.025852
-#: Of two energies of one structure: differences of their difference that rounding explains, of doubles and of
-#: numbers of single precision.
-_ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
 #: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
 #: answers to one question that differ by more are no rounding.
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
@@ -55,15 +52,6 @@ class RepeatCounts:
     typical: float = 0.0  # root mean square force where forces were compared last, eV/Å
 
 
-@dataclass
-class EnergyOffset:
-    """By how much the two energies of a calculator differ for one composition."""
-
-    formula: str
-    first: float  # energy minus free energy where it was asked for first, eV
-    change: float = 0.0  # the largest change of it that rounding does not explain, eV; signed
-
-
 class Repeats:
     """A few numbers of each answer of all objects of a calculator, compared where a question recurs.
 
@@ -71,28 +59,16 @@ class Repeats:
         new: what new objects answered to the first question they were asked: nothing can be remembered there.
         chance: answers that stuck out, asked for again of the same object; of those that differ, the ones
             that rounding does not explain, and the largest difference of a force component.
-        offsets: the difference of two energies by composition.
     """
 
     def __init__(self):
         self.new, self.chance = RepeatCounts(), RepeatCounts()
-        self.offsets: dict[bytes, EnergyOffset] = {}
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
-
-    def offset(self, atoms: Atoms, value: float, other: float) -> None:
-        """Take note of the energy that forces belong to, and of the one that a run logs."""
-        key = np.sort(atoms.numbers).tobytes()
-        kept = self.offsets.setdefault(key, EnergyOffset(atoms.get_chemical_formula(), other - value))
-        single = float(np.float32(value)) == value and float(np.float32(other)) == other
-        rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(abs(value), abs(other))
-        change = other - value - kept.first
-        if abs(change) > max(rounding, abs(kept.change)):
-            kept.change = change
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
         """Take note of what a new object (its number `which`) answered to its first question."""
-        bits = hashlib.blake2b(b"|".join(array.tobytes() for array in _bits(atoms)), digest_size=16)
-        before, first = self._known.setdefault((bits.digest(), what), (value, which))
+        key = hashlib.blake2b(b"|".join(array.tobytes() for array in bits(atoms)), digest_size=16)
+        before, first = self._known.setdefault((key.digest(), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
             self.new.differ += 1
@@ -117,12 +93,7 @@ class Repeats:
 
 
 def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
-    """Whether an answer that ought to be another one differs from it by more than any rounding.
-
-    Args:
-        change: of the energy, eV.
-        force: change of a force component, eV/Å.
-    """
+    """Whether a change of the energy (eV) or of a force component (eV/Å) is more than any rounding."""
     energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
@@ -142,9 +113,7 @@ def not_repeatable(
 
     Args:
         how: it came up, a variant of the sentences.
-        energy: by which answers differ, eV.
-        force: by which they differ, eV/Å.
-        typical: root mean square force, eV/Å.
+        energy, force: by which answers differ, eV and eV/Å; typical: root mean square force, eV/Å.
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
@@ -172,7 +141,8 @@ class CalculatorSubject:
     representable distances near an atom at the origin: where the bits differ, the cache is dropped first.
     Bits that do not differ are answered from the cache, so that energy and forces cost one calculation;
     `forget` makes the next question a calculation. The calculator is attached to the atoms that it is asked
-    about, as in a run: some answer in no other way.
+    about, as in a run: some answer in no other way. Each question may raise a `CalculatorError`: the
+    calculator raised, or answered with nan, and the structure has been saved.
 
     Args:
         name: what the person called it.
@@ -247,20 +217,13 @@ class CalculatorSubject:
         self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
-        """Potential energy in eV: the one the forces belong to where the calculator knows two.
-
-        Raises:
-            CalculatorError: the calculator raised, or answered with nan; the structure has been saved.
-        """
+        """Potential energy in eV: the one the forces belong to where the calculator knows two."""
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """(the energy that forces belong to, the one that a run logs), eV.
 
         ASE calls the first `free_energy` and the second `energy`; None where the calculator knows one alone.
-
-        Raises:
-            CalculatorError: as for `energy`.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -268,16 +231,10 @@ class CalculatorSubject:
         assert energy is not None
         if self._seen == 1:
             self.repeats.compare(asked, self._object, "energy", energy)
-        if other is not None:
-            self.repeats.offset(asked, energy, other)
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Forces in eV/Å.
-
-        Raises:
-            CalculatorError: as for `energy`, or forces of another shape than the positions.
-        """
+        """Forces in eV/Å; of another shape than the positions they raise as well."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -331,9 +288,6 @@ class CalculatorSubject:
 
         Returns:
             Whether the answer is another one by more than rounding.
-
-        Raises:
-            CalculatorError: as for `energy`.
         """
         repeats, chance = self.repeats, self.repeats.chance
         if not repeats.asks_again:
@@ -355,36 +309,11 @@ class CalculatorSubject:
             chance.typical = rms(now[1])
         return True
 
-    def returned(self, atoms: Atoms) -> dict[str, Any]:
-        """The very objects that the calculator gives back and keeps, by name; elsewhere copies are given.
-
-        Raises:
-            CalculatorError: as for `energy`.
-        """
-        asked = self._ask(atoms)
-        energies = self._answer(lambda: self._energies(asked), asked, "energy")
-        found = {"energy": energies[0], "forces": self._answer(asked.get_forces, asked, "forces")}
-        results = getattr(self.calculator, "results", None)
-        return found | ({f"results[{key!r}]": results[key] for key in results} if results else {})
-
-    def writes(self, atoms: Atoms) -> list[str]:
-        """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
-
-        Raises:
-            CalculatorError: as for `energy`.
-        """
-        self.forget()
-        asked = self._ask(atoms)
-        self._answer(lambda: self._energies(asked), asked, "energy")
-        self._answer(asked.get_forces, asked, "forces")
-        both = zip(("positions", "numbers", "cell", "periods"), _bits(atoms), _bits(asked), strict=True)
-        return [word for word, before, after in both if before.tobytes() != after.tobytes()]
-
     def _ask(self, atoms: Atoms) -> Atoms:
         asked = _bare(atoms) if self.copies else atoms
-        bits = _bits(asked)
+        now = bits(asked)
         same = self._last is not None and all(
-            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(bits, self._last, strict=True)
+            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(now, self._last, strict=True)
         )
         if not same:
             if self.forgets and self._nearly(asked):
@@ -392,7 +321,7 @@ class CalculatorSubject:
             self.meter.count()
         calculator = self.calculator
         self._seen += not same or self._seen == 0
-        self._last = bits
+        self._last = now
         self._answer(lambda: setattr(asked, "calc", calculator), asked, "an answer")
         return asked
 
@@ -486,7 +415,8 @@ def rms(forces: np.ndarray) -> float:
     return float(np.sqrt(np.mean(forces**2))) if forces.size else 0.0
 
 
-def _bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
+def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
+    """Positions, numbers, cell and periods, which stay as they are where the atoms change."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from mdnum.audit.base import CalculatorError, Progress, Ways
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
-from mdnum.audit.noise import digits
+from mdnum.audit.noise import digits, in_order
 from mdnum.audit.structures import Pair, molecules, whole
 from mdnum.audit.subject import CalculatorSubject, differences
 from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
@@ -163,7 +163,6 @@ def walk_surroundings(
     """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
 
     Args:
-        ways: counts crossings and routes.
         crossings: of known thresholds in the structure that are measured.
         routes: through the structure on which others are searched.
     """
@@ -369,15 +368,12 @@ class Crowd:
     # whether it is their number: with one of the others out of reach, the same place shows no jump
     by_number: bool
     order: CrowdOrder
-    # (k, largest force jump) for each tie with the k-th neighbor that was tried
-    jumps: tuple[tuple[int, float], ...]
 
 
 def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
     """Crowd an atom of each species that the calculator takes alone.
 
     Args:
-        ways: counts them.
         most: neighbors given to the center.
 
     Returns:
@@ -468,13 +464,11 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     floor = np.maximum(rounding * np.maximum(forces, np.median(forces)), 1e-14)
     floor = np.maximum(floor, 4 * np.sqrt(3) * quantum[1] / _SURE)
     noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
-    jumps: list[tuple[int, float]] = []
     over: list[tuple[int, float, float]] = []
     for k, place in enumerate(distances):
         if k >= ties and k + 1 not in _HABITUAL:
             continue
         energy, force = change(place)
-        jumps.append((k + 1, float(force.max())))
         sure = force > _SURE * noise_force
         if energy > _SURE * noise_energy or sure.any():
             over.append((k + 1, energy, float(force[sure].max()) if sure.any() else 0.0))
@@ -493,7 +487,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     return Crowd(
         walk.pair.species[0], radius, count, kept, energy, force,
         float(distances[kept - 1]) if kept else float("nan"), by_number,
-        _order(subject, walk, radius, count), tuple(jumps),
+        _order(subject, walk, radius, count),
     )  # fmt: skip
 
 
@@ -531,9 +525,7 @@ def _permuted(
     rng = np.random.default_rng(2)
     worst = np.zeros(2)
     for order in (np.arange(count + 1)[::-1], rng.permutation(count + 1), rng.permutation(count + 1)):
-        other = atoms.copy()[order]
-        assert isinstance(other, Atoms)
-        worst = np.maximum(worst, differences((energy, forces[order]), subject.both(other)))
+        worst = np.maximum(worst, differences((energy, forces), in_order(subject, atoms, order)))
     # terms are at most as large as their sum is where the crowd repels; rounding of float32 is allowed
     total = np.abs(forces).sum()
     scale = np.array([total * np.ptp(atoms.positions, axis=0).max() + abs(energy), total])

@@ -37,7 +37,7 @@ from mdnum.audit.subject import CalculatorSubject
 STEP = 0.025
 #: For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
 #: that stands out of it. A pair whose share is less than the fewest is not walked.
-_CALLS, _FEWEST_CALLS, WALKING_CALLS = 4000, 900, 4300
+_CALLS, _FEWEST_CALLS, WALKING_CALLS = 4200, 900, 4700
 #: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
 STEPS = 2.5
 #: Distances are walked down to where two particles cost so many kT.
@@ -77,7 +77,6 @@ class PairThreshold:
     order: int  # the lowest derivative of the energy that jumps, 0 for the energy itself; 6 or smoother is 6
     # of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before
     jumps: tuple[float, float, float]
-    doubt: tuple[float, float, float]  # how large each of them could look where nothing jumps
     inside: float  # the last distance before it that gives another answer
     outside: float  # the first one beyond it; the next double where a value jumps
     dies: bool  # whether the two do not interact beyond it
@@ -96,10 +95,6 @@ class Beyond:
     reached: float  # the farthest distance that was asked about, length
     force: float  # there, eV/Å
     left: float  # energy that is lost beyond it, as it decays there, eV; inf where it does not decay
-    nodes: Float[np.ndarray, "nodes"]  # distances asked about in all intervals
-    # energies, forces: there, eV and eV/Å
-    energies: Float[np.ndarray, "nodes"]
-    forces: Float[np.ndarray, "nodes"]
 
 
 @dataclass(frozen=True)
@@ -241,10 +236,6 @@ def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairW
     if pair.moves == "atom":
         thresholds = [one for one in thresholds if not _of_others(pair, one, thresholds)]
     values = curve.many(distance)
-    reach = distance[-1]
-    if further:
-        distance = np.append(distance, further.nodes)
-        values = np.hstack([values, np.array([further.energies, further.forces])])
     # forces are sums over the atoms of a particle
     quantum = digits(values[0]).quantum, len(pair.second) * digits(values[1]).quantum
     if any(quantum):
@@ -256,14 +247,14 @@ def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairW
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if ended and thresholds else None, left_out, len(curve.known),
-        quantum, knots, seen, further, float(reach),
+        quantum, knots, seen, further, float(distance[-1]),
     )  # fmt: skip
 
 
 def _at_jump(pair: Pair, jump: Jump) -> PairThreshold:
     return PairThreshold(
         jump.high if jump.exact else jump.at, pair.species, jump.order,
-        (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
+        (jump.energy, jump.force, jump.curvature), jump.low, jump.high, False,
         jump.high - jump.low, jump.third,
     )  # fmt: skip
 
@@ -363,7 +354,7 @@ def _with_end(
         order, third = SMOOTH, better[-1].third
         if better[-1].radius - edge[1] > better[-1].located:
             radius, located = better[-1].radius, better[-1].located
-    last = PairThreshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
+    last = PairThreshold(radius, pair.species, order, jumps, *edge, True, located, third)
     return [one for one in found if one not in same] + [last]
 
 
@@ -400,7 +391,7 @@ def _beyond(
         return None
     curve = (replace(pair, box=2.5 * _WIDEST) if pair.box else pair).curve(subject)
     farthest = min(start * _RATIO**_MOST, _WIDEST) if pair.box else start * _RATIO**_MOST
-    low, found, asked = start, [], [np.array([])]
+    low, found = start, []
     edge: tuple[float, float] | None = None
     left, force = np.inf, 0.0
     while low * _RATIO <= farthest:
@@ -425,7 +416,6 @@ def _beyond(
                     break
         except CalculatorError:
             break
-        asked.append(nodes)
         low, force = high, float(forces[-1])
         left = _left(nodes, forces)
         if left < _NOTHING * subject.kT:
@@ -440,9 +430,7 @@ def _beyond(
             found = _with_end(pair, curve, edge, found, max(low - 0.5, start))
         else:
             edge, left = None, 0.0
-    nodes = np.unique(np.concatenate(asked))[1:]
-    energies, forces = curve.many(nodes) if len(nodes) else np.zeros((2, 0))
-    return Beyond(tuple(found), edge, reached, force, left, nodes, energies, forces)
+    return Beyond(tuple(found), edge, reached, force, left)
 
 
 def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:

@@ -18,6 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum import units
+from mdnum.audit import base
+from mdnum.audit.causes import heads
+from mdnum.audit.checks import CHECKS
 from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import unknown
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from mdnum.audit.base import AuditCheck, CheckResult, Observed
     from mdnum.audit.record import AuditState
     from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
+    from mdnum.deadline import Deadline
 
 TEXTS = Texts(__file__)
 _SCRIPT = "reproduce.py"
@@ -135,13 +139,11 @@ def _ask_all(
     folder: RunFolder,
     loaded: LoadedCalculator,
     state: AuditState,
-    deadline: Any,
+    deadline: Deadline,
     report: bool,
     progress: Progress | None,
 ) -> Outcome:
     """Asks the checks that are not done, keeping each answer, and finishes the folder."""
-    from mdnum.audit.base import TIME_UP, TimeUp
-    from mdnum.audit.checks import CHECKS
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
 
@@ -173,11 +175,11 @@ def _ask_all(
                 raise
             state.why = "stopped"
             break
-        except TimeUp:
-            state.why = TIME_UP
+        except base.TimeUp:
+            state.why = base.TIME_UP
             break
         _keep_evidence(folder, loaded, check)
-        cut = any(reason == TIME_UP for _, reason in result.skipped)
+        cut = any(reason == base.TIME_UP for _, reason in result.skipped)
         if not result.asked and name in state.cut:  # its calls were used up: the brief form is what is known
             result = replace(state.cut[name], skipped=result.skipped)
         if brief or cut:
@@ -188,7 +190,7 @@ def _ask_all(
             state.results.append(result)
             state.cut.pop(name, None)
         if cut:
-            state.why = TIME_UP
+            state.why = base.TIME_UP
             break
         if name == "smoothness":
             state.thresholds = find_thresholds(subject)
@@ -209,23 +211,21 @@ def _ask_all(
 
 def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
-    from mdnum.audit.base import CalculatorError, CallsUp, CheckResult, finding
-
     named: dict[str, Any] = {"name": check.name, "title": check.title}
     try:
         return check(subject, log)
-    except CallsUp as up:
-        return CheckResult(
+    except base.CallsUp as up:
+        return base.CheckResult(
             (["calls_up"], {"calls": check.calls}), skipped=[(f"the rest of {check.name}", up.why)], asked=0,
             **named,
         )  # fmt: skip
-    except CalculatorError as error:
+    except base.CalculatorError as error:
         values = {"check": check.name, "why": error.message}
         values["file"] = error.structure.name if error.structure else ""
         saved = "saved" if error.structure else None
-        return CheckResult(
+        return base.CheckResult(
             (["failed"], values),
-            [finding("CALCULATOR_FAILED", "error", saved, **values)],
+            [base.finding("CALCULATOR_FAILED", "error", saved, **values)],
             skipped=[(f"the rest of {check.name}", error.message)],
             **named,
         )
@@ -259,11 +259,8 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
-    from mdnum.audit.base import in_order
-    from mdnum.audit.checks import CHECKS
-
     if checks is None:
-        return in_order(list(CHECKS))
+        return base.in_order(list(CHECKS))
     texts = (checks,) if isinstance(checks, str) else checks
     names = [name.strip() for text in texts for name in text.split(",") if name.strip()]
     for name in names:
@@ -271,7 +268,7 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
             raise unknown("check", name, CHECKS)
     if not names:
         raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
-    return in_order(list(dict.fromkeys(names)))
+    return base.in_order(list(dict.fromkeys(names)))
 
 
 def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
@@ -301,7 +298,7 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
     return _loaded(state.name if calculator is None else calculator)
 
 
-def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, deadline: Any) -> Atoms:
+def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, deadline: Deadline) -> Atoms:
     from ase import Atoms
 
     from mdnum.audit.building import default_structure
@@ -330,45 +327,35 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
-    from mdnum.audit.base import TIME_UP, answers, to_come
-
     atoms, given = state.atoms, units.get(state.units)
-    said = answers(state.shown, state.checks)
+    said = base.answers(state.shown, state.checks)
     why = state.why or "not finished"
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
     rest = [{"what": f"the check of {name}", "why": why, "part": name} for name in left]
-    found = [(one, one.name) for one in state.shown]
-    early = frame.UNDECIDED if to_come(state.shown, state.checks) else frame.PARTIAL
-    status = {"stopped": "stopped", TIME_UP: early}.get(state.why, "unfinished")
+    rest += [{"what": what, "why": why, "part": one.name} for one in state.shown for what, why in one.skipped]
+    early = frame.UNDECIDED if base.to_come(state.shown, state.checks) else frame.PARTIAL
+    status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
     status = "complete" if state.during is None else status
     return _in_units(
         {
-            "system": state.name,
-            "calculator": state.name,
-            "atoms": len(atoms),
-            "formula": atoms.get_chemical_formula(),
-            "periodic": atoms.pbc.tolist(),
-            "structure": atoms.info.get("origin"),
-            "kT": state.kT,
-            "units": state.units,
-            "safe_to_run": said["run"],
-            "safe_to_differentiate": said["differentiate"],
+            "system": state.name, "calculator": state.name, "atoms": len(atoms),
+            "formula": atoms.get_chemical_formula(), "periodic": atoms.pbc.tolist(),
+            "structure": atoms.info.get("origin"), "kT": state.kT, "units": state.units,
+            "safe_to_run": said["run"], "safe_to_differentiate": said["differentiate"],
             "parts": [
                 {
                     "name": one.name, "title": one.title, "says": _says(one), "tables": one.tables,
                     "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
                     "seconds": one.seconds,
                 }
-                for one, _ in found
+                for one in state.shown
             ],
-            "left_out": rest
-            + [{"what": what, "why": why, "part": name} for one, name in found for what, why in one.skipped],
+            "left_out": rest,
             "causes": [
                 {"code": head.code, "below": [one.code for one in below]}
                 for head, below in _by_cause([one for each in state.shown for one in each.findings])
             ],
-            "status": status,
-            "seconds": state.seconds,
+            "status": status, "seconds": state.seconds,
         },
         given,
     )  # fmt: skip
@@ -415,8 +402,6 @@ def _says(result: CheckResult) -> str:
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
     """(finding, those that may follow from it) of each that is listed by itself."""
-    from mdnum.audit.causes import heads
-
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])
@@ -453,10 +438,8 @@ class AuditView(View):
 
 def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
-    from mdnum.audit.base import concluded
-
     state = view.state
-    given, titles, more = units.get(state.units), {}, concluded(state.shown)
+    given, titles, more = units.get(state.units), {}, base.concluded(state.shown)
     observed = []
     for result in state.shown:
         # what a check has said by itself goes before what several say together
@@ -476,9 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    from mdnum.audit.base import CALLS_UP, TIME_UP, answers, largely_unasked, to_come
-
-    said, formula = answers(state.shown, state.checks), state.atoms.get_chemical_formula()
+    said, formula = base.answers(state.shown, state.checks), state.atoms.get_chemical_formula()
     name = TEXTS("on", name=state.name, formula=formula)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
     asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
@@ -496,10 +477,10 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
             TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name) for one in results
         ]
 
-    if state.shown and not asked and to_come(state.shown, state.checks):
+    if state.shown and not asked and base.to_come(state.shown, state.checks):
         head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
-        return _unfinished(state, head, TIME_UP)
-    rest = ", ".join([*ways(one for one in state.shown if largely_unasked(one)), *left])
+        return _unfinished(state, head)
+    rest = ", ".join([*ways(one for one in state.shown if base.largely_unasked(one)), *left])
     if rest:
         beside = "as far as asked" in said.values()
         head = TEXTS("with_rest_beside" if beside else "with_rest", head=head, rest=rest)
@@ -520,16 +501,16 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         head = TEXTS("found_nothing", head=head, checks=len(state.shown))
     else:
         head = TEXTS("nothing_asked", head=head)
-    refused = sum(why not in (TIME_UP, CALLS_UP) for one in state.shown for _, why in one.skipped)
+    refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in state.shown for _, why in one.skipped)
     head += " " + TEXTS("unasked", elements=listed(list(dict.fromkeys(state.atoms.symbols))))
     head += " " + TEXTS("refused", n=refused) if refused else ""
-    return _unfinished(state, head, TIME_UP)
+    return _unfinished(state, head)
 
 
-def _unfinished(state: AuditState, headline: str, time_up: str) -> str:
+def _unfinished(state: AuditState, headline: str) -> str:
     if state.during is None:
         return headline
-    name = {"stopped": "stopped", time_up: "time_up"}.get(state.why, "unfinished")
+    name = {"stopped": "stopped", base.TIME_UP: "time_up"}.get(state.why, "unfinished")
     return TEXTS(name, check=state.during, headline=headline)
 
 

@@ -37,7 +37,7 @@ def chain() -> Atoms:
 def subject(make: Callable[[], Any], atoms: Atoms | None = None, order: int | None = 4) -> CalculatorSubject:
     """The subject of an audit, with its cutoff as a walk finds it, of an order; None where it has none."""
     found = CalculatorSubject("planted", make, crystal() if atoms is None else atoms, kT=KT)
-    end = (R_CUT, ("Ar", "Ar"), order or 0, (0.0,) * 3, (0.0,) * 3, R_CUT, R_CUT, True, 1e-9)
+    end = (R_CUT, ("Ar", "Ar"), order or 0, (0.0,) * 3, R_CUT, R_CUT, True, 1e-9)
     found.known["thresholds"] = [] if order is None else [PairThreshold(*end)]
     return found
 

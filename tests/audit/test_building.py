@@ -50,6 +50,7 @@ SILICON = {"sigma": 2.1, "epsilon": 0.5, "rc": 5.0}
         ({"parameters": {"cutoff": 4.0, "atom_types": {"Al": 1, "Mg": 2}}}, "Al"),
         ({"atomic_numbers": np.array([26, 6])}, "Fe"),
         ({"model": type("Model", (), {"atomic_numbers": [79]})()}, "Au"),
+        ({"models": [type("Model", (), {"elements": ["Pt"]})()]}, "Pt"),
         ({"z_table": type("Table", (), {"zs": [22, 8]})()}, "Ti"),
         # many are meant for many: the usual ones first
         ({"elements": ["H", "He", "Li", "Be", "B", "Cu", "Si"]}, "Cu"),

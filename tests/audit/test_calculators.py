@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from mdnum.audit.base import TIME_UP, TimeUp, in_order, needed_to
 from mdnum.audit.building import default_structure
 from mdnum.audit.checks import CHECKS
-from mdnum.audit.checks.alone import Alone
+from mdnum.audit.checks.alone import AloneCheck
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.record import load_calculator
 from mdnum.audit.structures import read_structure
@@ -208,7 +208,9 @@ def test_who_fails_without_neighbors_gets_a_structure_and_a_finding(answer, rais
 
     atoms = default_structure(LoadedCalculator("lonely", "lonely", Lonely))
     assert cutoff < 6 or atoms.cell.lengths().min() > 2 * cutoff
-    assert code in codes(Alone(planted.subject(Lonely, atoms), atoms, NoiseFloor(1e-12, 1e-12)).findings())
+    found = AloneCheck()
+    found.look(planted.subject(Lonely, atoms), atoms, NoiseFloor(1e-12, 1e-12))
+    assert code in codes(found.findings())
 
 
 def test_who_never_answers_is_named_in_one_line_with_the_structure_saved():

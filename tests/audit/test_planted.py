@@ -16,7 +16,7 @@ from audit.planted import Good, Single, asked, but, chain, codes, crystal, decim
 
 from mdnum.audit.building import water
 from mdnum.audit.checks import CHECKS, invariance
-from mdnum.audit.checks.alone import Alone
+from mdnum.audit.checks.alone import AloneCheck
 from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.sequences import all_sequences
@@ -320,13 +320,24 @@ def test_a_planted_mistake_is_found(name: str, make, atoms: Atoms, expected: dic
         assert not {"TRANSLATION", "IMAGES", "FACES", "ORDER", "CELL_ULP"} & set(found)
 
 
-def test_an_energy_that_alone_is_cut_is_seen():
-    both, check = subject(planted.CutEnergy), SmoothnessCheck()
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (planted.CutEnergy, {"TWO_ENERGIES": "error"}),
+        # the difference changes, and not at once
+        (planted.Entropy, {}),
+        (planted.TwoEnergies, {}),
+    ],
+)
+def test_an_energy_that_alone_is_cut_is_seen_where_thresholds_are_known(make, expected):
+    """Forces are asked before, and know of no threshold."""
+    check = SmoothnessCheck()
     check.neighbors, check.routes = 8, 0
-    assert not codes(check(both))
-    result = CHECKS["forces"]()(both)
-    assert codes(result) == {"TWO_ENERGIES": "error"}
-    assert "between Ar-Ar at 3.4 Å, by 0.01 eV" in values(result, "TWO_ENERGIES")["places"]
+    result = check(subject(make))
+    assert codes(result) == expected
+    if expected:
+        told = values(result, "TWO_ENERGIES")
+        assert told["places"] == "between Ar-Ar at 3.4 Å, by 0.01 eV" and told["variants"] == ["wrong"]
 
 
 @pytest.mark.parametrize(("name", "what"), [("invariance", "lattice"), ("state", "sheared")])
@@ -415,7 +426,8 @@ def test_ases_own_remember_nothing(make, atoms: Atoms):
 
 @pytest.mark.parametrize("make", [TIP3P, TIP4P])
 def test_who_knows_whole_molecules_alone_is_asked_about_molecules_alone(make):
-    found = Alone(subject(make), water(4), NoiseFloor(1e-13, 1e-13))
+    found = AloneCheck()
+    found.look(subject(make), water(4), NoiseFloor(1e-13, 1e-13))
     assert not list(found.findings()) and not found.takes_atoms
     assert [row["atoms"] for row in found.rows] == ["one H2O", "two H2O 60 Å apart"]
 
@@ -425,7 +437,8 @@ def test_failing_on_an_atom_without_neighbors_is_found_where_the_cluster_has_one
     # the first twelve of them have holes between them
     atoms = crystal().repeat(2)[np.random.default_rng(1).permutation(64)]
     assert isinstance(atoms, Atoms)
-    found = Alone(subject(planted.EmptyList), atoms, NoiseFloor(1e-13, 1e-13))
+    found = AloneCheck()
+    found.look(subject(planted.EmptyList), atoms, NoiseFloor(1e-13, 1e-13))
     assert "cluster" in found.refused[-1][0] and codes(found.findings()) == {"LONELY_FAILS": "warning"}
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import product
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, finding
-from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
+from mdnum.audit.noise import FEW, NoiseFloor, settled
 from mdnum.audit.structures import molecules, nearest_distance, whole
-from mdnum.audit.subject import CalculatorSubject, Forces, largest
+from mdnum.audit.subject import CalculatorSubject, largest
 
 #: Å between two parts that cannot feel one another, and a cell that does not repeat around them: some lists
 #: take long over an empty one.
@@ -22,7 +21,13 @@ _EPS = np.finfo(float).eps
 
 
 class AloneCheck(AuditCheck):
-    """Do atoms without neighbors feel nothing, and do energies of parts far apart add up?"""
+    """Do atoms without neighbors feel nothing, and do energies of parts far apart add up?
+
+    Attributes:
+        rows: a row for each structure that was answered for.
+        refused: what was not, and why.
+        takes_atoms: whether the calculator answers for anything that is no whole molecule.
+    """
 
     name, title, order, calls = "alone", "Atoms alone", 48, 240
     needed_to = ("run",)
@@ -30,68 +35,66 @@ class AloneCheck(AuditCheck):
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Single atoms, and an atom far from a cluster."""
         with subject.meter.limited():
-            atoms, noise = settled(subject.fresh(), np.random.default_rng(self.seed), at_least=FEW)
-            alone = Alone(subject, atoms, noise)
-        self.structures |= alone.structures
-        found = list(alone.findings())
-        values = {"parts": len(alone.rows), "far": _FAR}
+            self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed), at_least=FEW))
+        found = list(self.findings())
         return CheckResult(
-            says=([f"alone_{'wrong' if found else 'right' if alone.rows else 'none'}"], values),
+            says=(
+                [f"alone_{'wrong' if found else 'right' if self.rows else 'none'}"],
+                {"parts": len(self.rows), "far": _FAR},
+            ),
             findings=found,
-            tables={"Atoms alone": alone.rows},
-            skipped=[(what, error.message) for what, error in alone.refused],
-            asked=max(len(alone.rows), 1),
-            possible=max(len(alone.rows), 1),
+            tables={"Atoms alone": self.rows},
+            skipped=[(what, error.message) for what, error in self.refused],
+            asked=max(len(self.rows), 1),
+            possible=max(len(self.rows), 1),
         )
 
-
-class Alone:
-    """Atoms without a neighbor: they feel no force, and energies of parts far apart add up.
-
-    Single atoms, two atoms far apart, and a cluster with an atom far away; molecules for calculators that
-    take nothing less.
-
-    Args:
-        subject: a new object is made for each question.
-        atoms: species, and the cluster.
-        noise: of the calculator.
-
-    Attributes:
-        rows: a row for each structure that was answered for.
-        refused: what was not, and why.
-        takes_atoms: whether the calculator answers for anything that is no whole molecule.
-        structures: on which it failed, by name.
-    """
-
-    def __init__(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor):
+    def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
+        """Ask, by a new object each, about parts of a structure; molecules where nothing less is taken."""
         self.rows: list[dict[str, Any]] = []
         self.refused: list[tuple[str, CalculatorError]] = []
-        self.structures: dict[str, Atoms] = {}
-        self._subject, self._noise = subject, noise
-        species = list(dict.fromkeys(atoms.symbols))
         single: dict[str, float] = {}
-        for symbol, periodic in product(species, (False, True)):
-            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
-            energy = self._ask(what, one, single.get(symbol))
-            if energy is not None:
-                single.setdefault(symbol, energy)
-        two = (species[0], species[-1])
-        pair = Atoms(two, positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]], cell=[_BOX] * 3)
-        expected = single[two[0]] + single[two[1]] if set(two) <= set(single) else None
-        self._ask(f"{two[0]} and {two[1]} {_FAR:g} Å apart", pair, expected)
-        if two[0] != two[1] and two[0] in single:
+
+        def energy(
+            what: str, there: Atoms, expected: float | None = None, lone: slice = slice(None), size: int = 1
+        ) -> float | None:
+            """Takes note of the energy, and of the forces on lone atoms (groups of this size, as a whole)."""
+            answer = subject.fresh().try_both(there)
+            if isinstance(answer, CalculatorError):
+                self.refused.append((what, answer))
+                if answer.cause is None:
+                    self.structures["alone-failed"] = there
+                return None
+            force = largest(answer[1].reshape(-1, size, 3).sum(axis=1)[lone])
+            expected = answer[0] if expected is None else expected
+            allowed = noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
+            self.rows.append({
+                "atoms": what, "energy (eV)": answer[0], "expected": expected, "force (eV/Å)": force,
+                "adds up": abs(answer[0] - expected) <= allowed.energy, "no force": force <= allowed.force,
+            })  # fmt: skip
+            return answer[0]
+
+        def total(*parts: float | None) -> float | None:
+            known = [part for part in parts if part is not None]
+            return sum(known) if len(known) == len(parts) else None
+
+        species = list(dict.fromkeys(atoms.symbols))
+        for symbol in species:
+            for where, periodic in (("", False), (" in a large periodic cell", True)):
+                one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
+                alone = energy(f"one {symbol} atom{where}", one, single.get(symbol))
+                if alone is not None:
+                    single.setdefault(symbol, alone)
+        first, last = species[0], species[-1]
+        sides = total(single.get(first), single.get(last))
+        energy(f"{first} and {last} {_FAR:g} Å apart", _apart(_boxed(Atoms(first)), Atoms(last)), sides)
+        if first != last and first in single:
             # who numbers species by what is there gives the last one other numbers without the first
-            near = 1.0 + nearest_distance(atoms)
-            both = Atoms([two[1]] * 2, positions=[[1.0, 2.0, 3.0], [near, 2.0, 3.0]], cell=[_BOX] * 3)
-            energy = self._ask(f"two {two[1]} atoms", both, None, lambda forces: forces[:0])
-            far = Atoms(two[0], positions=[[near + _FAR, 2.0, 3.0]], cell=[_BOX] * 3) + both
-            expected = None if energy is None else energy + single[two[0]]
-            self._ask(f"a {two[0]} atom {_FAR:g} Å from two {two[1]} atoms", far, expected, lambda f: f[:1])
-        cluster = atoms[: min(len(atoms), _CLUSTER)]
-        cluster.pbc = False
-        cluster.positions += 1.0 - cluster.positions.min(axis=0)
-        cluster.set_cell([_BOX + float(np.ptp(cluster.positions, axis=0).max())] * 3)
+            two = _boxed(Atoms([last] * 2, [[0, 0, 0], [nearest_distance(atoms), 0, 0]]))
+            together = total(energy(f"two {last} atoms", two, lone=slice(0)), single[first])
+            what = f"a {first} atom {_FAR:g} Å from two {last} atoms"
+            energy(what, _apart(two, Atoms(first)), together, slice(2, None))
+        cluster = _boxed(atoms[: min(len(atoms), _CLUSTER)])
         near = subject.fresh().try_both(cluster)
         failed = isinstance(near, CalculatorError)
         # one that knows whole molecules alone takes nothing of which an atom is gone; one that fails on an
@@ -101,44 +104,14 @@ class Alone:
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
         elif self.takes_atoms:
-            symbol = str(atoms.symbols[0])
-            far = cluster + Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-            expected = near[0] + single[symbol] if symbol in single else None
-            what = f"a {symbol} atom {_FAR:g} Å from a cluster"
-            self._ask(what, far, expected, lambda forces: forces[-1:])
+            both, what = _apart(cluster, Atoms(first)), f"a {first} atom {_FAR:g} Å from a cluster"
+            energy(what, both, total(near[0], single.get(first)), slice(-1, None))
         else:
-            one = whole(atoms, molecules(atoms)[0])
-            one.positions += [1.0, 2.0, 3.0]
-            one.set_cell([_BOX] * 3)
-            both, formula = one + displaced(one, np.array([_FAR, 0.0, 0.0])), one.get_chemical_formula()
+            one = _boxed(whole(atoms, molecules(atoms)[0]))
+            name, size = one.get_chemical_formula(), len(one)
             # within a molecule there are forces, on it as a whole there is none
-            felt = lambda forces: forces.reshape(-1, len(one), 3).sum(axis=1)  # noqa: E731
-            energy = self._ask(f"one {formula}", one, None, felt)
-            self._ask(f"two {formula} {_FAR:g} Å apart", both, energy and 2 * energy, felt)
-
-    def _ask(
-        self,
-        what: str,
-        atoms: Atoms,
-        expected: float | None,
-        felt: Callable[[Forces], np.ndarray] = np.asarray,
-    ) -> float | None:
-        """The energy of a structure, of which note is taken; without an expected one, only of its force."""
-        answer = self._subject.fresh().try_both(atoms)
-        if isinstance(answer, CalculatorError):
-            self.refused.append((what, answer))
-            if answer.cause is None:
-                self.structures["alone-failed"] = atoms
-            return None
-        energy, force = answer[0], largest(felt(answer[1]))
-        expected = energy if expected is None else expected
-        allowed = self._noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
-        self.rows.append({
-            "atoms": what, "energy (eV)": energy, "expected": expected, "force (eV/Å)": force,
-            "adds up": abs(energy - expected) <= allowed.energy,
-            "no force": force <= allowed.force,
-        })  # fmt: skip
-        return energy
+            alone = energy(f"one {name}", one, size=size)
+            energy(f"two {name} {_FAR:g} Å apart", _apart(one, one), total(alone, alone), size=size)
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""
@@ -154,3 +127,17 @@ class Alone:
             energies = f"{worst['energy (eV)']:.10g}", f"{worst['expected']:.10g}"
             values = {"what": worst["atoms"], "energy": energies[0], "expected": energies[1], "far": _FAR}
             yield finding("LONELY_ENERGY", "warning", **values)
+
+
+def _boxed(part: Atoms) -> Atoms:
+    """A part in a cell that does not repeat."""
+    there = Atoms(part.numbers, part.positions - part.positions.min(axis=0) + [1.0, 2.0, 3.0])
+    there.set_cell([_BOX + float(np.ptp(there.positions, axis=0).max())] * 3)
+    return there
+
+
+def _apart(part: Atoms, other: Atoms) -> Atoms:
+    """A part, and another one beyond its reach."""
+    there = other.copy()
+    there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
+    return part + there

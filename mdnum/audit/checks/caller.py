@@ -23,7 +23,7 @@ from mdnum.audit.base import (
     finding,
 )  # fmt: skip
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
-from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest
+from mdnum.audit.subject import CalculatorSubject, Forces, bits, differences, largest
 
 #: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
 _SEEDS = (271828, 314159)
@@ -43,20 +43,22 @@ class CallerCheck(AuditCheck):
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Every question, each with an object of its own."""
+        rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
-            atoms, noise = settled(subject.fresh(), np.random.default_rng(self.seed), at_least=FEW)
-        questions: list[tuple[str, Callable[[], Iterator[Observed]]]] = [
-            (f"{what} changed in place", partial(_edited, subject, atoms, noise, what, change))
-            for what, change in _changes(atoms, np.random.default_rng(self.seed))
-        ]
-        questions += [
-            ("arrays that were returned", partial(_buffers, subject, atoms, noise)),
-            ("the caller's random numbers", partial(_random, subject, atoms)),
-            ("the caller's atoms", partial(_written, subject, atoms)),
-        ]
+            atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
+        changes = _changes(atoms, np.random.default_rng(self.seed))
+        questions: dict[str, Callable[[], Iterator[Observed]]] = {
+            **{
+                f"{what} changed in place": partial(_edited, subject, atoms, noise, what, change)
+                for what, change in changes
+            },
+            "arrays that were returned": partial(_buffers, subject, atoms),
+            "the caller's random numbers": partial(_random, subject, atoms),
+            "the caller's atoms": partial(_written, subject, atoms),
+        }
         ways = Ways()
         found = ways.each(
-            subject, questions, lambda one: one[0], lambda one: list(one[1]()), progress, self.name,
+            subject, list(questions), str, lambda one: list(questions[one]()), progress, self.name,
             unit="questions", required=True, tolerant=True,
         )  # fmt: skip
         observed = [one for several in found.values() for one in several]
@@ -65,8 +67,7 @@ class CallerCheck(AuditCheck):
             worst = max(unseen, key=lambda one: one.values["force"])
             worst.values["changed"] = ", ".join(one.values["changed"] for one in unseen)
             observed = [worst, *(one for one in observed if one not in unseen)]
-        says = "caller_wrong" if observed else "caller_right"
-        return CheckResult(([says], {"questions": ways.asked}), observed, numbers={}, **vars(ways))
+        return CheckResult((["caller_wrong" if observed else "caller_right"], {}), observed, **vars(ways))
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
@@ -111,31 +112,29 @@ def _edited(
         yield finding("CHANGE_NOT_SEEN", "error", tests=("repeat", "fresh"), **values)
 
 
-def _buffers(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
+def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     """Arrays that were returned stay what they were, and writing to them changes no later answer."""
-    used = subject.fresh()
-    first = used.returned(atoms)
+    used, there = subject.fresh(), atoms.copy()
+    used.copies = False
+    used.both(there)
+    # what is given back, from the cache of the calculator, and what is kept in it
+    first: dict[str, Any] = {"energy": there.get_potential_energy(), "forces": there.get_forces()}
+    kept = getattr(used.calculator, "results", None) or {}
+    first |= {f"results[{key!r}]": value for key, value in kept.items()}
     before = {name: np.array(value, copy=True) for name, value in first.items()}
     used.both(displaced(atoms, 0.01 * np.arange(3 * len(atoms)).reshape(-1, 3) / len(atoms)))
-    changed = [name for name, value in first.items() if _bits(value) != _bits(before[name])]
-    own = [name for name in changed if not name.startswith("results")]
-    if changed:
-        yield finding(
-            "REUSED_BUFFER",
-            "error" if own else "info",
-            None if own else "kept",
-            what=" and ".join(own or changed),
-        )
-        return
-    forces = used.returned(atoms)["forces"]
-    if isinstance(forces, np.ndarray) and forces.flags.writeable:
-        forces += 1.0
-        if largest(used.forces(atoms) - before["forces"]) > 0.5:
-            yield finding("REUSED_BUFFER", "error", "written", what="forces")
-
-
-def _bits(value: Any) -> bytes:
-    return np.asarray(value).tobytes()
+    changed = [name for name, value in first.items() if np.asarray(value).tobytes() != before[name].tobytes()]
+    if own := [name for name in changed if not name.startswith("results")]:
+        yield finding("REUSED_BUFFER", "error", what=" and ".join(own))
+    elif changed:
+        yield finding("REUSED_BUFFER", "info", "kept", what=" and ".join(changed))
+    else:
+        used.both(there)
+        forces = there.get_forces()
+        if forces.flags.writeable:
+            forces += 1.0
+            if largest(used.forces(there) - before["forces"]) > 0.5:
+                yield finding("REUSED_BUFFER", "error", "written", what="forces")
 
 
 def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
@@ -147,47 +146,48 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     if torch := sys.modules.get("torch"):
         generators["torch"] = torch.get_rng_state, torch.set_rng_state, torch.manual_seed
     kept = [(put, get()) for get, put, _ in generators.values()]
-    # by the call of an object, the first one or another: states before and after it, for each seed
-    states: dict[str, list[dict[str, tuple[bytes, bytes]]]] = {"made": [], "asked": []}
+    # of each generator the states before and after the first call of an object and another, for each seed
+    states: dict[tuple[str, str], list[tuple[bytes, bytes]]] = {}
     try:
         for seed in _SEEDS:
             one = subject.fresh()
-            for seen in states.values():
+            for when in ("made", "asked"):
                 for _, _, start in generators.values():
                     start(seed)
                 before = [pickle.dumps(get()) for get, _, _ in generators.values()]
                 one.forget()
                 one.both(atoms)
-                after = [pickle.dumps(get()) for get, _, _ in generators.values()]
-                seen.append(dict(zip(generators, zip(before, after, strict=True), strict=True)))
+                for (name, (get, _, _)), state in zip(generators.items(), before, strict=True):
+                    states.setdefault((when, name), []).append((state, pickle.dumps(get())))
     finally:
         for put, state in kept:
             put(state)
-    told: tuple[tuple[str, Severity, int], ...] = (
-        ("asked", "error", 1), ("made", "warning", 1), ("drawn", "info", 2),
-    )  # fmt: skip
-    for when, severity, wanted in told:
-        first, second = states["made" if when == "made" else "asked"]
+    told: dict[str, tuple[str, Severity, bool]] = {
+        "asked": ("asked", "error", True),
+        "made": ("made", "warning", True),
+        "drawn": ("asked", "info", False),
+    }
+    for variant, (when, severity, seeded) in told.items():
+        pairs = {name: states[when, name] for name in generators}
         names = [
             name
-            for name in generators
-            if first[name][0] != first[name][1] and len({first[name][1], second[name][1]}) == wanted
+            for name, ((before, after), (_, other)) in pairs.items()
+            if before != after and (after == other) is seeded
         ]
         if names:
-            yield finding("RANDOM_SEEDED", severity, when, which=" and ".join(names))
+            yield finding("RANDOM_SEEDED", severity, variant, which=" and ".join(names))
             return
 
 
 def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
-    for there, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
-        other = subject.fresh()
-        try:
-            with other.trying():
-                changed = other.writes(there)
-        except CalculatorError:
+    for given, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
+        other, there = subject.fresh(), given.copy()
+        other.copies = False
+        if isinstance(other.try_both(there), CalculatorError):
             continue  # reported elsewhere
-        if changed:
+        both = zip(("positions", "numbers", "cell", "periods"), bits(given), bits(there), strict=True)
+        if changed := [word for word, before, after in both if before.tobytes() != after.tobytes()]:
             yield finding("CHANGED_INPUT", "error", what=what, changed=" and ".join(changed))
             return

@@ -67,44 +67,32 @@ class CurlCheck(AuditCheck):
             name, u, v = plane
             return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in radii])
 
-        name = lambda plane: f"a loop of {plane[0]}"  # noqa: E731
         found = ways.each(
-            worker,
-            wanted,
-            name,
-            asked,
-            progress,
-            self.name,
-            spread=True,
-            required=True,
-            most=1 if self.brief else None,
-        )
+            worker, wanted, lambda plane: f"a loop of {plane[0]}", asked, progress, self.name, spread=True,
+            required=True, most=1 if self.brief else None,
+        )  # fmt: skip
         loops = list(found.values())
         wrong = [one for one in loops if not one.conservative]
         worst = max(wrong, key=lambda one: one.share, default=None)
-        limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
+        # antisymmetric over symmetric part that may be there and is not seen
+        unseen = [(abs(one.curl) + one.error) / max(one.stiffness, 1e-300) for one in loops]
+        limit = loops[int(np.argmax(unseen))]
         numbers = {
             "loops": len(loops), "with_work": len(wrong),
             "largest_curl": max(abs(one.curl) for one in loops),
             "largest_share": max((one.share for one in wrong), default=0.0),
             "largest_error": max(one.error for one in loops),
-            # antisymmetric over symmetric part that may be there and is not seen, at the median loop
-            "unseen_share": float(
-                np.median([(abs(one.curl) + one.error) / max(one.stiffness, 1e-300) for one in loops])
-            ),
+            "unseen_share": float(np.median(unseen)),
         }  # fmt: skip
-        values: dict[str, Any] = {"loops": len(loops), "wrong": len(wrong)}
-        values |= {"limit": abs(limit.curl) + limit.error, "stiffness": limit.stiffness}
-        found = []
-        if worst:
-            values |= {
-                "radius": worst.radius, "plane": worst.plane, "work": worst.work, "curl": worst.curl,
-                "error": worst.error, "share": worst.share,
-            }  # fmt: skip
-            found.append(finding("CURL", "error" if worst.share > _SMALL else "warning", **values))
+        values: dict[str, Any] = {**vars(worst), "share": worst.share} if worst else {}
+        values |= {
+            "loops": len(loops), "wrong": len(wrong), "limit": abs(limit.curl) + limit.error,
+            "stiffness": limit.stiffness,
+        }  # fmt: skip
+        severity = "error" if worst and worst.share > _SMALL else "warning"
         return CheckResult(
             says=(["curl_found" if worst else "curl_none"], values),
-            findings=found,
+            findings=[finding("CURL", severity, **values)] if worst else [],
             tables={"Work around closed loops": [_row(one) for one in loops]},
             numbers=numbers,
             limits={"with_work": (0, ("CURL",))},
@@ -116,9 +104,6 @@ def agreed(tried: Sequence[Loop]) -> Loop:
     """The loop with the smallest error, which is raised where a loop of another radius disagrees.
 
     A curl is the same on every small circle; what a jump of the forces does to the work around one is not.
-
-    Args:
-        tried: the same plane at several radii.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]

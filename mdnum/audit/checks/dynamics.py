@@ -73,8 +73,10 @@ class DynamicsCheck(AuditCheck):
         rng = np.random.default_rng(self.seed)
         limits, unknown = ([], "") if self.brief else _limits(subject)
         atoms = roomy(subject.atoms, FEW)
-        held = rigid(atoms) if _only_molecules(subject) else None
-        worker = subject.fresh()
+        held, worker = rigid(atoms), subject.fresh()
+        # of molecules that it takes whole alone, a calculator does not know the inner distances
+        if held is not None and subject.fresh().answers(subject.atoms[:-1]):
+            held = None
         iterations = _FEW_ITERATIONS if self.brief else _POWER_ITERATIONS
         fitting, period = fitting_timestep(worker, atoms, rng, iterations)
         start = prepared(worker, atoms, held, period, rng)
@@ -144,11 +146,6 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
     return found, "" if found else "no threshold was found"
 
 
-def _only_molecules(subject: CalculatorSubject) -> bool:
-    """Whether the calculator takes whole molecules alone, whose inner distances it does not know."""
-    return rigid(subject.atoms) is not None and not subject.fresh().answers(subject.atoms[:-1])
-
-
 @dataclass(frozen=True)
 class TwoRuns:
     """Two runs and where their energy went."""
@@ -210,18 +207,14 @@ class TwoRuns:
         says = ["dynamics", *(f"dynamics_{name}" for name in _SOURCES if name in shares)]
         values = numbers | {name: shares[name].slope for name in _SOURCES if name in shares}
         values |= {"time_unit": self.subject.units.time, "ratio": abs(numbers["drift_ratio"])}
+        limits = {
+            "hidden_wander": (_WANDERS, ("HIDDEN_JUMPS", "STALE_DYNAMICS")),
+            "stale": (self.stale[1], ("STALE_DYNAMICS",)),
+        }
+        recorded = {"energies": self.energy_rows(), "crossings": self.crossing_rows()}
+        findings, tables = list(self._findings(shares, numbers)), self._tables(shares, numbers)
         return CheckResult(
-            says=(says, values),
-            findings=list(self._findings(shares, numbers)),
-            tables=self._tables(shares, numbers),
-            charts=[self._chart()],
-            numbers=numbers,
-            limits={
-                "hidden_wander": (_WANDERS, ("HIDDEN_JUMPS", "STALE_DYNAMICS")),
-                "stale": (self.stale[1], ("STALE_DYNAMICS",)),
-            },
-            skipped=skipped,
-            recorded={"energies": self.energy_rows(), "crossings": self.crossing_rows()},
+            (says, values), findings, tables, [self._chart()], numbers, limits, skipped, recorded=recorded
         )
 
     def _numbers(self, shares: Mapping[str, Drift]) -> dict[str, Any]:
@@ -277,17 +270,15 @@ class TwoRuns:
         hidden, size = self.balance.hidden, numbers["hidden_wander"]
         # those that an old list makes are reported as such
         if hidden.jumps and not old and size > _WANDERS:
-            one, (k, times) = shares["elsewhere"], hidden.rank or (0, 0)
-            tie = times > 0.5 * len(hidden.jumps)
-            radius, passed = hidden.radius or (0.0, 0)
-            cutoff = passed > 0.5 * len(hidden.jumps)
+            one, (k, times), (radius, passed) = shares["elsewhere"], hidden.rank, hidden.radius
+            most = 0.5 * len(hidden.jumps)
             told = values(
                 "elsewhere", candidates=len(hidden.candidates), searched=len(hidden.steps), k=k, times=times,
                 share=hidden.share, jump=1e3 * numbers["largest_hidden_jump"], wander=size,
                 places=len(hidden.jumps), at=radius, passed=passed,
             )  # fmt: skip
             severity = "error" if one.significant and abs(one.slope) > much else "warning"
-            how = "cutoff" if cutoff else "tie" if tie else None
+            how = "cutoff" if passed > most else "tie" if times > most else None
             yield finding("HIDDEN_JUMPS", severity, how, **told)
         integrator = shares["integrator"]
         if integrator.significant and abs(integrator.slope) > much:
@@ -337,13 +328,9 @@ class TwoRuns:
             "forces that are no gradient": np.cumsum(self.balance.filled),
         }
         units = self.subject.units
-        return Chart(
-            "Change of the energy during a run, and what explains it",
-            f"time ({units.time})",
-            "change (meV/atom)",
-            (one.time / units.time_factor).tolist(),
-            {name: (scale * line).tolist() for name, line in lines.items()},
-        )
+        title, time = "Change of the energy during a run, and what explains it", one.time / units.time_factor
+        curves = {name: (scale * line).tolist() for name, line in lines.items()}
+        return Chart(title, f"time ({units.time})", "change (meV/atom)", time.tolist(), curves)
 
     def energy_rows(self) -> dict[str, list[Any]]:
         """Rows of energies.parquet."""
@@ -453,7 +440,6 @@ def run(
     Args:
         start: with velocities and constraints; left as it is.
         timestep: internal time.
-        each: called with the step reached.
 
     Returns:
         the run, and the structure with velocities at its end.

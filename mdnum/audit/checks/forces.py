@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -54,6 +55,9 @@ _SAME = 0.01
 #: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
 #: between two ways of writing one structure down, above the other is an error.
 _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
+#: Of two energies of one structure: changes of their difference that rounding explains, of doubles and of
+#: numbers of single precision.
+_ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
 #: Å to either side, for the derivative of that difference, and the error of it, roughly.
 _STEP, _CENTRAL = 1e-3, 1e-3
 
@@ -125,7 +129,14 @@ class ForcesCheck(AuditCheck):
             progress, self.name, spread=True, required=True, most=1 if self.brief else None,
         )  # fmt: skip
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
-        wrong_sums = list(_judged_sums(sums, scale))
+        wrong_sums = [
+            finding(
+                code, "error" if row["found"] > _SMALL * scale else "warning", size=row["found"],
+                allowed=row["rounding explains"],
+            )
+            for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False)
+            if row["found"] > row["rounding explains"]
+        ]  # fmt: skip
         if wrong_sums or not all(one.agrees for one in slopes):
             # the forces at the structure itself, which all directions are compared with
             worker.again(atoms, forces=forces)
@@ -140,15 +151,10 @@ class ForcesCheck(AuditCheck):
             one
             for place, one in found.items()
             # as much as a force of the drowned size does along a direction in which more atoms move
-            if one.agrees
-            and max(one.error, one.gap) > _DROWNED * scale * float(np.linalg.norm(wanted[place][1]))
+            if one.agrees and max(one.error, one.gap) > _DROWNED * scale * np.linalg.norm(wanted[place][1])
         ]
         first = min(found)
-        observed = [
-            *drowned,
-            *_judged(slopes, scale, places),
-            *wrong_sums,
-        ]
+        observed = [*drowned, *_judged(slopes, scale, places), *wrong_sums]
         if not self.brief:
             if not any(one.severity == "error" for one in drowned):
                 observed += precision(worker, atoms, noise)
@@ -230,10 +236,8 @@ def slope(
     """The derivative of the energy along a line by differences, with its error, beside that of the forces.
 
     Args:
-        line: displacement per Å of step.
-        forces: the calculator's at `atoms`.
-        noise: of the energy there.
-        what: the direction in words.
+        line: displacement per Å of step; `what` names it.
+        forces: the calculator's at `atoms`, where `noise` is that of the energy.
     """
     plus, minus = (
         np.array([subject.energy(displaced(atoms, sign * step * line)) for step in _LADDER])
@@ -257,16 +261,11 @@ def slope(
     # a difference that grows like 1/h down to the smallest h shows a step of the energy
     sizes = 2 * _LADDER[-4:] * (central - force)[-4:]
     steady = np.ptp(sizes) < 0.3 * abs(sizes[-1]) and abs(sizes[-1]) > noise.allowed.energy
+    doubt += noise.force * float(np.sqrt(np.sum(line**2)))  # a force has its own rounding
     return Slope(
-        what,
-        float(better[best + 1]),
-        # a force has its own rounding
-        doubt + noise.force * float(np.sqrt(np.sum(line**2))),
-        force,
-        float(_LADDER[best + 2]),
-        np.abs(central - force),
+        what, float(better[best + 1]), doubt, force, float(_LADDER[best + 2]), np.abs(central - force),
         float(sizes[-1]) if steady else 0.0,
-    )
+    )  # fmt: skip
 
 
 def _best(
@@ -279,8 +278,7 @@ def _best(
 
     Args:
         gaps: difference minus force at each step, the longest first.
-        error: of the differences, estimated.
-        rounding: the part of it that noise explains.
+        error: of the differences, estimated; rounding: the part of it that noise explains.
     """
     best = int(np.argmin(error))
     wrong = abs(gaps[best])
@@ -306,13 +304,6 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
         reach = float(np.max(np.linalg.norm(arms, axis=1)))
         torque, allowed = float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))), allowed * max(reach, 1.0)
         yield {"sum": "net torque (eV)", "found": torque, "rounding explains": float(allowed)}
-
-
-def _judged_sums(sums: list[dict[str, Any]], scale: float) -> Iterator[Observed]:
-    for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False):
-        if row["found"] > row["rounding explains"]:
-            severity = "error" if row["found"] > _SMALL * scale else "warning"
-            yield finding(code, severity, size=row["found"], allowed=row["rounding explains"])
 
 
 def _drowned(
@@ -366,17 +357,10 @@ def _row(one: Slope) -> dict[str, Any]:
 def _chart(slopes: list[Slope]) -> Chart:
     """Difference of forces and differences by step: a valley where all is well, a plateau where it is not."""
     shown = slopes[:_DIRECTIONS]
-    worst = _worst(slopes)
-    if worst not in shown:
-        shown = [*shown, worst]
-    return Chart(
-        "Forces against differences of the energy, by step",
-        "step (Å)",
-        "difference (eV/Å)",
-        _LADDER[::-1].tolist(),
-        {one.direction: one.gaps[::-1].tolist() for one in shown},
-        log_y=True,
-    )
+    shown += [one for one in [_worst(slopes)] if one not in shown]
+    lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
+    title = "Forces against differences of the energy, by step"
+    return Chart(title, "step (Å)", "difference (eV/Å)", _LADDER[::-1].tolist(), lines, log_y=True)
 
 
 # -- calculators that know two energies: the one forces belong to, and the one that a run logs
@@ -388,45 +372,41 @@ def _two_energies(
     """A finding where `energy` and `free_energy` differ by what is not constant.
 
     Every other check is about the free energy, which forces belong to by ASE's definition; where the two
-    differ by a constant at most, what they find holds for both. What has been asked so far counts as well.
+    differ by a constant at most, what they find holds for both.
 
     Args:
-        atoms: a structure away from thresholds.
-        line: a displacement of it, per Å; along: the slope along it.
+        along: the slope along the line, a displacement per Å of a structure away from thresholds.
     """
-    if subject.energies(atoms)[1] is None:
+    free, logged = subject.energies(atoms)
+    if logged is None:
         return
 
-    def offset(there: Atoms) -> float:
+    def change(there: Atoms) -> float:
         free, other = subject.energies(there)
-        return 0.0 if other is None else other - free
+        return 0.0 if other is None else other - free - offset
 
-    # where it may not change: between ways to write a structure down, and at a threshold of two particles
+    offset, kT = logged - free, subject.kT
+    # where it may not change
     rng = np.random.default_rng(0)
     kinds = (invariance.translated, invariance.imaged, invariance.permuted)
-    changes: list[tuple[str, float]] = []
+    changes: dict[str, float] = {}
     for same in (one for kind in kinds for one in islice(kind(atoms, rng), 1)):
-        try:
-            with subject.trying():
-                changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
-        except CalculatorError:
-            continue  # reported elsewhere
-    for walk in subject.known["walks"].walks if "walks" in subject.known else ():
-        for one in walk.thresholds:
-            sides = [offset(walk.pair.at(place)) for place in (one.inside, one.outside)]
-            changes.append((f"between {walk.pair.name} at {one.radius:.8g} Å", abs(sides[1] - sides[0])))
-    forward, back = (offset(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
+        with suppress(CalculatorError), subject.trying():  # reported elsewhere
+            changes[f"with {same.what}"] = change(same.atoms)
+    forward, back = (change(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
     slope_of_offset = (forward - back) / (2 * _STEP)
-    worst = max(subject.repeats.offsets.values(), key=lambda one: abs(one.change))
-    if abs(worst.change) <= max(noise.allowed.energy, _SMALL_OFFSET * subject.kT):
+    moved = [change(displaced(atoms, sign * _LADDER[0] * line)) for sign in (1, -1)]
+    worst = max([*changes.values(), *moved], key=abs)
+    single = all(float(np.float32(energy)) == energy for energy in (free, logged))
+    rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(abs(free), abs(logged))
+    if abs(worst) <= max(noise.allowed.energy, _SMALL_OFFSET * kT, rounding):
         return
     limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
-    free = along.agrees
     other = abs(along.difference - along.force + slope_of_offset) <= limit
-    belong = "both" if free and other else "free" if free else "energy" if other else "neither"
-    wrong = [f"{what}, by {size:.3g} eV" for what, size in changes if size > _LARGE_OFFSET * subject.kT]
+    belong = ("both" if other else "free") if along.agrees else "energy" if other else "neither"
+    wrong = [f"{what}, by {abs(by):.3g} eV" for what, by in changes.items() if abs(by) > _LARGE_OFFSET * kT]
     yield finding(
         "TWO_ENERGIES", "error" if wrong else "warning", belong, "wrong" if wrong else None,
-        formula=worst.formula, offset=worst.first, change=worst.change, places="; ".join(wrong),
-        kT=abs(worst.change) / subject.kT if subject.kT else None,
+        formula=atoms.get_chemical_formula(), offset=offset, change=worst, places="; ".join(wrong),
+        kT=abs(worst) / kT if kT else None,
     )  # fmt: skip

@@ -191,19 +191,18 @@ class InvarianceCheck(AuditCheck):
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
-            if grouped is None or not judge(grouped).agrees:
+            if grouped is None or not judge(grouped[0]).agrees:
                 return wrong
         except CalculatorError:
             return wrong
         worst = max(wrong.get("ORDER", []), key=lambda one: one.energy, default=None)
-        values: dict[str, Any] = {"what": grouped.what}
+        values: dict[str, Any] = {"what": grouped[0].what}
         if worst:
             values |= {"single": worst.same.what, "energy": worst.energy, "force": worst.force}
         severity, variant = ("warning", "silent") if worst else ("info", None)
         judge.notes.append(finding("TOPOLOGY_BY_ORDER", severity, variant, **values))
         kept = {code: cases for code, cases in wrong.items() if code != "ORDER"}
-        whole = images_by_molecule(judge.atoms, rng)
-        if "IMAGES" not in kept or whole is None or not judge(whole).agrees:
+        if "IMAGES" not in kept or not judge(grouped[1]).agrees:
             return kept
         worst = max(kept["IMAGES"], key=lambda one: one.energy)
         values = {"what": worst.same.what, "energy": worst.energy}
@@ -279,13 +278,11 @@ class _Judge:
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
     """Ways of writing the structure down that nobody may fail on, and answers that are not numbers."""
-    groups: dict[str, list[tuple[Same, CalculatorError]]] = {}
-    for same, error in refused:
-        if error.cause is None:
-            groups.setdefault("NOT_FINITE", []).append((same, error))
-        elif same.code in _MUST_ANSWER:
-            groups.setdefault("FAILS", []).append((same, error))
-    for code, cases in groups.items():
+    empty = [one for one in refused if one[1].cause is None]
+    raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
+    for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
+        if not cases:
+            continue
         same, error = cases[0]
         values = {"what": same.what, "why": error.message, "ways": len(cases)}
         values["file"] = error.structure.name if error.structure else ""
@@ -396,23 +393,19 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         yield Same(f"atoms of {Atoms([number]).symbols[0]} first", "ORDER", atoms[order], order)
 
 
-def by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
-    """Whole molecules in another order, where the atoms come in molecules; None where they do not."""
+def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
+    """Whole molecules in another order, and moved by lattice vectors of their own, where there are some."""
     size = group(atoms)
     if size is None:
         return None
-    order = (rng.permutation(len(atoms) // size)[:, None] * size + np.arange(size)).ravel()
-    return Same(f"molecules of {size} atoms in another order", "ORDER", atoms[order], order)
-
-
-def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
-    """Whole molecules moved by lattice vectors of their own; None as for `by_molecule`."""
-    size = group(atoms)
-    if size is None or not atoms.pbc.any():
-        return None
-    boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
+    count = len(atoms) // size
+    order = (rng.permutation(count)[:, None] * size + np.arange(size)).ravel()
+    boxes = rng.integers(-2, 3, (count, 3)) * atoms.pbc
     there = displaced(atoms, np.repeat(boxes, size, axis=0) @ atoms.cell.array)
-    return _same("IMAGES", atoms, f"molecules of {size} atoms moved by lattice vectors of their own", there)
+    return (
+        Same(f"molecules of {size} atoms in another order", "ORDER", atoms[order], order),
+        _same("IMAGES", atoms, f"molecules of {size} atoms moved by lattice vectors of their own", there),
+    )
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:

@@ -62,11 +62,12 @@ class SmoothnessCheck(AuditCheck):
                 *_jumps(walks, around, kT),
                 *_at_cutoff(around, kT),
                 *_among_many(around, kT, walks.not_walked),
+                *_logged(subject, walks),
                 *(one for crowded in crowds for one in _caps(crowded, kT)),
                 *(one for walk in walks.walks for one in reach(walk, kT)),
             ],
             tables=_tables(walks, around, crowds, kT),
-            charts=_charts(walks, crowds, subject),
+            charts=_charts(walks, subject),
             numbers=numbers,
             limits={
                 "largest_energy_jump": (_SMALL * kT, _ENERGY),
@@ -125,11 +126,10 @@ def figures(
     worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
     says = ["walked" if walks.walks else "not_walked"]
     values: dict[str, Any] = numbers | {
-        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs),
-        "energy": 1e3 * numbers["largest_energy_jump"], "kT": numbers["largest_energy_jump_kT"],
-        "force": force, "derivative": ORDERS[order] if order is not None else "",
-        "knots": knots, "not_walked": ", ".join(walks.not_walked), "neighbors": numbers["neighbors_tried"],
-        "kept": min(capped, default=0),
+        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs), "energy": 1e3 * step,
+        "kT": numbers["largest_energy_jump_kT"], "force": force, "kept": min(capped, default=0),
+        "derivative": ORDERS[order] if order is not None else "", "not_walked": ", ".join(walks.not_walked),
+        "neighbors": numbers["neighbors_tried"], "knots": knots,
     }  # fmt: skip
     says += ["ends"] if cutoffs else []
     says.append(f"jumps_{worst}" if order is None or order <= SMOOTH else "jumps_at_an_end")
@@ -201,6 +201,23 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
         energy=1e3 * energy, kT=energy / kT, alone=ORDERS[threshold.order], measured=around.measured,
         places=len(around.lower),
     )  # fmt: skip
+
+
+def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
+    """A finding where `energy`, which a run logs, jumps at a threshold where `free_energy` does not."""
+    jumps: list[tuple[float, float, str, str]] = []
+    for walk in walks.walks:
+        for one in walk.thresholds:
+            sides = [subject.energies(walk.pair.at(at)) for at in (one.inside, one.outside)]
+            before, after = (np.nan if other is None else other - free for free, other in sides)
+            where = f"between {walk.pair.name} at {one.radius:.8g} Å, by {abs(after - before):.3g} eV"
+            jumps.append((after - before, before, walk.pair.name, where))
+    kT = subject.kT
+    if wrong := [one for one in jumps if abs(one[0]) > _LARGE * (kT or 1.0)]:
+        change, offset, pair, _ = max(wrong, key=lambda one: abs(one[0]))
+        values = {"formula": pair, "offset": offset, "change": change, "kT": abs(change) / kT if kT else None}
+        places = "; ".join(where for *_, where in wrong)
+        yield finding("TWO_ENERGIES", "error", "wrong", places=places, **values)
 
 
 def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
@@ -338,18 +355,12 @@ def _tables(
     }
 
 
-def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubject) -> list[Chart]:
+def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
     found: list[Chart] = []
     for walk in walks.walks[:_DRAWN]:
         found.append(_energies(walk, subject.kT))
         sharp = [one for one in walk.thresholds if one.order <= 1]
         found += [_close_up(walk, one, subject) for one in sharp[:1]]
-    for one in crowds:
-        if one.kept:
-            title = f"{one.species} with {one.neighbors} neighbors: what jumps when another passes the k-th"
-            k, forces = zip(*one.jumps, strict=True)
-            what, kept = "largest jump of a force (eV/Å)", {"kept": float(one.kept)}
-            found.append(Chart(title, "k", what, [float(n) for n in k], {"force": list(forces)}, kept))
     return found
 
 

@@ -62,14 +62,14 @@ class StateCheck(AuditCheck):
         total, done = sum(map(len, sequences.values())), 0
         rows: list[Comparison] = []
         for name, sequence in sequences.items():
-            compared = len(rows)
+            left = sum(one.compared for one in sequence)
             try:
                 with subject.meter.limited():
                     for reached, row in _through(subject, sequence, noise, name):
                         rows.append(row)
+                        left -= 1
                         progress(done + reached, total, {"phase": "state", "unit": "structures"})
             except TimeUp as up:
-                left = sum(one.compared for one in sequence) - (len(rows) - compared)
                 skipped.append((f"{left} questions of the sequence “{name}”", up.why))
             done += len(sequence)
         if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
@@ -77,18 +77,17 @@ class StateCheck(AuditCheck):
         repeats = _repeated(subject, atoms)
         tolerance = _tolerance(subject, atoms)
         stale = [row for row in rows if row.remembers and not row.broken]
-        chance: dict[str, Any] = {}
-        if stale and not _again(subject, sequences, stale):
+        worst = max(stale, key=lambda row: row.energy, default=None)
+        chance: dict[str, Any] = {"answers": 0}
+        if worst and not _again(subject, sequences[worst.sequence], noise, worst):
             # another object on the same way does not go astray: it is chance, and no memory
-            worst = max(stale, key=lambda row: row.energy)
             chance = {"answers": len(stale), "energy": worst.energy, "force": worst.force}
             stale = []
-        refused = [row for row in rows if row.refused and not row.remembers]
         finite = [row.energy for row in stale if np.isfinite(row.energy)]
-        says = "failing" if stale and not finite else "stale" if stale else "chance" if chance else "none"
+        says = "none" if not worst else "chance" if not stale else "stale" if finite else "failing"
         values: dict[str, Any] = {
             "rows": len(rows), "stale": len(stale), "sequences": len({row.sequence for row in rows}),
-            "answers": chance.get("answers", 0), "energy": max(finite, default=chance.get("energy", 0.0)),
+            "answers": chance["answers"], "energy": max(finite, default=chance.get("energy", 0.0)),
         }  # fmt: skip
         numbers = {
             "structures": len(rows), "remembered": len(stale), "bit_identical": repeats["bit-identical"],
@@ -109,10 +108,7 @@ class StateCheck(AuditCheck):
             },
             numbers=numbers,
             limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
-            skipped=[
-                *skipped,
-                *((row.what, row.why) for row in refused),
-            ],
+            skipped=[*skipped, *((row.what, row.why) for row in rows if row.refused and not row.remembers)],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
@@ -122,7 +118,7 @@ class StateCheck(AuditCheck):
         repeats = _repeated(subject, atoms, brief=True)
         return CheckResult(
             says=([_how(repeats)], {}),
-            findings=list(_unsteady(repeats, {}, subject.kT)),
+            findings=list(_unsteady(repeats, {"answers": 0}, subject.kT)),
             tables={"The same question again": [repeats]},
             possible=1 + sum(map(len, all_sequences(atoms, rng).values())),
         )
@@ -139,7 +135,7 @@ class StateCheck(AuditCheck):
             )  # fmt: skip
 
     def _failures(self, rows: list[Comparison]) -> Iterator[Observed]:
-        for row in [row for row in rows if row.remembers and row.broken][:1]:
+        if row := next((row for row in rows if row.remembers and row.broken), None):
             yield finding("BROKEN_BY_FAILURE", "info", step=row.what, why=row.why)
         empty = (row for row in rows if row.refused and not row.remembers and row.refused.cause is None)
         if row := next(empty, None):
@@ -231,26 +227,18 @@ def _through(
 
 
 def _again(
-    subject: CalculatorSubject, sequences: Mapping[str, list[SequenceStep]], stale: list[Comparison]
+    subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, worst: Comparison
 ) -> bool:
     """Whether another object, on the way on which the worst difference showed, answers as that one did."""
-    worst = max(stale, key=lambda row: row.energy)
-    used = subject.used()
-    answer: Answered | None = None
-    for asked in sequences[worst.sequence]:
-        answer = used.try_both(asked.atoms)
-        if asked.atoms is worst.atoms and asked.what == worst.what:
-            break
-    if isinstance(answer, CalculatorError) or isinstance(worst.old, CalculatorError):
-        return isinstance(answer, CalculatorError) and isinstance(worst.old, CalculatorError)
-    new = subject.fresh().try_both(worst.atoms)
-    if isinstance(new, CalculatorError) or isinstance(worst.new, CalculatorError) or answer is None:
-        return False
+    end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
+    way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
+    ((_, again),) = _through(subject, way, noise, worst.sequence)
+    if worst.refused or again.refused:
+        return isinstance(worst.old, CalculatorError) and isinstance(again.old, CalculatorError)
     # both must come again: what objects in use answer, and what new ones do
-    return all(
-        force <= 0.5 * worst.force and energy <= 0.5 * worst.energy
-        for energy, force in (differences(answer, worst.old), differences(new, worst.new))
-    )
+    answers: list[tuple[Any, Any]] = [(again.old, worst.old), (again.new, worst.new)]
+    changes = [differences(*two) for two in answers]
+    return all(force <= 0.5 * worst.force and energy <= 0.5 * worst.energy for energy, force in changes)
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
@@ -301,14 +289,13 @@ def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> 
 
 def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) -> Iterator[Observed]:
     within = not repeats["bit-identical"]
-    if not within and repeats["bit-identical between objects"] and not chance:
-        return
-    energy, force = (
-        max(repeats[f"{what} scatter by"], repeats[f"{what} between objects"], chance.get(one, 0.0))
-        for what, one in (("energies", "energy"), ("forces", "force"))
-    )
-    how = "chance" if chance else "within" if within else "between"
-    yield not_repeatable(how, energy, force, repeats["typical force"], kT, answers=chance.get("answers", 0))
+    if within or chance["answers"] or not repeats["bit-identical between objects"]:
+        energy, force = (
+            max(repeats[f"{what} scatter by"], repeats[f"{what} between objects"], chance.get(one, 0.0))
+            for what, one in (("energies", "energy"), ("forces", "force"))
+        )
+        how = "chance" if chance["answers"] else "within" if within else "between"
+        yield not_repeatable(how, energy, force, repeats["typical force"], kT, answers=chance["answers"])
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
