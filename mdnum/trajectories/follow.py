@@ -193,6 +193,8 @@ def follow(
         if last is not None:
             if (
                 found.frames < _FLIGHTS
+                # velocities are per time, and the numbers of frames are none
+                and trajectory.time != "frame"
                 and (flight := flight_of(last, frame, resolution.usual_step(frame))) is not None
             ):
                 found.flights.append(flight)

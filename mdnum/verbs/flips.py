@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import chain
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -42,6 +43,7 @@ _PART_ROWS, _PARTS_HELD = 1_500_000, 10
 _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
 _BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
+_Pairs = str | Mapping[tuple[str, str], float]
 _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
 
 
@@ -51,9 +53,9 @@ def flips(
     other: str | Path | None = None,
     *,
     topology: str | Path | None = None,
-    cutoffs: Sequence[float] = (),
-    pairs: Sequence[str | Mapping[tuple[str, str], float]] = (),
-    nearest: Sequence[int] = (),
+    cutoffs: float | Sequence[float] = (),
+    pairs: _Pairs | Sequence[_Pairs] = (),
+    nearest: int | Sequence[int] = (),
     most: int | None = None,
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
@@ -68,8 +70,8 @@ def flips(
             may stand behind an @ ("run.xtc@100:", "run.xtc@::10").
         other: another one of the same atoms: where do the two diverge?
         topology: what the atoms are, where the trajectory does not say.
-        cutoffs: lengths in the file's unit, a rule each; default the cutoff of the mdnum run that the file
-            belongs to.
+        cutoffs: a length in the file's unit, or several, a rule each; default the cutoff of the mdnum run
+            that the file belongs to. One rule needs no sequence here, nor in `pairs` and `nearest`.
         pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5".
         nearest: numbers of neighbors, a rule each: the k nearest of every atom.
         most: neighbors an atom can have inside a cutoff; the nearest are kept.
@@ -154,9 +156,9 @@ VERBS = {"flips": Verb(judge, page, FlipsView)}
 
 
 def rules(
-    cutoffs: Sequence[float] = (),
-    pairs: Sequence[str | Mapping[tuple[str, str], float]] = (),
-    nearest: Sequence[int] = (),
+    cutoffs: float | Sequence[float] = (),
+    pairs: _Pairs | Sequence[_Pairs] = (),
+    nearest: int | Sequence[int] = (),
     most: int | None = None,
 ) -> tuple[Rule, ...]:
     """The membership rules asked for, in this order; arguments as of `flips`.
@@ -171,13 +173,21 @@ def rules(
             "--most keeps the nearest of those inside a cutoff, and there is no cutoff",
             remedy="Add --cutoff R; for the K nearest without a cutoff write --nearest K",
         )
-    found: list[Rule] = [CutoffRule(radius) if most is None else Capped(radius, most) for radius in cutoffs]
-    found += [SpeciesCutoffs(one if isinstance(one, Mapping) else _species_cutoffs(one)) for one in pairs]
-    found += [Nearest(k) for k in nearest]
+    radii, species, counts = map(_listed, (cutoffs, pairs, nearest))
+    if wrong := [one for one in (*radii, *counts) if not isinstance(one, Real)]:
+        raise InputError(f"{wrong[0]!r} is no number", remedy="Write cutoffs=5.0 or cutoffs=[4.0, 5.0]")
+    found: list[Rule] = [CutoffRule(r) if most is None else Capped(r, most) for r in map(float, radii)]
+    found += [SpeciesCutoffs(one if isinstance(one, Mapping) else _species_cutoffs(one)) for one in species]
+    found += [Nearest(k) for k in counts]
     names = [one.name for one in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"the rule {twice[0]!r} is asked for twice", remedy="Keep one of them")
     return tuple(found)
+
+
+def _listed(given: Any) -> tuple[Any, ...]:
+    """One rule's value or several, as several."""
+    return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
 def _species_cutoffs(words: str) -> dict[tuple[str, str], float]:

@@ -193,3 +193,13 @@ def test_a_velocity_column_of_another_name_is_said_to_be_ignored(tmp_path: Path,
         one.arrays["forces2"] = one.arrays.pop(name)
     other = finding(told(tmp_path, frames, "b.extxyz"), "READING")
     assert other is None or "not read" not in other.text
+
+
+def test_frames_without_times_contradict_no_velocities(tmp_path: Path):
+    frames = vibrating()
+    for one in frames:
+        one.info.pop("time")
+    # as ASE's dynamics writes them
+    write(tmp_path / "run.traj", frames)
+    found = mdnum.flips(tmp_path / "run.traj", cutoffs=4.0, report=False, out=tmp_path / "found")
+    assert {one.code for one in found.verdict.findings} & {"NO_TIMES", "VELOCITIES_ODD"} == {"NO_TIMES"}

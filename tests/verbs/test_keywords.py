@@ -100,3 +100,28 @@ def test_arrays_go_where_the_message_says() -> None:
     found = NeighborFlips(MDAnalysis.Universe.empty(40).load_new(x), r_cut=3.0).run().results
     inside = [np.linalg.norm(one[:, None] - one, axis=2)[np.triu_indices(40, 1)] < 3.0 for one in x]
     assert len(found.flips) == sum(np.count_nonzero(a != b) for a, b in pairwise(inside))
+
+
+@pytest.mark.parametrize(
+    ("asked", "names"),
+    [
+        ({"cutoffs": 5.0}, ["r < 5"]),
+        ({"cutoffs": np.float32(5)}, ["r < 5"]),
+        ({"cutoffs": (3, 5.0)}, ["r < 3", "r < 5"]),
+        ({"nearest": 4}, ["4 nearest"]),
+        ({"pairs": "O-H=2.5"}, ["O-H < 2.5"]),
+        ({"pairs": {("O", "H"): 2.5}}, ["O-H < 2.5"]),
+    ],
+)
+def test_one_rule_needs_no_sequence(asked, names) -> None:
+    from mdnum.verbs.flips import rules
+
+    assert all(said in one.name for one, said in zip(rules(**asked), names, strict=True)), rules(**asked)
+
+
+@pytest.mark.parametrize("asked", [{"cutoffs": "3"}, {"nearest": ["4"]}])
+def test_a_word_is_no_cutoff(asked) -> None:
+    from mdnum.verbs.flips import rules
+
+    with pytest.raises(InputError, match="is no number"):
+        rules(**asked)
