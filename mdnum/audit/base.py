@@ -331,7 +331,7 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
     if "warning" in severities:
         return "with care"
     needed, begun = needed_to(question), {result.name for result in results}
-    if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
+    if nothing_felt(results) or not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
     return "yes" if needed <= asked else "as far as asked"
@@ -342,9 +342,15 @@ def largely_unasked(result: CheckResult) -> bool:
     return result.asked < _NEARLY * result.possible
 
 
+def nothing_felt(results: Sequence[CheckResult]) -> bool:
+    """Whether no atom feels another in the structure: what was found right there tells nothing."""
+    return any(result.numbers.get("nothing_felt") for result in results)
+
+
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
     begun, basic = {result.name for result in results}, {name for name in wanted if CHECKS[name].basic}
+    begun = set() if nothing_felt(results) else begun
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 

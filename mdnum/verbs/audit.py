@@ -335,7 +335,8 @@ def _summary(state: AuditState) -> dict[str, Any]:
     rest += [{"what": what, "why": why, "part": one.name} for one in state.shown for what, why in one.skipped]
     early = frame.UNDECIDED if base.to_come(state.shown, state.checks) else frame.PARTIAL
     status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
-    status = "complete" if state.during is None else status
+    if state.during is None:
+        status = frame.UNDECIDED if base.nothing_felt(state.shown) and early == frame.UNDECIDED else "complete"
     return _in_units(
         {
             "system": state.name, "calculator": state.name, "atoms": len(atoms),
@@ -477,6 +478,8 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
             TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name) for one in results
         ]
 
+    if base.nothing_felt(state.shown) and base.to_come(state.shown, state.checks):
+        return _unfinished(state, TEXTS("nothing_felt", name=name))
     if state.shown and not asked and base.to_come(state.shown, state.checks):
         head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
         return _unfinished(state, head)
