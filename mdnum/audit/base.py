@@ -336,7 +336,11 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
     if "warning" in severities:
         return "with care"
     needed, begun = needed_to(question), {result.name for result in results}
-    if nothing_felt(results) or not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
+    if (
+        nothing_felt(results)
+        or not needed <= set(wanted)
+        or not {name for name in needed if CHECKS[name].basic} <= begun
+    ):
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
     return "yes" if needed <= asked else "as far as asked"

@@ -16,7 +16,7 @@ from ase import Atoms
 from mdnum.audit.base import CalculatorError, Meter, TimeUp
 from mdnum.audit.structures import FARTHEST, Pair, nearest_distance, pairs
 from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
-from mdnum.deadline import Deadline
+from mdnum.deadline import Deadline, interrupting
 from mdnum.errors import InputError
 
 #: Tried in this order, and then every other element: argon where anything goes; and a second one beside each.
@@ -71,9 +71,12 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
         return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
     builder = _Builder(loaded, Meter(deadline=deadline or Deadline(), most=BUILDING_CALLS))
     try:
-        with builder.meter.limited():
+        with interrupting(builder.meter.deadline), builder.meter.limited():
             return builder.built()
-    except TimeUp as up:
+    except (TimeUp, KeyboardInterrupt) as error:
+        if not isinstance(error, TimeUp) and not builder.meter.deadline.passed:
+            raise
+        up = error if isinstance(error, TimeUp) else TimeUp
         best = builder.best if builder.best is not None else _filled(*_unit_cell(*builder.likely[:1]))
         return _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
 

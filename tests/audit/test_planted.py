@@ -484,7 +484,9 @@ def test_questions_that_differ_in_charges_tags_or_moments_are_not_one(make, atom
     assert asked_about.repeats.new.times and not asked_about.repeats.findings(asked_about.kT)
 
 
-@pytest.mark.parametrize(("symbol", "name"), [("Ar", "an Ar atom"), ("Fe", "an Fe atom"), ("Cu", "a Cu atom")])
+@pytest.mark.parametrize(
+    ("symbol", "name"), [("Ar", "an Ar atom"), ("Fe", "an Fe atom"), ("Cu", "a Cu atom")]
+)
 def test_elements_have_their_article(symbol: str, name: str):
     atoms = crystal()
     atoms.set_chemical_symbols([symbol] * len(atoms))

@@ -194,10 +194,11 @@ class ForcesCheck(AuditCheck):
 
 def _values(slopes: list[Slope], unclear: list[Slope], scale: float) -> dict[str, Any]:
     clear = [one for one in slopes if not any(one is other for other in unclear)] or slopes
+    gap, error = max(one.gap for one in clear), max(one.error for one in clear)
     return {
         "directions": len(slopes), "clear": len(clear), "wrong": sum(not one.agrees for one in slopes),
         "gap": max(one.gap for one in slopes), "error": max(one.error for one in slopes),
-        "clear_gap": max(one.gap for one in clear), "clear_error": max(one.error for one in clear),
+        "clear_gap": gap, "clear_error": error, "clear_bound": max(gap, error),
         "scale": scale, "unclear": len(unclear),
         "unclear_direction": unclear[0].direction if unclear else "",
         "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
