@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 from mdnum.errors import InputError
 
 T = TypeVar("T")
+#: Seconds past a deadline after which a call in progress is interrupted.
+GRACE = 10.0
 
 
 class TimeUp(Exception):
@@ -52,6 +57,25 @@ class Deadline:
     def passed(self) -> bool:
         """Whether the time is up."""
         return self.left == 0.0
+
+
+@contextmanager
+def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
+    """In the main thread, KeyboardInterrupt where a call is in progress longer than `grace` s past a deadline.
+
+    It comes again until the block is left, since somebody else's code may catch it. A call that holds Python's
+    lock in compiled code cannot be interrupted.
+    """
+    if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, deadline.left + grace, grace)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def fewest(

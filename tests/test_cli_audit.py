@@ -95,3 +95,36 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     assert call("audit", EMT, "-s", "cu.extxyz", "-o", "other", "--checks", "curl") == 130
     assert "stopped. Continue it with `mdnum audit --resume other`." in capsys.readouterr().err
     assert not (copper / "other/summary.json").exists()
+
+
+LOOPS = """
+from ase.calculators.lj import LennardJones
+
+calls = [0]
+
+class Loops(LennardJones):
+    def calculate(self, *words, **more):
+        calls[0] += 1
+        while calls[0] > {after}:
+            try:
+                pass
+            except BaseException:
+                pass
+        super().calculate(*words, **more)
+
+def make():
+    return Loops(sigma=3.4, epsilon=0.01, rc=5.0)
+"""
+
+
+@pytest.mark.parametrize("given", [(), ("-s", "ar.extxyz")], ids=["built", "given"])
+@pytest.mark.parametrize("after", [0, 11])
+def test_a_call_that_never_ends_is_interrupted_after_the_deadline(given, after, copper, monkeypatch):
+    """While the structure is built, or when it is asked about: a folder, a page and exit code 3."""
+    monkeypatch.setattr("mdnum.deadline.interrupting.__wrapped__.__defaults__", (0.5,))
+    (copper / "loops.py").write_text(LOOPS.format(after=after))
+    write(copper / "ar.extxyz", bulk("Ar", cubic=True).repeat(2))
+    assert call("audit", "loops.py", *given, "--time", "0.01", "-o", "a") == 3
+    summary = json.loads((copper / "a" / "summary.json").read_text())
+    assert summary["status"] == "undecided" and (copper / "a" / "report.html").exists()
+    assert "The time was up" in summary["headline"] and "safe" not in summary["headline"]

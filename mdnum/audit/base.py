@@ -66,6 +66,7 @@ class Meter:
     calls: int = 0
     deadline: Deadline = field(default_factory=Deadline)
     most: float = math.inf  # calls, after which what may be left is left
+    spare: int = 0  # that earlier checks were allowed and did not make: later ones may
     _limited: int = 0
 
     def count(self) -> None:
@@ -86,13 +87,13 @@ class Meter:
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """What several checks rest on is found here: it has calls of its own, and takes none from a check."""
-        most, before = self.most, self.calls
-        self.most = before + calls
+        """What several checks rest on is found here, by calls of its own; the check gets what is left of them."""
+        most = self.most
+        self.most = self.calls + calls
         try:
             yield
         finally:
-            self.most = most + self.calls - before
+            self.most = max(most + calls, self.calls)
 
     @contextmanager
     def limited(self) -> Iterator[None]:
@@ -182,7 +183,7 @@ class AuditCheck:
         order: checks with a lower one are asked before: what tells most by a call first.
         basic: whether it has a brief form of a few dozen calls. The brief forms are asked before any check is
             asked in full: with them there is an answer.
-        calls: that it may make at most.
+        calls: that it may make at most, besides those that checks before it left.
         brief: whether this is the brief form.
         needed_to: answers that are not known without this check, "run" or "differentiate".
         seed: of all that it draws.
@@ -213,9 +214,13 @@ class AuditCheck:
 
     def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
         """Ask it, with name, title and the time that it took."""
-        began = perf_counter()
-        subject.meter.most = subject.meter.calls + self.calls
-        found = self.ask(subject, progress or idle)
+        began, meter = perf_counter(), subject.meter
+        meter.most = meter.calls + self.calls + (0 if self.brief else meter.spare)
+        try:
+            found = self.ask(subject, progress or idle)
+        finally:
+            if not self.brief:
+                meter.spare = int(max(meter.most - meter.calls, 0))
         found = replace(found, findings=[*found.findings, *_above_limits(found)])
         return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
 
@@ -331,7 +336,11 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
     if "warning" in severities:
         return "with care"
     needed, begun = needed_to(question), {result.name for result in results}
-    if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
+    if (
+        nothing_felt(results)
+        or not needed <= set(wanted)
+        or not {name for name in needed if CHECKS[name].basic} <= begun
+    ):
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
     return "yes" if needed <= asked else "as far as asked"
@@ -342,9 +351,15 @@ def largely_unasked(result: CheckResult) -> bool:
     return result.asked < _NEARLY * result.possible
 
 
+def nothing_felt(results: Sequence[CheckResult]) -> bool:
+    """Whether no atom feels another in the structure: what was found right there tells nothing."""
+    return any(result.numbers.get("nothing_felt") for result in results)
+
+
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
     begun, basic = {result.name for result in results}, {name for name in wanted if CHECKS[name].basic}
+    begun = set() if nothing_felt(results) else begun
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 

@@ -15,8 +15,8 @@ from ase import Atoms
 
 from mdnum.audit.base import CalculatorError, Meter, TimeUp
 from mdnum.audit.structures import FARTHEST, Pair, nearest_distance, pairs
-from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
-from mdnum.deadline import Deadline
+from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
+from mdnum.deadline import Deadline, interrupting
 from mdnum.errors import InputError
 
 #: Tried in this order, and then every other element: argon where anything goes; and a second one beside each.
@@ -38,7 +38,7 @@ _SLOW = 0.15
 #: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
 _RATTLE = 0.02
 #: Distances at which two atoms are asked about, from the farthest inward.
-_DISTANCES = FARTHEST * 1.12 ** -np.arange(29.0)
+_DISTANCES = FARTHEST * 1.12 ** -np.arange(35.0)
 #: Attributes that name elements, those that do so by atomic numbers, and attributes that hold a model.
 _NAMES = ("elements", "species", "symbols", "atom_types", "chemical_symbols", "type_map", "parameters")
 _NUMBERS = ("atomic_numbers", "z_table", "zs")
@@ -71,9 +71,12 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
         return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
     builder = _Builder(loaded, Meter(deadline=deadline or Deadline(), most=BUILDING_CALLS))
     try:
-        with builder.meter.limited():
+        with interrupting(builder.meter.deadline), builder.meter.limited():
             return builder.built()
-    except TimeUp as up:
+    except (TimeUp, KeyboardInterrupt) as error:
+        if not isinstance(error, TimeUp) and not builder.meter.deadline.passed:
+            raise
+        up = error if isinstance(error, TimeUp) else TimeUp
         best = builder.best if builder.best is not None else _filled(*_unit_cell(*builder.likely[:1]))
         return _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
 
@@ -110,13 +113,16 @@ class _Builder:
             subject = self.about(water(edge))
             subject.saving = edge == _WATER_EDGES[-1]
             try:
-                subject.energy(subject.atoms)
+                felt = _feels(subject, subject.atoms)
             except CalculatorError as error:
                 why, saved = error.message, error.structure
-            else:
+                continue
+            if felt:
                 return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
         # after water, since a calculator of molecules may take any atoms in threes for them
         made = made or self._first(others) or self._first(self.likely, paired=False)
+        if made is None and self.best is not None:
+            return self.best  # on which no atom feels another: the forces say so
         if made is None:
             raise InputError(
                 "the calculator answers neither for atoms of any element nor for water "
@@ -168,19 +174,22 @@ class _Builder:
         elif len(symbols) == 1:
             self.cutoff, self.least = None, None
         cell, kind = _unit_cell(*symbols)
-        start = next((scale for scale in _DENSITIES if subject.answers(_small(cell, scale))), None)
-        if start is None:
-            return None
-        self.best = _filled(cell, kind, start)
-        scale, relaxed = _least_energy(subject, cell, self.least, start)
-        for how in ((scale, relaxed), (start, False)):
-            if (made := _grown(subject, cell, kind, *how, self.cutoff)) is not None:
-                return made
+        for start in _DENSITIES:
+            if not subject.answers(_small(cell, start)):
+                continue
+            if self.best is None:
+                self.best = _filled(cell, kind, start)
+            scale, relaxed = _least_energy(subject, cell, self.least, start)
+            for how in ((scale, relaxed), (start, False))[: 1 + (scale != start)]:
+                made = _grown(subject, cell, kind, *how, self.cutoff)
+                if made is not None and _feels(subject, made):
+                    self.best = made
+                    return made
         return None
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Elements that a calculator, its file, its name or its documentation names, the likeliest first."""
+    """Elements that a calculator, its arguments, file or documentation name, the likeliest first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -189,7 +198,9 @@ def meant_for(calculator: Any, words: str) -> list[str]:
         found.sort(key=lambda one: (*_FIRST, one).index(one))
     path = Path(words.partition(".py")[0] + ".py")
     text = path.read_text(errors="replace") if path.is_file() else ""
-    name = words.rpartition("/")[2]
+    # arguments and the name of a file; that of a class or a function ("InPlace", "CoModel") is no element
+    home, _, call = words.partition(":")
+    name = f"{home.rpartition('/')[2] if '/' in home or '.py' in home else ''} {call.partition('(')[2]}"
     spoken = {name.lower(): chemical_symbols[k] for k, name in enumerate(atomic_names) if k}
     said = re.findall(r"[a-z]+", f"{name} {type(calculator).__doc__ or ''} {text}".lower())
     found += [spoken[word] for word in said if word in spoken and word not in _WORDS]
@@ -289,6 +300,16 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
     least = min((one for one in known if one > 0.8), key=lambda one: known[one][0])
     bound = energy_far is not None and known[least][0] < energy_far - 1e-9
     return cutoff, least if bound else None
+
+
+def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
+    """Whether atoms feel each other: a force, or an energy that changes as they move."""
+    energy, forces = subject.both(atoms)
+    moved = atoms.copy()
+    moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
+    other = subject.try_both(moved)
+    change = np.inf if isinstance(other, CalculatorError) else abs(other[0] - energy)
+    return largest(forces) > _SAME or change > _SAME * max(abs(energy), 1.0)
 
 
 def _grown(

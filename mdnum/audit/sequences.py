@@ -57,7 +57,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
     if atoms.pbc.any():
         cluster = atoms.copy()
         cluster.pbc = False
-        yield "the periods were switched off", cluster
+        yield "pbc was switched off", cluster
         molecule = cluster.copy()
         molecule.set_cell(np.zeros((3, 3)))
         yield "the cell was taken away", molecule

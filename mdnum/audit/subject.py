@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import itertools
+import pickle
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -67,8 +68,7 @@ class Repeats:
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
         """Take note of what a new object (its number `which`) answered to its first question."""
-        key = hashlib.blake2b(b"|".join(array.tobytes() for array in bits(atoms)), digest_size=16)
-        before, first = self._known.setdefault((key.digest(), what), (value, which))
+        before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
             self.new.differ += 1
@@ -180,7 +180,7 @@ class CalculatorSubject:
         self.forgets = self.renews = self.saving = self.copies = True
         self._make = make
         self._calculator: Any = None
-        self._last: tuple[np.ndarray, ...] | None = None
+        self._last: bytes | None = None
         self._saved = 0
         # which object it is, and how many structures it has been asked about
         self._object, self._seen = 0, 0
@@ -311,10 +311,8 @@ class CalculatorSubject:
 
     def _ask(self, atoms: Atoms) -> Atoms:
         asked = _bare(atoms) if self.copies else atoms
-        now = bits(asked)
-        same = self._last is not None and all(
-            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(now, self._last, strict=True)
-        )
+        now = _question(asked)
+        same = now == self._last
         if not same:
             if self.forgets and self._nearly(asked):
                 self.forget()
@@ -418,6 +416,18 @@ def rms(forces: np.ndarray) -> float:
 def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
     """Positions, numbers, cell and periods, which stay as they are where the atoms change."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
+
+
+def _question(atoms: Atoms) -> bytes:
+    """A digest of all that a calculator may read: charges, moments, tags and info as well as the structure."""
+    arrays = [atoms.arrays[name] for name in sorted(atoms.arrays)]
+    try:
+        info = pickle.dumps(atoms.info)
+    except Exception:  # whatever somebody has put there
+        info = repr(atoms.info).encode()
+    parts = [repr(sorted(atoms.arrays)).encode(), info]
+    parts += [array.tobytes() for array in (*arrays, np.asarray(atoms.cell), atoms.pbc)]
+    return hashlib.blake2b(b"|".join(parts), digest_size=16).digest()
 
 
 def _bare(atoms: Atoms) -> Atoms:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -122,15 +122,20 @@ def audit(
         raise InputError("no calculator is named", remedy="Name one, or resume an audit")
     loaded = _loaded(calculator)
     _internal(timestep, loaded.units)
-    # a quarter of the time, so that most is left for what it is asked
-    atoms, wanted = _structure(structure, loaded, Deadline(time and time / 4)), _wanted(checks)
+    wanted = _wanted(checks)
+    given = None if structure is None and loaded.atoms is None else _structure(structure, loaded, deadline)
     kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
     kT = kT if temperature is None else temperature * loaded.units.k_B
-    state = AuditState(
-        loaded.name, isinstance(calculator, str), encoded(atoms), kT, loaded.units.name, wanted, temperature,
-        timestep, steps,
-    )  # fmt: skip
-    with frame.new_folder("audit", f"audit-{loaded.stem}", out) as folder:
+    # before the first question, which may never be answered
+    with ExitStack() as stack:
+        frame.end_on_sigterm(stack)
+        folder = stack.enter_context(frame.new_folder("audit", f"audit-{loaded.stem}", out))
+        # a quarter of the time, so that most is left for what it is asked
+        atoms = _structure(None, loaded, Deadline(time and time / 4)) if given is None else given
+        state = AuditState(
+            loaded.name, isinstance(calculator, str), encoded(atoms), kT, loaded.units.name, wanted,
+            temperature, timestep, steps,
+        )  # fmt: skip
         _write_structures(folder, {"structure": atoms})
         return _ask_all(folder, loaded, state, deadline, report, progress)
 
@@ -146,6 +151,7 @@ def _ask_all(
     """Asks the checks that are not done, keeping each answer, and finishes the folder."""
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
+    from mdnum.deadline import interrupting
 
     answers = Answers(folder, state)
     answers.save()
@@ -169,8 +175,12 @@ def _ask_all(
         state.during = name
         try:
             others = [one for one in state.shown if one.name != name]
-            result = _repeatable(_ask(check, subject, log), subject, others)
+            with interrupting(deadline):
+                result = _repeatable(_ask(check, subject, log), subject, others)
         except KeyboardInterrupt:
+            if deadline.passed:
+                state.why = base.TIME_UP
+                break
             if not state.shown:
                 raise
             state.why = "stopped"
@@ -331,11 +341,15 @@ def _summary(state: AuditState) -> dict[str, Any]:
     said = base.answers(state.shown, state.checks)
     why = state.why or "not finished"
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
-    rest = [{"what": f"the check of {name}", "why": why, "part": name} for name in left]
+    whys = dict.fromkeys(left, why) | {name: "not selected" for name in CHECKS if name not in state.checks}
+    rest = [{"what": f"the check of {name}", "why": why, "part": name} for name, why in whys.items()]
     rest += [{"what": what, "why": why, "part": one.name} for one in state.shown for what, why in one.skipped]
     early = frame.UNDECIDED if base.to_come(state.shown, state.checks) else frame.PARTIAL
     status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
-    status = "complete" if state.during is None else status
+    if state.during is None:
+        status = (
+            frame.UNDECIDED if base.nothing_felt(state.shown) and early == frame.UNDECIDED else "complete"
+        )
     return _in_units(
         {
             "system": state.name, "calculator": state.name, "atoms": len(atoms),
@@ -477,6 +491,8 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
             TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name) for one in results
         ]
 
+    if base.nothing_felt(state.shown) and base.to_come(state.shown, state.checks):
+        return _unfinished(state, TEXTS("nothing_felt", name=name))
     if state.shown and not asked and base.to_come(state.shown, state.checks):
         head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
         return _unfinished(state, head)
@@ -498,11 +514,16 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
             remedy = next((one.remedy for one in severe if one.severity == "warning" and one.remedy), "")
             head = TEXTS("what_to_do", head=head, remedy=remedy).rstrip()
     elif state.shown:
-        head = TEXTS("found_nothing", head=head, checks=len(state.shown))
+        nothing = "found_no_errors" if found else "found_nothing"
+        head = TEXTS(nothing, head=head, checks=len(state.shown))
     else:
         head = TEXTS("nothing_asked", head=head)
     refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in state.shown for _, why in one.skipped)
-    head += " " + TEXTS("unasked", elements=listed(list(dict.fromkeys(state.atoms.symbols))))
+    unselected = base.in_order([one for one in CHECKS if one not in state.checks])
+    head += " " + TEXTS(
+        "unasked_checks" if unselected else "unasked", checks=listed(unselected or ["none"]),
+        elements=listed(list(dict.fromkeys(state.atoms.symbols))),
+    )  # fmt: skip
     head += " " + TEXTS("refused", n=refused) if refused else ""
     return _unfinished(state, head)
 

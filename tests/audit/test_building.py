@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ase.build import bulk
 from ase.calculators.eam import EAM
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
@@ -14,7 +15,7 @@ from audit.planted import Good
 
 import mdnum
 from mdnum.audit.building import BUILDING_CALLS, default_structure, meant_for
-from mdnum.audit.subject import LoadedCalculator
+from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
 from mdnum.verbs import frame
 
 TABLE = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
@@ -73,6 +74,43 @@ def test_the_name_and_the_text_of_a_file_are_read(tmp_path):
         (tmp_path / "pot.py").write_text(text)
         assert meant_for(object(), f"{tmp_path}/pot.py:Class(a=1)") == expected
     assert meant_for(object(), "some.package:Own(file='Cu_u3.eam')") == ["Cu"]
+
+
+@pytest.mark.parametrize("kind", ["InPlace", "Tags", "CoModel", "In", "Gold"])
+def test_the_name_of_a_class_or_function_is_no_element(kind, tmp_path):
+    (tmp_path / "pot.py").write_text(f"class {kind}: pass\n" if kind != "Gold" else "")
+    for words in (kind, f"pot.py:{kind}", f"a.package:{kind}(a=1)", f"{tmp_path}/pot.py:{kind}()"):
+        assert meant_for(object(), words) == []
+    assert meant_for(object(), f"a.package:{kind}(file='Si.tersoff')") == ["Si"]
+    assert meant_for(object(), f"{tmp_path}/Si_a.py:{kind}") == ["Si"]
+
+
+@pytest.mark.parametrize(("sigma", "elements"), [(0.8, []), (0.7, ["Na"]), (1.0, ["Cs", "Ar"])])
+def test_a_structure_is_built_in_which_atoms_feel_each_other(sigma, elements):
+    """One that acts below 1.3 Å alone: another spacing, or a smaller element, than that of most crystals."""
+    kind = counted(elements=elements)
+    structure = default_structure(loaded(kind, sigma=sigma, epsilon=0.5, rc=1.25 * sigma))
+    subject = CalculatorSubject("x", lambda: kind(sigma=sigma, epsilon=0.5, rc=1.25 * sigma), structure)
+    assert largest(subject.forces(structure)) > 1e-3 and kind.calls <= BUILDING_CALLS
+
+
+def test_where_no_atom_feels_another_nothing_is_cleared(tmp_path):
+    """One whose energy is that of its atoms, and a gas too thin for one that interacts."""
+    gas = bulk("Ar", "fcc", a=3.9, cubic=True)
+    gas.set_cell(gas.cell.array * 8, scale_atoms=True)
+
+    class Alone(Good):
+        def answer(self, atoms):
+            return -1.5 * len(atoms), np.zeros((len(atoms), 3))
+
+    for n, (kind, structure) in enumerate(((Alone, None), (Good, gas), (Good, gas[:1]))):
+        wanted = ["forces", "curl", "state", "alone", "dynamics"]
+        outcome = mdnum.audit_calculator(
+            kind, structure, checks=wanted, out=tmp_path / f"{n}", steps=20, report=False
+        )
+        assert outcome.summary["status"] == frame.UNDECIDED, n
+        assert "no atom feels another" in outcome.verdict.headline
+        assert "safe" not in outcome.verdict.headline and "found nothing" not in outcome.verdict.headline
 
 
 def test_silicon_for_a_silicon_potential():

@@ -473,3 +473,23 @@ def test_positions_in_single_precision_are_no_kept_answer():
 
     atoms = Atoms("Ar8", crystal().positions + 50.0)
     assert "KEPT_ANSWER" not in codes(asked("state", but(Single, positions=positions), atoms))
+
+
+@pytest.mark.parametrize("make", [planted.ReadsTags, planted.ReadsCharge, planted.ReadsSpin])
+@pytest.mark.parametrize("atoms", [crystal(), chain()], ids=["crystal", "chain"])
+def test_questions_that_differ_in_charges_tags_or_moments_are_not_one(make, atoms: Atoms):
+    """New objects that answer them otherwise are repeatable: what is wrong is that a change is not seen."""
+    asked_about = subject(make, atoms)
+    assert codes(CHECKS["caller"]()(asked_about)) == {"CHANGE_NOT_SEEN": "error"}
+    assert asked_about.repeats.new.times and not asked_about.repeats.findings(asked_about.kT)
+
+
+@pytest.mark.parametrize(
+    ("symbol", "name"), [("Ar", "an Ar atom"), ("Fe", "an Fe atom"), ("Cu", "a Cu atom")]
+)
+def test_elements_have_their_article(symbol: str, name: str):
+    atoms = crystal()
+    atoms.set_chemical_symbols([symbol] * len(atoms))
+    rows = planted.asked("alone", Good, atoms).tables["Atoms alone"]
+    named = [row["atoms"] for row in rows if row["atoms"].startswith(("a ", "an "))]
+    assert named and all(one.startswith(name) for one in named)

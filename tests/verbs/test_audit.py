@@ -27,10 +27,11 @@ from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
 from mdnum.errors import InputError
 from mdnum.plain import plain
+from mdnum.report.words import listed
 from mdnum.store import RunFolder
 from mdnum.units import LJ
 from mdnum.verbs import frame
-from mdnum.verbs.audit import _headline, _in_units
+from mdnum.verbs.audit import TEXTS, _headline, _in_units
 
 QUICK = "invariance,forces"
 CHECKS = in_order(list(checks.CHECKS))
@@ -193,8 +194,27 @@ CARE = "Use x on Ar with care, to run and to differentiate: "
     ],
 )  # fmt: skip
 def test_findings_add_up_to_two_answers(parts, answer, headline):
-    unasked = "Not asked: stress, and elements other than Ar."
-    assert judged(parts) == (answer, answer, f"{headline} {unasked}")
+    found, others = judged(parts), [one for one in CHECKS if one not in {two.name for two in parts}]
+    unasked = f"Not asked: stress, elements other than Ar, and the checks of {listed(others)}." if others else (
+        "Not asked: stress, and elements other than Ar."
+    )  # fmt: skip
+    assert found == (answer, answer, f"{headline} {unasked}")
+
+
+def test_checks_that_were_not_selected_are_named_and_a_measured_number_is_not_nothing():
+    every = [part(name) for name in CHECKS]
+    assert "9 checks found nothing. Not asked: stress, and elements" in judged(every)[2]
+    headline = judged([part("forces", ("A", "info")), *every[1:-1]])[2]
+    assert f"{len(CHECKS) - 1} checks found no errors or warnings" in headline
+    assert "Ar, and the checks of dynamics." in headline
+
+
+def test_no_bound_is_below_the_largest_error(good):
+    """A difference may be smaller than its error by chance, and promises no more than the error."""
+    _, values = good.result["forces"].says
+    assert values["clear_bound"] == max(values["clear_gap"], values["clear_error"])
+    values = {**values, "clear_gap": 3e-4, "clear_error": 0.002, "clear_bound": 0.002}
+    assert "to within 0.002 eV" in TEXTS("forces_right", **values)
 
 
 def test_what_is_largely_unasked_is_not_safe():
@@ -320,7 +340,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
 
 def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch):
     class Spent:
-        looks = 600
+        looks, left = 600, 1e6
 
         def __init__(self, minutes=None):
             self.limited = minutes is not None

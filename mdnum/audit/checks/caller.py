@@ -65,7 +65,10 @@ class CallerCheck(AuditCheck):
         # one that keeps its answer whatever has changed is reported once
         if unseen := [one for one in observed if one.code == "CHANGE_NOT_SEEN"]:
             worst = max(unseen, key=lambda one: one.values["force"])
-            worst.values["changed"] = ", ".join(one.values["changed"] for one in unseen)
+            changed = [one.values["changed"] for one in unseen]
+            *most, last = changed
+            worst.values["changed"] = " and ".join([", ".join(most), last] if most else [last])
+            worst.values["n"] = 2 if most or last.endswith("s") else 1
             observed = [worst, *(one for one in observed if one not in unseen)]
         return CheckResult((["caller_wrong" if observed else "caller_right"], {}), observed, **vars(ways))
 
@@ -79,7 +82,7 @@ def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Call
         yield "numbers", lambda there: there.numbers.__setitem__(slice(None), swapped)
     if atoms.pbc.any():
         yield "cell", lambda there: np.multiply(there.cell.array, 1.01, out=there.cell.array)
-        yield "periods", lambda there: there.pbc.__setitem__(slice(None), False)
+        yield "pbc", lambda there: there.pbc.__setitem__(slice(None), False)
     yield "tags", lambda there: there.set_tags(np.arange(len(there)) % 3)
     yield "info", lambda there: there.info.update(_INFO)
     yield "initial charges", lambda there: there.set_initial_charges(np.linspace(-0.5, 0.5, len(there)))
@@ -187,7 +190,7 @@ def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
         other.copies = False
         if isinstance(other.try_both(there), CalculatorError):
             continue  # reported elsewhere
-        both = zip(("positions", "numbers", "cell", "periods"), bits(given), bits(there), strict=True)
+        both = zip(("positions", "numbers", "cell", "pbc"), bits(given), bits(there), strict=True)
         if changed := [word for word, before, after in both if before.tobytes() != after.tobytes()]:
             yield finding("CHANGED_INPUT", "error", what=what, changed=" and ".join(changed))
             return

@@ -58,6 +58,8 @@ _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
 #: Of two energies of one structure: changes of their difference that rounding explains, of doubles and of
 #: numbers of single precision.
 _ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
+#: eV/Å: a force below is none, where no noise is louder.
+_NOTHING = 1e-12
 #: Å to either side, for the derivative of that difference, and the error of it, roughly.
 _STEP, _CENTRAL = 1e-3, 1e-3
 
@@ -171,6 +173,9 @@ class ForcesCheck(AuditCheck):
         numbers = {
             "directions": len(slopes), "disagree": values["wrong"], "could_not_tell": len(unclear),
             "largest_difference": values["gap"], "largest_error": values["error"], "rms_force": scale,
+            # the structure is displaced: in a perfect crystal, too, there would be a force
+            "nothing_felt": scale <= max(noise.force, _NOTHING)
+            and all(abs(one.difference) <= max(_SIGNIFICANT * one.error, _NOTHING) for one in slopes),
             "step": _worst(slopes).step, "noise_energy": noise.energy, "noise_force": noise.force,
         }  # fmt: skip
         return CheckResult(
@@ -189,10 +194,11 @@ class ForcesCheck(AuditCheck):
 
 def _values(slopes: list[Slope], unclear: list[Slope], scale: float) -> dict[str, Any]:
     clear = [one for one in slopes if not any(one is other for other in unclear)] or slopes
+    gap, error = max(one.gap for one in clear), max(one.error for one in clear)
     return {
         "directions": len(slopes), "clear": len(clear), "wrong": sum(not one.agrees for one in slopes),
         "gap": max(one.gap for one in slopes), "error": max(one.error for one in slopes),
-        "clear_gap": max(one.gap for one in clear), "clear_error": max(one.error for one in clear),
+        "clear_gap": gap, "clear_error": error, "clear_bound": max(gap, error),
         "scale": scale, "unclear": len(unclear),
         "unclear_direction": unclear[0].direction if unclear else "",
         "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
@@ -211,7 +217,7 @@ def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -
 
 
 def _worst(slopes: list[Slope]) -> Slope:
-    return max(slopes, key=lambda one: one.gap / one.error)
+    return max(slopes, key=lambda one: one.gap / max(one.error, 1e-300))
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
