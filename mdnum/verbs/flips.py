@@ -77,8 +77,8 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
-        drop_repeats: leave out every frame that is an earlier one again, bit for bit; the others keep their
-            numbers. Such frames are reported either way.
+        drop_repeats: leave out every frame that is an earlier one again, or has its time; the others keep
+            their numbers. Such frames are reported either way.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
