@@ -1,8 +1,8 @@
-"""Frames that repeat earlier ones bit for bit, or have their times: an overlap at a restart, no motion at all.
+"""Frames that repeat earlier ones bit for bit, or have their times: a restart, or no motion at all.
 
 A run that continues from a checkpoint writes some frames again, joined files have frames in common, and a
 simulation that stopped, or a rejected Monte Carlo move, leaves the frame before. Times do not always tell. A
-restart that rounds otherwise, or wraps its atoms, repeats times and not bits: of two frames the first is kept.
+restart that rounds otherwise repeats times and not bits: of two frames the first is kept.
 """
 
 from __future__ import annotations

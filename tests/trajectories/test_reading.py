@@ -165,6 +165,8 @@ def test_dcd_of_either_byte_order_is_read_and_one_with_long_record_markers_is_on
     if marker == "i":
         assert error is None and len(frames) == 4
         assert frames[3].positions.min() >= 0 and frames[3].positions.max() <= SIDE
+        # a step of 0.02 of 48.9 fs, after the first
+        np.testing.assert_allclose([one.time for one in frames], 0.02 * 0.0488882 * np.arange(1, 5), rtol=1e-5)
     else:
         assert error is not None and "cannot open it" in str(error)
 
