@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.io import netcdf_file
 
-from mdnum.reading import CHECK, check_claim, reading
+from mdnum.reading import check_claim, reading
 from mdnum.trajectories.binary import TrrFile, opened
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
@@ -148,8 +148,7 @@ class MDAnalysisTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
-        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-        with reading(path, remedy=CHECK + hint if topology is None else CHECK):
+        with reading(path):
             self._universe, said = self._universe_of(format)
             if topology is None:
                 self.table = AtomTable.of(self._universe.atoms)
@@ -265,7 +264,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factor(trajectory: Any) -> float:
-    """Times in a DCD file over MDAnalysis's, which takes the step in the head in this machine's byte order."""
+    """Times in a DCD file over MDAnalysis's, which takes the step in this machine's byte order."""
     if "DCD" not in formats_of(trajectory):
         return 1.0
     with Path(trajectory.filename).open("rb") as file:
