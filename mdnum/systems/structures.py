@@ -28,8 +28,6 @@ _MOST_ATOMS = 20_000_000
 _ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
 #: Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff.
 _FARTHEST = 1e8
-# sizes of a system away from its middle at which no atom is
-_LOST = 1e5
 #: Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair.
 _SMALLEST_IN_SIGMA = 0.4
 
@@ -203,15 +201,6 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
             f"two neighboring numbers lie {np.spacing(places[worst]):.2g} {length} apart; expected at most "
             f"{farthest:.3g} {length}, {_FARTHEST:g} cutoffs",
             remedy="Correct the structure: its numbers, its unit, or its rattle",
-        )
-    away = np.abs(atoms.positions - np.median(atoms.positions, axis=0)).max(axis=1)
-    size = max(float(np.abs(np.asarray(atoms.cell)).max()), float(np.median(away)), r_cut)
-    if away.max() > _LOST * size:
-        worst = int(np.argmax(away))
-        raise InputError(
-            f"atom {worst} ({atoms.symbols[worst]}) is {away[worst]:g} {length} away from the others, "
-            f"{away[worst] / size:.2g} times the size of the system",
-            remedy="Correct the structure: what is damaged looks like this",
         )
     sides = np.abs(np.asarray(atoms.cell)).max(axis=1)
     if np.isfinite(sides).all() and (sides > farthest).any():

@@ -233,7 +233,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
     if topology is None and kinds[0] not in _BARE and kinds[1] in _BARE:
         # a structure that several frames have is a trajectory
         with suppress(InputError):
-            if kinds[0] not in _STRUCTURES and len(open_trajectory(first).sample()) > 1:
+            if kinds[0] not in _STRUCTURES and len(open_trajectory(names[0]).sample()) > 1:
                 return
         raise InputError(
             f"two paths are two trajectories to compare, and {Path(names[0]).name} looks like the "
