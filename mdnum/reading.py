@@ -30,15 +30,30 @@ CHECK = "Check that the file is whole and of the kind its name says"
 CHECK_STRUCTURE = "Check that `ase.io.read` opens it; extxyz is the safest format"
 # what the end of the file looks like to ASE's reader of traj
 _ENDS = "buffer is smaller than requested size"
+# beginnings of files that their readers cannot read, with what they are and what to do
+_NOT_SUPPORTED = {
+    b"CDF\x05": ("CDF-5 is not supported", "Convert it with nccopy -k classic"),
+    **dict.fromkeys(
+        (b"T" + bytes(7) + b"CORD", bytes(7) + b"TCORD"),
+        ("record markers of 64 bits are not supported in a DCD file", "Write it with those of 32 bits"),
+    ),
+}
+# what readers say of a file that does not say how many atoms it has
+_NO_ATOMS = ("cannot deduce the number of atoms", "topology can be minimally inferred")
+# words for exceptions that say too little
+_SAID = (
+    (r"KeyError: '([A-Z][a-z]{0,2})'", r"\1 is the symbol of no element"),
+    (r".*netcdf_variable.* no attribute '(\w+)'", r"a variable lacks the attribute \1, which AMBER requires"),
+)
 # what MDAnalysis puts around the message of one of its parsers
 _WRAPPED = ("Failed to construct topology", "Failed to load from the topology")
 # names of columns that are velocities or momenta
 _VELOCITY = re.compile(r"(v|vel\w*|v_?[xyz]|mom|momentum|momenta\w+)", re.IGNORECASE)
 # the number of atoms in the head of formats whose readers count up to it, or fill memory, at once
-_LINE_ONE, _PRMTOP = r"\s*(\d+)", r".*?%FLAG POINTERS\s*%FORMAT[^\n]*\s*(\d+)"
+_LINE_ONE, _PRMTOP = r"\s*(-?\d+)", r".*?%FLAG POINTERS\s*%FORMAT[^\n]*\s*(\d+)"
 _ANNOUNCED = {
-    ".xyz": _LINE_ONE, ".txyz": _LINE_ONE, ".arc": _LINE_ONE, ".gro": r"[^\n]*\n\s*(\d+)",
-    ".inpcrd": r"[^\n]*\n\s*(\d+)", ".psf": r".*?(\d+)\s*!NATOM", ".data": r".*?\n\s*(\d+)\s+atoms",
+    ".xyz": _LINE_ONE, ".txyz": _LINE_ONE, ".arc": _LINE_ONE, ".gro": r"[^\n]*\n\s*(-?\d+)",
+    ".inpcrd": r"[^\n]*\n\s*(-?\d+)", ".psf": r".*?(\d+)\s*!NATOM", ".data": r".*?\n\s*(\d+)\s+atoms",
     ".crd": r"(?:\s*\*[^\n]*\n)*\s*(\d+)", ".prmtop": _PRMTOP, ".parm7": _PRMTOP, ".top": _PRMTOP,
 }  # fmt: skip
 _HEAD = 20_000
@@ -102,6 +117,13 @@ def reading(
                 remedy="Install the package, or convert the file to xtc or extxyz",
                 where=where,
             ) from error
+        if any(one in said for one in _NO_ATOMS):
+            remedy = "It does not say what its atoms are: give its topology with -s TOPOLOGY"
+        with suppress(OSError), open(file, "rb") as raw:
+            head = raw.read(12)
+            said, remedy = next(
+                (_NOT_SUPPORTED[one] for one in _NOT_SUPPORTED if head.startswith(one)), (said, remedy)
+            )
         raise InputError(f"{by} cannot open it ({said})", remedy=remedy, where=where) from error
     finally:
         sys.unraisablehook = hook
@@ -126,7 +148,7 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
         with suppress(OSError, EOFError, ValueError, zlib.error), open_with_compression(str(path)) as file:
             found = re.match(announced, file.read(_HEAD), re.DOTALL)
     atoms = atoms or (int(found[1]) if found else 0)
-    if atoms > _MOST_ATOMS * max(size, 1):
+    if atoms < 0 or atoms > _MOST_ATOMS * max(size, 1):
         said = f"it announces {atoms:,} atoms, which its {size:,} bytes cannot hold"
         raise InputError(said, remedy=CHECK, where=str(path))
 
@@ -146,7 +168,8 @@ def first_line(error: BaseException) -> str:
         return "the file ends in it"
     said = text[0].rstrip(".") if text else ""
     # the message of some is no more than a key or a number
-    return said if " " in said else f"{type(error).__name__}: {said}" if said else type(error).__name__
+    said = said if " " in said else f"{type(error).__name__}: {said}" if said else type(error).__name__
+    return next((match.expand(words) for one, words in _SAID if (match := re.fullmatch(one, said))), said)
 
 
 # ---- ASE

@@ -35,6 +35,28 @@ def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("frames", "suffix"), [(15, "xyz"), (2, "extxyz"), (2, "pdb"), (1, "xyz"), (1, "pdb")]
+)
+def test_a_file_of_several_frames_is_a_trajectory_to_compare(frames, suffix, capsys, tmp_path):
+    import ase.io
+    import MDAnalysis
+
+    rng = np.random.default_rng(0)
+    images = [ase.Atoms("Ar8", rng.uniform(0, 9, (8, 3)), cell=[9] * 3, pbc=True) for _ in range(frames)]
+    first, second = str(tmp_path / f"a.{suffix}"), str(tmp_path / "b.xtc")
+    ase.io.write(first, images, format={"pdb": "proteindatabank"}.get(suffix, suffix))
+    universe = MDAnalysis.Universe.empty(8, trajectory=True)
+    universe.dimensions = [9, 9, 9, 90, 90, 90]
+    with MDAnalysis.Writer(second, 8) as writer:
+        for atoms in images:
+            universe.atoms.positions = atoms.positions
+            writer.write(universe)
+    code = call("flips", first, second, "--cutoff", "4", "-o", str(tmp_path / "f"), "--no-report")
+    assert (code == 2) == (frames == 1)
+    assert ("looks like the topology" in capsys.readouterr().err) == (frames == 1)
+
+
 def test_the_library_gives_the_ledger_that_the_verb_writes(capsys, tmp_path):
     import MDAnalysis
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 # share of their extent in every frame before to which atoms do not shrink together
 _COLLAPSED = 0.02
@@ -20,6 +20,8 @@ _ALIKE, _MORE = 0.2, 3.0
 _SUDDEN = 10.0
 # up to as many atoms may come to one place
 _FEW = 3
+# sizes of a system without a box that are far between two frames; a few atoms may be wrapped in a large box
+_FAR, _FAR_FEW = 300.0, 1e4
 
 
 @dataclass
@@ -30,6 +32,7 @@ class Collective:
     last: Float[np.ndarray, "some 3"] | None = None  # positions in the last one
     alike: float = 0.0  # the largest share of atoms that had one coordinate
     drift: float | None = None  # the longest shift of all atoms between two of them, length
+    level: Bool[np.ndarray, "3"] | None = None  # coordinates that all atoms had in common in each of them
 
     def refuse(self, x: Float[np.ndarray, "some 3"], atoms: int, side: float, far: float) -> str | None:
         """Why the atoms cannot have moved to where they are now, in words; None where they may have.
@@ -58,12 +61,26 @@ class Collective:
                 return (
                     f"{there.mean():.0%} of all atoms have {'xyz'[axis]} = {value:g}, as in no frame before"
                 )
-        far = far or 1e4 * float(now[2])
+        far = far or (_FAR if atoms > _FEW else _FAR_FEW) * float(now[2])
         shift = _shift(last, x, far)
         if shift > (_SUDDEN * far if self.drift is None else max(_SUDDEN * self.drift, far)):
             return f"all atoms are shifted by {shift:.3g} from where they were a frame before"
         self.drift = max(self.drift or 0.0, shift)
         return None
+
+    def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
+        """What all atoms had in common in all frames before, if they cannot have left it so; else empty."""
+        last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
+        self.level = level if was is None else was & level
+        if last is None or was is None or atoms <= _FEW or not was.any() or self.level.any():
+            return ""
+        shift, now = np.median(x - last, axis=0), spreads(x)
+        apart = np.median(np.abs(x - last - shift), axis=0)
+        # what starts flat leaves its plane no faster than it moves along it
+        sudden = apart[was].max() > _SUDDEN * apart[~was].max(initial=0.0)
+        sudden |= np.abs(shift[was]).max() > _FAR * now[2]
+        gone = sudden and _flat(spreads(last), now, atoms, True) is not None
+        return ", ".join(f"{'xyz'[k]} = {last[0, k]:g}" for k in np.flatnonzero(was)) if gone else ""
 
 
 def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
@@ -105,7 +122,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
     """How far all atoms are shifted from where they were, length; 0 where not far, or not together."""
     moved = now - before
-    if len(now) < 2 or not far or np.abs(moved).max() <= far / 2:
+    if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0
     shift = np.median(moved, axis=0)
     size, apart = float(np.linalg.norm(shift)), float(np.median(np.abs(moved - shift).max(axis=1)))

@@ -162,7 +162,7 @@ class FrameCheck:
         if not np.isfinite(frame.furthest_of(atoms)):
             bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
             yield f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed
-        if (found := far_out(frame, atoms, self.radius, self.bits)) is not None:
+        if (found := far_out(frame, atoms, self.radius, self.bits, self.collective.last)) is not None:
             what = f": {place(found[0])}, {found[2]}{_and_others(found[1])}"
             yield what, f"{failed}; an atom that did fly off is left out with --between"
         # one atom may well be at the origin; two cannot be at one place
@@ -174,6 +174,9 @@ class FrameCheck:
             what = f": {some}, as where coordinates were never written"
             yield what, "Leave the frame out with @START:STOP, or the atoms with --between"
         some, far = x[:: max(1, len(x) // _SOME)], _LEAP_BOXES * frame.box.longest
+        if lay := self.collective.left(some, len(x)):
+            what = f" is the first in which not all atoms have {lay}: the frames before it cannot be right"
+            yield what, f"Leave them out, and begin with this one (@{frame.index}:)"
         if (why := self.collective.refuse(some, len(x), frame.box.shortest, far)) is not None:
             yield f": {why}", failed
 
@@ -193,9 +196,15 @@ def _and_others(count: int) -> str:
 
 
 def far_out(
-    frame: Frame, atoms: AtomIndices = None, radius: float = np.inf, bits: int = 64
+    frame: Frame,
+    atoms: AtomIndices = None,
+    radius: float = np.inf,
+    bits: int = 64,
+    before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
     """The atom that is furthest out, where that is further than can be; arguments as of `FrameCheck`.
+
+    Positions of some atoms a frame before tell the size of a system half of which is damaged.
 
     Returns:
         (the atom, how many are too far out, why in words); None where none is.
@@ -210,6 +219,11 @@ def far_out(
         return None
     away = np.abs(x - np.median(x, axis=0)).max(axis=1)
     size = max(box, float(np.median(away)))
+    if before is not None and len(before) > 1:
+        there = np.median(before, axis=0)
+        usual = max(box, float(np.median(np.abs(before - there).max(axis=1))))
+        if usual and away.max() > (_FAR_BOXES if box else _FAR_SIZES) * usual:
+            size, away = usual, np.abs(x - there).max(axis=1)
     limit = (_FAR_BOXES if box else _FAR_SIZES) * size
     if size and away.max() > limit:
         at, what = np.argmax(away), "the box" if box >= size else "all the rest"

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import struct
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.io import netcdf_file
 
-from mdnum.reading import CHECK, check_claim, reading
+from mdnum.reading import check_claim, reading
 from mdnum.trajectories.binary import TrrFile, opened
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.text import refuse_cut_line
@@ -146,8 +148,7 @@ class MDAnalysisTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
-        hint = "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-        with reading(path, remedy=CHECK + hint if topology is None else CHECK):
+        with reading(path):
             self._universe, said = self._universe_of(format)
             if topology is None:
                 self.table = AtomTable.of(self._universe.atoms)
@@ -156,6 +157,7 @@ class MDAnalysisTrajectory(Trajectory):
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
             self.time = "frame" if _has_no_times(trajectory, said) else "ps"
+            self._time_factor = _time_factor(trajectory)
             self._boxes = Boxes(trajectory)
             self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
@@ -200,7 +202,8 @@ class MDAnalysisTrajectory(Trajectory):
             # some formats go forward only, so that the next frame is asked for as the next
             forward = at is not None and number == at + 1 and trajectory.ts.frame == at
             ts, at = frames.timestep(number, forward), number
-            return frames.frame(ts, number, self.time == "frame")
+            frame = frames.frame(ts, number, self.time == "frame")
+            return replace(frame, time=frame.time * self._time_factor)
 
         yield get
 
@@ -258,6 +261,19 @@ def _length_of(trajectory: Any) -> str:
         return "Å" if unit else ""
     # left as they are, because the file did not name all its units
     return "Å" if str(unit) in ("A", "Angstrom", "angstrom") else str(unit)
+
+
+def _time_factor(trajectory: Any) -> float:
+    """Times in a DCD file over MDAnalysis's, which takes the step in this machine's byte order."""
+    if "DCD" not in formats_of(trajectory):
+        return 1.0
+    with Path(trajectory.filename).open("rb") as file:
+        head = file.read(88)
+    order = "<" if head[:1] == b"T" else ">"
+    # without a version, it is X-PLOR's
+    (step,) = struct.unpack_from(order + ("f" if any(head[84:]) else "d"), head, 44)
+    read = trajectory._file.header["delta"]
+    return step / read if step and read else 1.0
 
 
 def _has_no_times(trajectory: Any, said: list[str]) -> bool:

@@ -1,7 +1,8 @@
-"""Frames that repeat earlier ones bit for bit: an overlap at a restart, a copied stretch, no motion at all.
+"""Frames that repeat earlier ones bit for bit, or have their times: a restart, or no motion at all.
 
 A run that continues from a checkpoint writes some frames again, joined files have frames in common, and a
-simulation that stopped, or a rejected Monte Carlo move, leaves the frame before. Times do not always tell.
+simulation that stopped, or a rejected Monte Carlo move, leaves the frame before. Times do not always tell. A
+restart that rounds otherwise repeats times and not bits: of two frames the first is kept.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from mdnum.trajectories.frame import Frame
 
 # atoms that are digested one by one, for speed; a checksum stands for all
 _ATOMS = 1000
+# fractions of the box that are the same place: far above the rounding of float64, far below any motion
+_SAME = 1e-8
 
 
 def digest(frame: Frame) -> bytes:
@@ -34,6 +37,8 @@ class Repeats:
     Attributes:
         drop: leave them out when frames are passed on.
         frames: how many there are.
+        again: ranges of other frames whose times were there before, with numbers as in `stretches`, the first
+            and the last time (time, to), and how many there are (frames).
         stretches: of consecutive ones that repeat consecutive ones: numbers in the file (first, last,
             of_first, of_last), and whether that is one frame without motion (still).
     """
@@ -44,12 +49,43 @@ class Repeats:
     # (place, number) of each frame known, and how far back the last one was found; 0 where it is new
     _known: dict[bytes, tuple[int, int]] = field(default_factory=dict)
     _place = _back = 0
+    again: list[dict[str, Any]] = field(default_factory=list)
+    # digests (cells, frame) by that of the fractions of the box
+    _wrapped: dict[bytes, tuple[bytes, bytes]] = field(default_factory=dict)
+    # numbers of frames by time, and the place of the last one whose time was there
+    _times: dict[str, int] = field(default_factory=dict)
+    _had = 0
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Passes frames on, without those that repeat others if they are to be left out."""
         for frame in frames:
-            if not (self.see(frame.index, digest(frame)) and self.drop):
+            if not (
+                self.see(frame.index, self._digest(frame)) | self.had(frame.index, frame.time) and self.drop
+            ):
                 yield frame
+
+    def _digest(self, frame: Frame) -> bytes:
+        """Of the frame, or of an earlier one that had the same atoms in other cells."""
+        digested, box = digest(frame), frame.box
+        if not box.pbc.all() or not np.linalg.det(box.matrix):
+            return digested
+        x = frame.positions[:: max(1, len(frame.positions) // _ATOMS)]
+        cells, rest = np.divmod(np.rint(x @ np.linalg.inv(box.matrix) / _SAME), 1 / _SAME)
+        key, mine = (blake2b(one.tobytes(), digest_size=16).digest() for one in (rest + 0.0, cells + 0.0))
+        before, known = self._wrapped.setdefault(key + box.matrix.tobytes(), (mine, digested))
+        return digested if before == mine else known
+
+    def had(self, number: int, time: float) -> bool:
+        """Whether the next frame, once it was seen, has the time of an earlier one, and times had gone on."""
+        of = self._times.setdefault(f"{time:.12g}", number)
+        if of == number or len(self._times) < 2:
+            return False
+        if not self._back:
+            if not self.again or self._had < self._place - 1:
+                self.again.append({"first": number, "of_first": of, "time": time, "frames": 0})
+            last, self._had = self.again[-1], self._place
+            last |= {"last": number, "of_last": of, "to": time, "frames": last["frames"] + 1}
+        return True
 
     def see(self, number: int, digested: bytes) -> bool:
         """Whether the next frame, of this number in the file, repeats an earlier one."""
@@ -69,4 +105,4 @@ class Repeats:
     def plain(self, most: int = 100) -> dict[str, Any]:
         """As plain values, with so many of the stretches."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
-        return sizes | {"dropped": self.drop, "ranges": self.stretches[:most]}
+        return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -248,6 +248,8 @@ def _whole_number(line: str, what: str) -> int:
 
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
     """The lines of so many atoms, behind some others."""
+    if atoms < 0:
+        raise ValueError(f"{atoms} where the number of atoms is expected")
     rows = list(islice(lines, head + atoms))
     if len(rows) < head + atoms:
         raise ValueError(f"the file ends after {max(len(rows) - head, 0):,} of {atoms:,} atoms")

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed
 from mdnum.systems import structures
+from mdnum.trajectories.frame import Box, Frame, far_out
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
@@ -58,7 +61,11 @@ def check(question: str, system: System) -> Checked:
 
 
 def structure_findings(system: System) -> Iterator[Finding]:
-    """What a run would not make of a structure as its author may think: its temperature, its velocities."""
+    """What a run would not make of a structure as its author may think: its temperature, its velocities, its size."""
+    atoms = system.atoms
+    frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
+    if (far := far_out(frame)) is not None:
+        yield TEXTS.finding("ATOM_FAR", atom=far[0], why=far[2])
     structure, dynamics = system.spec.structure, system.spec.dynamics
     if (velocities := system.velocities) is not None:
         masses = system.atoms.get_masses()

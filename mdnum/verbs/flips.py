@@ -7,6 +7,7 @@ import struct
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from itertools import chain
 from numbers import Real
@@ -44,6 +45,8 @@ _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
 _BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
 _Pairs = str | Mapping[tuple[str, str], float]
+# and files that say what the atoms are and hold one frame, if any
+_STRUCTURES = frozenset({"psf", "prmtop", "parm7", "top", "tpr", "itp", "data", "mol2"})
 _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
 
 
@@ -79,8 +82,8 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
-        drop_repeats: leave out every frame that is an earlier one again, bit for bit; the others keep their
-            numbers. Such frames are reported either way.
+        drop_repeats: leave out every frame that is an earlier one again, or has its time; the others keep
+            their numbers. Such frames are reported either way.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
@@ -231,13 +234,17 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
     """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
-    from mdnum.trajectories.trajectory import IN_MEMORY
+    from mdnum.trajectories.trajectory import IN_MEMORY, open_trajectory
 
     for one in (first, second):
         expect_path(one, IN_MEMORY)
     names = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
-    bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in names]
-    if topology is None and not bare[0] and bare[1]:
+    kinds = [Path(one).suffix.lower().lstrip(".") for one in names]
+    if topology is None and kinds[0] not in _BARE and kinds[1] in _BARE:
+        # a structure that several frames have is a trajectory
+        with suppress(InputError):
+            if kinds[0] not in _STRUCTURES and len(open_trajectory(names[0]).sample()) > 1:
+                return
         raise InputError(
             f"two paths are two trajectories to compare, and {Path(names[0]).name} looks like the "
             f"topology of {Path(names[1]).name}",

@@ -12,7 +12,7 @@ import numpy as np
 from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
-from mdnum.report.words import count, many, number, percent, plain
+from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
@@ -201,7 +201,7 @@ def _others(view: FlipsView) -> Iterator[Finding]:
             values = {"interval": view.time(number(summary["interval"])), "swapped": swapped}
             yield TEXTS.finding("TIMES_ODD", *["swapped"] * bool(swapped), **values)
         elif summary["backward"]:
-            yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
+            yield _time_goes_back(view)
         elif not summary["even"]:
             yield TEXTS.finding("UNEVEN_FRAMES", interval=view.duration(1))
     axes = repeating(summary["box"])
@@ -210,6 +210,17 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         yield TEXTS.finding("READING", *more, notes=" ".join(summary["notes"]), axes=", ".join(axes))
     if any(one["min_margin"] == 0 for one in summary["rules"]):
         yield TEXTS.finding("TIE", margin=view.length(0.0))
+
+
+def _time_goes_back(view: FlipsView) -> Finding:
+    """At which frames, and which frames have the times of earlier ones."""
+    rows = view.table("frames")
+    numbers, times = (rows[name][rows["rule"] == 0] for name in ("number", "time"))
+    told = view.again(view.summary["repeats"].get("again", ()))
+    for at in np.flatnonzero(np.diff(times) <= 0)[:_ROWS] if not told else ():
+        before, now = plain(float(times[at]), 9), view.time(plain(float(times[at + 1]), 9))
+        told.append(TEXTS("back_at", number=int(numbers[at + 1]), before=before, now=now))
+    return TEXTS.finding("TIME_GOES_BACK", frames=view.summary["backward"], places=listed(told))
 
 
 # ---- sections

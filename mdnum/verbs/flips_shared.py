@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,6 +192,10 @@ class FlipsView(View):
 
     def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
         """The finding on frames that repeat earlier ones, if any do; of one of two files by its name."""
+        again = repeats.get("again", ()) if repeats else ()
+        if again and repeats and repeats["dropped"]:
+            total = sum(one["frames"] for one in again)
+            yield TEXTS.finding("TIME_GOES_BACK", "dropped", frames=total, places=listed(self.again(again)))
         if not repeats or not repeats["frames"]:
             return
         ranges, examined = repeats["ranges"], self.summary["frames"]
@@ -206,6 +210,15 @@ class FlipsView(View):
         variants = ["still"] * still + ["few"] * (still and few) + [kept]
         values = {"frames": repeats["frames"], "file": f"{file}: " if file else ""}
         yield TEXTS.finding("REPEATED_FRAMES", *variants, ranges=listed(told), **values)
+
+    def again(self, again: Sequence[Mapping[str, Any]]) -> list[str]:
+        """Which frames have the times of earlier ones, in words."""
+        told = []
+        for one in again[:_RANGES]:
+            times = plain(one["time"], 9), self.time(plain(one["to"], 9))
+            kind = "one" if one["first"] == one["last"] else "many"
+            told.append(TEXTS(f"again_{kind}", **{**one, "time": times[0], "to": times[1]}))
+        return told
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
         """(label, values) of an axis along the trajectory."""

@@ -105,6 +105,22 @@ def test_velocities_of_another_name_are_said_to_be_ignored(tmp_path: Path, colum
     )
 
 
+@pytest.mark.parametrize("unit", ["metal", "lj"])
+def test_an_atom_out_of_the_world_is_a_warning(tmp_path: Path, unit: str, capsys) -> None:
+    path = made(tmp_path, units=unit)
+    assert call("systems", "check", str(path)) == 0
+    for far, odd in ((2**31 / 100, True), (-(2**31) / 100, True), (500.0, False)):
+        atoms = ase.io.read(tmp_path / "s.extxyz")
+        # to an image of its own, which overlaps with nothing
+        atoms.positions[7, 1] += round(far / atoms.cell[1, 1]) * atoms.cell[1, 1]
+        ase.io.write(tmp_path / "s.extxyz", atoms)
+        capsys.readouterr()
+        assert call("systems", "check", str(path)) == odd
+        text = capsys.readouterr().out
+        assert ("atom 7 is" in text and "away from the others" in text) == odd and ("fine" in text) != odd
+        made(tmp_path, units=unit)
+
+
 @pytest.mark.slow
 def test_the_command_line_and_a_run_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = made(tmp_path, actual=0.64)

@@ -5,6 +5,7 @@ What is planar, straight, drifting or wrapped by nature stays what it is.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import ase.io
@@ -41,9 +42,11 @@ def examined(positions, side: float | None = SIDE, atoms=None) -> list[Frame]:
 
 
 def refused(said: str, positions, side: float | None = SIDE, frame: int = 5, atoms=None) -> None:
-    with pytest.raises(FrameError, match=f"frame {frame}: .*{said}") as caught:
+    with pytest.raises(FrameError, match=f"frame {frame}:? ?.*{said}") as caught:
         examined(positions, side, atoms)
-    assert caught.value.frame == frame and f"@:{frame}" in str(caught.value)
+    assert caught.value.frame == frame and {f"@:{frame}", f"@{frame}:"} & set(
+        re.findall(r"@[\d:]+", str(caught.value))
+    )
 
 
 def spoiled(how, positions=None, number: int = 5):
@@ -100,6 +103,48 @@ def test_a_frame_that_collapsed_or_was_shifted_far_ends_the_file(how, said, side
     refused(said, spoiled(how), side)
 
 
+@pytest.mark.parametrize("side", [SIDE, None])
+@pytest.mark.parametrize("bad", [1, 2, 5])
+@pytest.mark.parametrize(
+    ("axis", "value", "said"),
+    [
+        (2, 2**31 / 100, "z = 2.14748e.07"),
+        (2, 0.0, "z = 0"),
+        (0, 6.0, "x = 6"),
+        ([0, 1], 3.0, "x = 3, y = 3"),
+        ([0, 1, 2], 4.0, "x = 4, y = 4, z = 4"),
+    ],
+)
+def test_first_frames_that_collapsed_are_named_and_not_the_good_one_behind_them(axis, value, said, side, bad):
+    positions = [put(axis, value)(x) if k < bad else x for k, x in enumerate(liquid())]
+    refused(f"is the first in which not all atoms have {said}: the frames before", positions, side, bad)
+    assert len(examined(positions[bad:], side)) == 8 - bad
+
+
+@pytest.mark.parametrize("side", [SIDE, None])
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+@pytest.mark.parametrize("last", [6, 8])
+def test_a_part_of_the_atoms_that_is_far_out_is_damage_as_one_is(share, last, side):
+    """In one frame, or from one on."""
+    positions = list(liquid(32))
+    for x in positions[5:last]:
+        x[: int(32 * share), 1] += 2**31 / 100
+    refused("atom .* away from the others, and .* others likewise", positions, side)
+
+
+@pytest.mark.parametrize("atoms", [5, 40])
+def test_a_cluster_without_a_box_does_not_leap_by_hundreds_of_its_sizes(atoms):
+    """Nor is it left where it was by a shift of some sizes, to the middle of a box that the file lacks."""
+    cluster = [x * 7 / SIDE for x in liquid(atoms)]
+    refused(
+        "all atoms are shifted by 2.15e",
+        [x + (k > 4) * 2**31 / 1e6 * np.eye(3)[2] for k, x in enumerate(cluster)],
+        None,
+    )
+    for far in (7.0, 100.0):
+        assert len(examined([x + (k > 4) * far for k, x in enumerate(cluster)], None)) == 8
+
+
 @pytest.mark.parametrize("atoms", [5, 8, 500, 3000])
 def test_it_does_not_depend_on_how_many_atoms_there_are(atoms):
     refused("in a plane, z = 21", spoiled(put(2, 2**31 / 1e8), liquid(atoms, 7)))
@@ -149,6 +194,17 @@ FINE = {
     "a layer that is held": (put_some(2, 0.0, 20)(x) for x in liquid()),
     "atoms that settle one by one": (put_some(2, 0.0, 2 * k)(x) for k, x in enumerate(liquid())),
     "a line": (along(x, (1, 2, 3)) for x in liquid()),
+    # planar, straight or of layers in the first frames, and not for ever
+    "a sheet that begins to ripple": (
+        HONEYCOMB + RNG.normal(0, 0.02, (64, 3)) * [1, 1, 0.5 * k] for k in range(8)
+    ),
+    "a molecule that is planar at first": (AMMONIA * [1, 1, k / 3] for k in range(4)),
+    "a ring that is planar at first": (RING + RNG.normal(0, 0.1, (12, 3)) * (k > 0) for k in range(8)),
+    "a gas that starts in a plane": (x * [1, 1, k > 0] for k, x in enumerate(liquid(step=4.0))),
+    "a gas that starts on a line": (x * [1, k > 0, k > 0] for k, x in enumerate(liquid(step=4.0))),
+    "a crystal that melts": (CRYSTAL + RNG.normal(0, 0.3 * k, (64, 3)) for k in range(8)),
+    "two atoms on an axis at first": (x[:2] * [1, k > 0, k > 0] for k, x in enumerate(liquid())),
+    "three atoms on an axis at first": (x[:3] * [1, k > 0, k > 0] for k, x in enumerate(liquid())),
     # few atoms
     "one atom": (x[:1] for x in liquid(step=5.0)),
     "one atom that drifts": (np.full((1, 3), 1e5 * k) for k in range(8)),

@@ -151,9 +151,31 @@ def dcd(path: Path, rng, order="<", marker="i") -> Path:
 
 def test_netcdf_without_units_or_of_another_kind_is_one_line(tmp_path, rng):
     assert len(frames_of(amber(tmp_path / "good.nc", rng))[0]) == 4
-    for path in (amber(tmp_path / "a.nc", rng, units=False), amber(tmp_path / "b.nc", rng, magic=b"CDF\x05")):
+    bad = {
+        "lacks the attribute units": amber(tmp_path / "a.nc", rng, units=False),
+        "CDF-5 is not supported": amber(tmp_path / "b.nc", rng, magic=b"CDF\x05"),
+    }
+    for said, path in bad.items():
         frames, error = frames_of(path)
-        assert not frames and error is not None and str(path) in str(error)
+        assert not frames and error is not None and str(path) in str(error) and said in str(error)
+        assert ("nccopy" in str(error)) == ("CDF-5" in said) and "-s TOPOLOGY" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.extxyz", "1\nProperties=species:S:1:pos:R:3\nUue 0 0 0\n", "Uue is the symbol of no element"),
+        ("a.extxyz", "-5\nProperties=species:S:1:pos:R:3\nAr 0 0 0\n", "-5 where the number of atoms"),
+        ("a.xyz", "-5\nwords\nAr 0 0 0\n", "announces -5 atoms"),
+        ("a.gro", "words\n-5\n\n", "-5 "),
+        ("a.mdcrd", "words\n  1.0  2.0  3.0\n", "-s TOPOLOGY"),
+    ],
+)
+def test_what_a_text_cannot_mean_is_said(tmp_path, name, text, said):
+    path = tmp_path / name
+    path.write_text(text)
+    frames, error = frames_of(path)
+    assert not frames and said in str(error) and ("TOPOLOGY" in str(error)) == ("TOPOLOGY" in said)
 
 
 @pytest.mark.parametrize(("order", "marker"), [("<", "i"), (">", "i"), ("<", "q"), (">", "q")])
@@ -165,8 +187,13 @@ def test_dcd_of_either_byte_order_is_read_and_one_with_long_record_markers_is_on
     if marker == "i":
         assert error is None and len(frames) == 4
         assert frames[3].positions.min() >= 0 and frames[3].positions.max() <= SIDE
+        # a step of 0.02 of 48.9 fs, after the first
+        np.testing.assert_allclose(
+            [one.time for one in frames], 0.02 * 0.0488882 * np.arange(1, 5), rtol=1e-5
+        )
     else:
-        assert error is not None and "cannot open it" in str(error)
+        assert error is not None and "cannot open it (record markers of 64 bits" in str(error)
+        assert "-s TOPOLOGY" not in str(error)
 
 
 @pytest.mark.parametrize("changing", [False, True])

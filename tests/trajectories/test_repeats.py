@@ -111,7 +111,7 @@ def test_what_stands_still_is_told_in_words_of_its_own(tmp_path):
     }  # fmt: skip
     for name, (positions, severity) in cases.items():
         said = finding(flips(written(tmp_path / f"{name}.extxyz", positions), tmp_path / name))
-        assert (said["severity"], "nothing moves" in said["title"]) == (severity, True), name
+        assert (said["severity"], "identical to the frame before" in said["title"]) == (severity, True), name
     assert finding(flips(written(tmp_path / "run.extxyz", run), tmp_path / "run")) is None
 
 
@@ -171,3 +171,49 @@ def test_a_folder_that_knew_none_of_it_is_still_judged(tmp_path):
         }
         found = judged(view(RunFolder.open(tmp_path / name), older))
         assert [one.code for one in found.findings] == [one["code"] for one in summary["findings"]]
+
+
+@pytest.mark.parametrize("kind", ["xtc", "traj", "extxyz"])
+def test_a_restart_that_rounds_otherwise_repeats_times_which_are_named_and_left_out(tmp_path, kind):
+    run, rng = walk(16), np.random.default_rng(3)
+    order = [*range(13), *range(9, 16)]
+    jitter = [0.0 if n < 13 else 1e-3 * rng.normal(size=(20, 3)) for n in range(20)]
+    path = written(
+        tmp_path / f"run.{kind}",
+        [run[k] + more for k, more in zip(order, jitter, strict=True)],
+        [100.0 * k for k in order],
+    )
+    found = flips(path, tmp_path / "a")
+    said = next(one for one in found["findings"] if one["code"] == "TIME_GOES_BACK")
+    assert "frames 13 to 16 have the times of frames 9 to 12 (900 to 1,200 ps)" in said["text"]
+    assert found["frames"] == 20 and not found["repeats"]["frames"] and not found["timed"]
+    left = flips(path, tmp_path / "b", drop_repeats=True)
+    said = next(one for one in left["findings"] if one["code"] == "TIME_GOES_BACK")
+    assert said["severity"] == "info" and said["title"].startswith("4 frames")
+    assert left["timed"] and left["interval"] == 100.0
+    table = RunFolder.open(tmp_path / "b").read("frames")
+    assert table["number"].tolist() == [*range(13), *range(17, 20)]
+
+
+def test_times_that_go_back_without_being_there_before_are_named_and_constant_ones_are_left_alone(tmp_path):
+    run = walk(8)
+    path = written(tmp_path / "a.xtc", run, [0.0, 10, 20, 30, 15, 25, 35, 45])
+    for drop in (True, False):
+        found = flips(path, tmp_path / f"a{drop}", drop_repeats=drop)
+        said = next(one for one in found["findings"] if one["code"] == "TIME_GOES_BACK")
+        assert "frame 4 (from 30 to 15 ps)" in said["text"] and found["frames"] == 8
+    path = written(tmp_path / "b.xtc", run, [0.0] * 8)
+    assert flips(path, tmp_path / "b", drop_repeats=True)["frames"] == 8
+
+
+@pytest.mark.parametrize("kind", ["traj", "extxyz"])
+@pytest.mark.parametrize("atoms", [5, 1500])
+def test_a_repeat_that_the_restart_wrapped_is_one(tmp_path, kind, atoms):
+    run = walk(10, atoms)
+    order = [*range(8), 5, 6, 7, 8, 9]
+    positions = [run[k] % SIDE if n > 7 else run[k] + SIDE * (k % 3) for n, k in enumerate(order)]
+    assert named(flips(written(tmp_path / f"run.{kind}", positions), tmp_path / "a")) == [(8, 10, 5, 7)]
+    # an atom elsewhere is motion
+    positions[9][0, 1] += 1e-4
+    found = flips(written(tmp_path / f"moved.{kind}", positions), tmp_path / "b")
+    assert named(found) == [(8, 8, 5, 5), (10, 10, 7, 7)]
