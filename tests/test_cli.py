@@ -263,6 +263,15 @@ def crystal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "mine/crystal-108.toml"
 
 
+def test_help_says_when_a_check_exits_with_1(capsys: pytest.CaptureFixture[str]):
+    assert call("systems", "check", "--help") == 0
+    assert "a warning exits with 1" in " ".join(capsys.readouterr().out.split())
+    assert call("flips", "--help") == 0
+    assert "--drop-repeats Leave out frames that repeat an earlier frame" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
 def test_systems_are_shown_checked_and_copied(crystal: str, capsys: pytest.CaptureFixture[str]):
     capsys.readouterr()
     assert call("systems", "show", crystal, "--set", "cutoff.kind=shifted") == 0

@@ -444,6 +444,24 @@ def test_a_list_that_rounds_positions_to_float32_is_a_warning(
         assert 1e-9 < finding["values"]["length"] < 2e-6 and 2**16 < finding["values"]["times"] <= 2**29
 
 
+@pytest.mark.parametrize(
+    ("name", "limits"),
+    [("rounds", ()), ("rounds_half", ("minimum-image", "orthorhombic", "all-axes")), ("rounds", ("free",))],
+)
+def test_few_questions_show_that_positions_are_rounded(
+    mine: Path, name: str, limits: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+):
+    """Those that are asked before the others: whoever has a minute is warned, too."""
+    first = lambda *given, **named: plan(*given, **named)[:1]  # noqa: E731
+    monkeypatch.setattr("mdnum.references.conformance.suite.plan", first)
+    home = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+    (mine / "rounds.py").write_text(home + _ROUNDS)
+    asked = ["conform", f"rounds.py:{name}", "--cases", "0", "--no-report", "-o", "out"]
+    assert call(*asked, *(["--limits", ",".join(limits)] if limits else [])) == 1
+    (finding,) = RunFolder.open("out").summary["findings"]
+    assert (finding["code"], finding["severity"]) == ("SINGLE_PRECISION", "warning")
+
+
 _HANGS = """
 import ctypes, os, signal, time
 from pathlib import Path
@@ -539,6 +557,10 @@ def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.S
     assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
     if by != signal.SIGKILL:
         assert summary["asked"] >= 5 and "resumes it" in summary["verdict"] and "right pairs" in out
+        assert "There is no verdict yet: it was stopped after 5 of " in out
+        assert "A call was running when it ended (cube of 2.1 cutoffs)." in summary["headline"]
+    # of most areas nothing was asked; after a kill, what was saved last counts
+    assert summary["headline"].startswith("There is no verdict yet: it was stopped after ")
 
 
 def _wait_for(condition: Callable[[], Any]) -> None:
@@ -559,7 +581,8 @@ def test_time_that_is_up_ends_it(mine: Path, name: str, code: int, status: str):
     assert monotonic() - began < 40
     summary = RunFolder.open("out").summary
     assert summary["status"] == status and summary["left"] > 500
-    assert ("no verdict yet" in summary["headline"]) == (status == "undecided")
+    assert ("no verdict yet: time was up" in summary["headline"]) == (status == "undecided")
+    assert ("A call was running" in summary["headline"]) or name == "slow"
     assert (mine / "out" / "report.html").exists()
     areas = {row["area"]: row["asked"] + row["skipped"] for row in summary["areas"]}
     if status == "partial":
@@ -593,7 +616,11 @@ def test_a_script_is_run_before_it_is_named(
     assert (failure["code"], failure["earlier"], failure["reproduced"]) == ("CRASHED", calls, reproduced)
     (finding,) = (one for one in summary["findings"] if one["code"] == "CRASHED")
     assert (f"Reproduced by {failure['script']}" in finding["text"]) == reproduced
-    assert ("could not be reproduced" in finding["text"]) == (not reproduced)
+    assert ("does not occur when the script runs alone" in finding["text"]) == (not reproduced)
+    asked = sum(row["asked"] for row in summary["areas"])
+    wrong = sum(row["failed"] for row in summary["areas"])
+    right = f"{asked - wrong} of {asked} cases right; {wrong} ended the process."
+    assert summary["headline"] == f"hangs:{name}: {right}"
     script = mine / "out" / failure["script"]
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
     assert (done.returncode < 0) == reproduced and ("the list is right" in done.stdout) == (not reproduced)

@@ -45,10 +45,11 @@ def read_structure(words: str | Path) -> Atoms:
         )
     with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
         chosen = list(ase_images(path, which))
+        count = 1 if chosen else sum(1 for _ in ase_images(path))
     if len(chosen) != 1:
         several = f"means {len(chosen)} structures, and an audit is about one structure"
         raise InputError(
-            several if chosen else f"cannot be read: the file has no structure {which}",
+            several if chosen else f"the file has no structure {which} (it has {count})",
             where=text,
             remedy="Name one by its number: file@0 is the first, file@-1 the last",
         )

@@ -330,7 +330,7 @@ def show(
 def check_system(
     system: str = SYSTEM_ARGUMENT, settings: list[str] | None = SET_OPTION, as_json: bool = JSON_OPTION
 ) -> int:
-    """Read a system file and its structure, and say whether it can be run."""
+    """Read a system file and its structure, and say whether it can be run; a warning exits with 1."""
     loaded = _load(system, settings)
     from mdnum.verbs.check import structure_findings
 

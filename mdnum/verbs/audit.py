@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +50,7 @@ _BOLTZMANN = 8.617333262e-5
 _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 
 
-@frame.keywords_checked
+@partial(frame.keywords_checked, name="audit_calculator")
 def audit(
     calculator: str | Callable[[], Any] | None = None,
     structure: Atoms | str | Path | None = None,

@@ -245,8 +245,8 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
     tested = found.tested
-    own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "padding",
-           "asked", "wrong", "conforms", "seconds")  # fmt: skip
+    own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
+           "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
     why = {area: sorted(tally.why.items(), key=lambda one: -one[1]) for area, tally in found.areas.items()}
     return {
         "world": "conform",
@@ -323,12 +323,16 @@ def judge(view: View) -> Verdict:
         else "silent"
     )  # fmt: skip
     headline = TEXTS(said, **values)
+    done, questions = summary["questions"] - left, summary["questions"]
+    undecided = done < summary["breadth"]
     if left:
-        few = "too_few" if summary["status"] == frame.UNDECIDED and not wrong else "so_far"
-        questions = summary["questions"]
-        headline = TEXTS(few, headline=headline, done=questions - left, questions=questions)
+        early = "stopped_early" if summary["status"] == "stopped" else "too_few"
+        few = early if undecided and not wrong else "so_far"
+        headline = TEXTS(few, headline=headline, done=done, questions=questions)
+        if summary["running"]:
+            headline += f" {TEXTS('running', case=summary['running'])}"
     findings = [*_failures(summary), *_conduct(summary, answered)]
-    best = "info" if summary["status"] == frame.UNDECIDED else "good"
+    best = "info" if undecided else "good"
     return conclude(findings, _evidence(view), headline=headline, best=best, judged=True)
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from mdnum import units
 from mdnum.errors import FolderError, InputError
 from mdnum.plain import plain
-from mdnum.registry import unknown
+from mdnum.registry import nearest
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
@@ -197,7 +197,7 @@ class UnknownKeyword(InputError, TypeError):
     """A verb has no such keyword; also the TypeError that Python raises for one."""
 
 
-def keywords_checked(verb: V, more: Iterable[str] = ()) -> V:
+def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
     """A public verb that rejects a keyword it does not have before it reads or writes anything.
 
     What a verb passes on as `**keep` would otherwise be looked at only when its folder is made, after options
@@ -205,6 +205,7 @@ def keywords_checked(verb: V, more: Iterable[str] = ()) -> V:
 
     Args:
         more: names of keywords that it passes on besides those of `Keep`.
+        name: its public name, where that is another than its own.
 
     Raises:
         UnknownKeyword: with the nearest name that it has, and all of them.
@@ -218,8 +219,10 @@ def keywords_checked(verb: V, more: Iterable[str] = ()) -> V:
     def checked(*args: Any, **kwargs: Any) -> Any:
         for word in kwargs:
             if word not in known:
-                error = unknown(f"keyword of {verb.__name__}()", word, known)
-                raise UnknownKeyword(error.message, remedy=error.remedy)
+                close = nearest(word, known)
+                hint = f"Did you mean {close!r}? " if close else ""
+                message = f"{name or verb.__name__}() has no keyword {word!r}"
+                raise UnknownKeyword(message, remedy=f"{hint}It takes {', '.join(known)}")
         return verb(*args, **kwargs)
 
     return cast(V, checked)

@@ -225,9 +225,13 @@ def test_structures_from_files(tmp_path: Path):
     ase.io.write(tmp_path / "three.extxyz", [bulk("Ar"), bulk("Cu"), bulk("Al")])
     assert read_structure(tmp_path / "three.extxyz").symbols[0] == "Al"
     assert read_structure(f"{tmp_path / 'three.extxyz'}@1").symbols[0] == "Cu"
+    ase.io.write(tmp_path / "two.traj", [bulk("Ar"), bulk("Cu")])
     (tmp_path / "bad.extxyz").write_text("1\n\nAr 0 nan 0\n")
     for name, message in {
-        "none.xyz": "no such", "bad.extxyz": "not finite", "three.extxyz@9": "cannot be",
+        "none.xyz": "no such", "bad.extxyz": "not finite",
+        "three.extxyz@9": r"@9: the file has no structure 9 \(it has 3\)",
+        "three.extxyz@-4": r"the file has no structure -4 \(it has 3\)",
+        "two.traj@2": r"the file has no structure 2 \(it has 2\)",
     }.items():  # fmt: skip
         with pytest.raises(InputError, match=message):
             read_structure(tmp_path / name)

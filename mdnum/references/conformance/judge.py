@@ -480,6 +480,7 @@ class Report:
     large: tuple[int, float] | None = None  # (atoms, seconds) of its largest question
     questions: int = 0  # cases that there are, those that it does not claim to do included
     breadth: int = 0  # of them, those at the beginning without which there is no verdict
+    running: str | None = None  # the case whose call was cut off when the asking ended
     motions: int = 0  # against its rebuild rule, that it was asked; and calls: of it in those
     calls: int = 0
     whole: bool = True  # all failures were shrunk as far as they are

@@ -100,6 +100,7 @@ def _boxes() -> Named:
 
 
 def _axes() -> Named:
+    yield "pairs a hair inside the cutoff, across walls of cells, free", _across_walls()
     for pbc in ((True, True, False), (True, False, False), (False, True, True), (False, False, True)):
         word = "".join(letter for letter, repeats in zip("xyz", pbc, strict=True) if repeats)
         edges = np.array([4.0, 4.5, 5.0])
@@ -144,6 +145,9 @@ def _narrow() -> Named:
 
 
 def _outside() -> Named:
+    hair = "pairs a hair inside the cutoff, across walls of cells, edges {!r}"
+    # early: it shows whether positions are rounded to float32
+    yield hair.format(4.0), _across_walls(), [4.0, 200.0, 200.0]
     inside = gas(24, 4.0, 40)
     shifts = np.random.default_rng(41).integers(-3, 4, inside.shape)
     yield "lattice vectors added", inside + 4.0 * shifts, 4.0
@@ -166,16 +170,15 @@ def _outside() -> Named:
         near = np.array([[0.5, 2, 2], [3.5, 2, 2], [2, 0.5, 2], [2, 3.5, 2], [2, 2, 0.5], [2, 2, 3.5]])
         on = np.array([[place, 2, 2], [2, place, 2], [2, 2, place], [place, place, place]])
         yield f"atoms at {word}", np.vstack([on, near, [[0.4, 0.4, 0.4]]]), 4.0
-    for edge in (4.0, 4.0 * (1 + 1e-9), 4.0 * (1 + 1e-6)):
-        name = f"pairs a hair inside the cutoff, across walls of cells, edges {edge!r}"
-        yield name, _across_walls(edge), [edge, 200.0, 200.0]
+    yield hair.format(stretched := 4.0 * (1 + 1e-9)), _across_walls(), [stretched, 200.0, 200.0]
+    yield hair.format(stretched := 4.0 * (1 + 1e-6)), _across_walls(), [stretched, 200.0, 200.0]
     face = [[0.0, 1, 1], [3 * (1.0 / 3.0) * 2.1, 1, 1], [2.1 - 0.5, 1, 1]]
     yield "a face that no double holds", face, 2.1
     for edge in (2.1, 3.3, 4.7):
         yield "a grid on the walls of the cells", grid(3) / 3 * edge, edge, True, edge / 3 * 1.1
 
 
-def _across_walls(edge: float) -> ndarray:
+def _across_walls() -> ndarray:
     """Pairs along x whose atoms lie just below a multiple of the cutoff, and a cutoff less a hair below that.
 
     A search that puts one of them into the next cell, as float32 does, has two cells between them.

@@ -314,10 +314,12 @@ def examine(
             report.skip(case, why)
             continue
         if result is None:
+            report.running = case.name
             try:
                 result = answers.cases[str(number)] = examiner.ask(case)
             except TimeUp:
                 continue
+            report.running = None
             saved(bool(result.failures))
             if session.starts != starts:
                 starts, history = session.starts, []
