@@ -161,7 +161,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     force = float(np.median(sizes[sizes > 0])) if share > _STAIRS else 0.0
     climbs = np.abs(np.diff(energies)[moved])
     stays = np.sum(climbs == 0) >= _STAYS and climbs.any()
-    energy = float(np.median(climbs[climbs > 0])) if stays else _quantum(energies)
+    energy = float(np.median(climbs[climbs > 0])) if stays else 0.0
     if not np.ptp(energies):
         # as large as the change that the forces predict, at least
         along = forces @ line.ravel()
@@ -175,7 +175,8 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
     """What the steps in which answers go make of them, and the digits that they carry."""
     stairs = steps(subject, atoms)
-    grain = max(stairs.energy, digits(stairs.energies).grain(stairs.energies))
+    energies = stairs.energies
+    grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
     return NoiseFloor(0.5 * grain, 0.5 * stairs.force)
 
 
