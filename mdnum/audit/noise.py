@@ -38,6 +38,9 @@ _STEP_POINTS = 17
 #: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share
 #: of the forces that do, from which forces do.
 _STAYS, _STAIRS = 3, 0.1
+#: Second differences that are multiples of one number, to within this share of it, are those of a value in
+#: steps; those of a smooth one change little from one to the next.
+_ALIKE = 1e-3
 #: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
 #: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
@@ -167,6 +170,25 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     length = (_STEP_POINTS - 1) * spacing
     subject.known[key] = Staircase(energy, force, share, length, energies, forces)
     return subject.known[key]
+
+
+def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
+    """What the steps in which answers go make of them, and the digits that they carry."""
+    stairs = steps(subject, atoms)
+    energies = stairs.energies
+    grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
+    return NoiseFloor(0.5 * grain, 0.5 * stairs.force)
+
+
+def _quantum(values: Float[np.ndarray, "points"]) -> float:
+    """A number of which second differences are different multiples; 0 where there is none above rounding."""
+    sizes = np.abs(np.diff(values, n=2))
+    sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
+    for part in (1, 2, 3) if sizes.size else ():
+        ratio = part * sizes / sizes.min()
+        if np.abs(ratio - np.rint(ratio)).max() < _ALIKE and len(set(np.rint(ratio))) > 1:
+            return float(sizes.min()) / part
+    return 0.0
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
@@ -302,8 +324,7 @@ def settled(
             noise = noise.louder(along_a_line(subject, many, rng))
     # what goes in steps may not move at all on so short a line
     if not brief:
-        stairs = steps(subject, there)
-        noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
+        noise = noise.louder(rounding(subject, there))
         # another order of the same sum is rounded otherwise, which no line shows
         subject.known["order"] = order_change(subject, there, noise, rng)
         noise = noise.louder(subject.known["order"][1])
@@ -343,6 +364,10 @@ class Digits:
     def quantum(self) -> float:
         """Step between two numbers that are rounded to decimals; 0 for others."""
         return 0.0 if self.decimals is None else 10.0**-self.decimals
+
+    def grain(self, values: np.ndarray) -> float:
+        """Step between two numbers as large as the largest of some."""
+        return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
     def format(self) -> str | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ase import Atoms
 from ase.build import bulk
-from audit import planted
+from audit import planted, rivals
 from audit.planted import Good, adding, asked, but, chain, codes, crystal, subject, through, values
 
 import mdnum
@@ -65,6 +65,40 @@ def test_an_energy_in_single_precision_is_reported_and_one_that_loses_kT_is_warn
     # which leaves nothing to test the forces with
     told = codes(asked("forces", far))
     assert set(told.values()) == {"warning"} and not {"FORCES_NOT_GRADIENT", "ENERGY_STEP"} & set(told)
+
+
+#: Numbers that are rounded to decimals, before a factor as well, and to single precision.
+ROUNDED = {
+    **{f"energy to {n}": through(energy=lambda e, n=n: round(e, n)) for n in (2, 3, 6)},
+    **{f"forces to {n}": through(forces=lambda f, n=n: np.round(f, n)) for n in (3, 4)},
+    "energy in kcal/mol": through(energy=lambda e: round(23.06 * e, 6) * 0.0433641153107705),
+    "far energy in single": through(energy=lambda e: float(np.float32(e - 10.0))),
+    "energy that loses kT": through(energy=lambda e: float(np.float32(e - 1e5))),
+}
+
+
+@pytest.mark.parametrize("brief", [False, True], ids=["full", "brief"])
+@pytest.mark.parametrize("atoms", [crystal(), chain(), rivals.liquid()], ids=["crystal", "chain", "liquid"])
+@pytest.mark.parametrize("kind", ROUNDED)
+def test_rounding_is_no_wrong_force(kind: str, atoms: Atoms, brief: bool):
+    """Along some directions all steps of differences are flat, along others none is."""
+    found = {}
+    for check in (ForcesCheck(), CurlCheck()):
+        check.brief = brief
+        found |= codes(check(subject(ROUNDED[kind], atoms)))
+    assert set(found) <= {"QUANTIZED", "LOW_PRECISION", "NOISE_FLOOR"}
+
+
+@pytest.mark.parametrize("brief", [False, True], ids=["full", "brief"])
+@pytest.mark.parametrize("places", [7, 9])
+def test_a_wrong_force_is_found_under_rounding(places: int, brief: bool):
+    def rounded(self, atoms, energy, forces):
+        return round(energy, places), forces
+
+    check = ForcesCheck()
+    check.brief = brief
+    found = codes(check(subject(but(planted.NoSwitchInForce, extra=rounded))))
+    assert found["FORCES_NOT_GRADIENT"] == "error"
 
 
 def test_a_step_at_the_structure_is_told_from_a_wrong_force():
