@@ -61,10 +61,10 @@ class Deadline:
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """In the main thread, KeyboardInterrupt where a call is in progress longer than `grace` s past a deadline.
+    """KeyboardInterrupt in the main thread where a call goes on for `grace` s after a deadline.
 
-    It comes again until the block is left, since somebody else's code may catch it. A call that holds Python's
-    lock in compiled code cannot be interrupted.
+    It comes again until the block is left, since somebody else's code may catch it. A call that holds
+    Python's lock in compiled code cannot be interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield

@@ -87,7 +87,7 @@ class Meter:
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """What several checks rest on is found here, by calls of its own; the check gets what is left of them."""
+        """What several checks rest on is found here, by calls of its own; a check gets what is left."""
         most = self.most
         self.most = self.calls + calls
         try:

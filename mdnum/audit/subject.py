@@ -419,7 +419,7 @@ def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
 
 
 def _question(atoms: Atoms) -> bytes:
-    """A digest of all that a calculator may read: charges, moments, tags and info as well as the structure."""
+    """A digest of all that a calculator may read: charges, moments, tags and info, too."""
     arrays = [atoms.arrays[name] for name in sorted(atoms.arrays)]
     try:
         info = pickle.dumps(atoms.info)

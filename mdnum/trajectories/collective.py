@@ -72,7 +72,7 @@ class Collective:
         """What all atoms had in common in all frames before, if they cannot have left it so; else empty."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
-        if last is None or was is None or atoms <= _FEW or not was.any() or self.level.any():
+        if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
             return ""
         shift, now = np.median(x - last, axis=0), spreads(x)
         apart = np.median(np.abs(x - last - shift), axis=0)

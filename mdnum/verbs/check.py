@@ -61,7 +61,7 @@ def check(question: str, system: System) -> Checked:
 
 
 def structure_findings(system: System) -> Iterator[Finding]:
-    """What a run would not make of a structure as its author may think: its temperature, its velocities, its size."""
+    """Where a run takes a structure otherwise than its author may think: temperature, velocities, size."""
     atoms = system.atoms
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
