@@ -61,10 +61,9 @@ class Deadline:
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """KeyboardInterrupt in the main thread where a call goes on for `grace` s after a deadline.
+    """In the main thread, `TimeUp` where a call is in progress longer than `grace` s past a deadline.
 
-    It comes again until the block is left, since somebody else's code may catch it. A call that holds
-    Python's lock in compiled code cannot be interrupted.
+    It is interrupted again and again, since its code may catch that; compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield
@@ -73,6 +72,8 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
     signal.setitimer(signal.ITIMER_REAL, deadline.left + grace, grace)
     try:
         yield
+    except KeyboardInterrupt:
+        raise TimeUp if deadline.passed else KeyboardInterrupt from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)

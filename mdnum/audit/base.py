@@ -87,7 +87,7 @@ class Meter:
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """What several checks rest on is found here, by calls of its own; a check gets what is left."""
+        """What several checks rest on is found here, by calls of its own; what is left is for the check."""
         most = self.most
         self.most = self.calls + calls
         try:
@@ -336,11 +336,8 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
     if "warning" in severities:
         return "with care"
     needed, begun = needed_to(question), {result.name for result in results}
-    if (
-        nothing_felt(results)
-        or not needed <= set(wanted)
-        or not {name for name in needed if CHECKS[name].basic} <= begun
-    ):
+    begun = set() if nothing_felt(results) else begun
+    if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
     return "yes" if needed <= asked else "as far as asked"

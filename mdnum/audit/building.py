@@ -73,10 +73,7 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     try:
         with interrupting(builder.meter.deadline), builder.meter.limited():
             return builder.built()
-    except (TimeUp, KeyboardInterrupt) as error:
-        if not isinstance(error, TimeUp) and not builder.meter.deadline.passed:
-            raise
-        up = error if isinstance(error, TimeUp) else TimeUp
+    except TimeUp as up:
         best = builder.best if builder.best is not None else _filled(*_unit_cell(*builder.likely[:1]))
         return _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
 
@@ -174,11 +171,8 @@ class _Builder:
         elif len(symbols) == 1:
             self.cutoff, self.least = None, None
         cell, kind = _unit_cell(*symbols)
-        for start in _DENSITIES:
-            if not subject.answers(_small(cell, start)):
-                continue
-            if self.best is None:
-                self.best = _filled(cell, kind, start)
+        for start in (scale for scale in _DENSITIES if subject.answers(_small(cell, scale))):
+            self.best = self.best or _filled(cell, kind, start)
             scale, relaxed = _least_energy(subject, cell, self.least, start)
             for how in ((scale, relaxed), (start, False))[: 1 + (scale != start)]:
                 made = _grown(subject, cell, kind, *how, self.cutoff)
@@ -304,8 +298,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
     """Whether atoms feel each other: a force, or an energy that changes as they move."""
-    energy, forces = subject.both(atoms)
-    moved = atoms.copy()
+    (energy, forces), moved = subject.both(atoms), atoms.copy()
     moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
     other = subject.try_both(moved)
     change = np.inf if isinstance(other, CalculatorError) else abs(other[0] - energy)

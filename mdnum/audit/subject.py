@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import itertools
-import pickle
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,6 +31,8 @@ _ROOM_TEMPERATURE = 0.025852
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
 #: Answers that stick out are asked for again, in one audit no more often than this.
 _MOST_AGAIN = 100
+#: Of info, what has the same representation in a copy.
+_PLAIN = (str, int, float, list, tuple, dict, np.ndarray)
 
 _objects = itertools.count()
 Forces = Float[np.ndarray, "atoms 3"]
@@ -419,15 +420,11 @@ def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
 
 
 def _question(atoms: Atoms) -> bytes:
-    """A digest of all that a calculator may read: charges, moments, tags and info, too."""
-    arrays = [atoms.arrays[name] for name in sorted(atoms.arrays)]
-    try:
-        info = pickle.dumps(atoms.info)
-    except Exception:  # whatever somebody has put there
-        info = repr(atoms.info).encode()
-    parts = [repr(sorted(atoms.arrays)).encode(), info]
-    parts += [array.tobytes() for array in (*arrays, np.asarray(atoms.cell), atoms.pbc)]
-    return hashlib.blake2b(b"|".join(parts), digest_size=16).digest()
+    """A digest of all that a calculator may read: charges, tags and info as well as the structure."""
+    parts = {**atoms.arrays, "cell": np.asarray(atoms.cell), "pbc": atoms.pbc}
+    info = {key: value for key, value in atoms.info.items() if isinstance(value, _PLAIN)}
+    text = b"|".join(name.encode() + parts[name].tobytes() for name in sorted(parts))
+    return hashlib.blake2b(text + repr(info).encode(), digest_size=16).digest()
 
 
 def _bare(atoms: Atoms) -> Atoms:

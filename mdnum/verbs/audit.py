@@ -178,9 +178,6 @@ def _ask_all(
             with interrupting(deadline):
                 result = _repeatable(_ask(check, subject, log), subject, others)
         except KeyboardInterrupt:
-            if deadline.passed:
-                state.why = base.TIME_UP
-                break
             if not state.shown:
                 raise
             state.why = "stopped"
@@ -346,10 +343,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
     rest += [{"what": what, "why": why, "part": one.name} for one in state.shown for what, why in one.skipped]
     early = frame.UNDECIDED if base.to_come(state.shown, state.checks) else frame.PARTIAL
     status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
-    if state.during is None:
-        status = (
-            frame.UNDECIDED if base.nothing_felt(state.shown) and early == frame.UNDECIDED else "complete"
-        )
+    status = {frame.PARTIAL: "complete"}.get(early, early) if state.during is None else status
     return _in_units(
         {
             "system": state.name, "calculator": state.name, "atoms": len(atoms),
@@ -520,10 +514,9 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         head = TEXTS("nothing_asked", head=head)
     refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in state.shown for _, why in one.skipped)
     unselected = base.in_order([one for one in CHECKS if one not in state.checks])
-    head += " " + TEXTS(
-        "unasked_checks" if unselected else "unasked", checks=listed(unselected or ["none"]),
-        elements=listed(list(dict.fromkeys(state.atoms.symbols))),
-    )  # fmt: skip
+    values = {"elements": listed(list(dict.fromkeys(state.atoms.symbols)))}
+    values |= {"checks": listed(unselected)} if unselected else {}
+    head += " " + TEXTS("unasked_checks" if unselected else "unasked", **values)
     head += " " + TEXTS("refused", n=refused) if refused else ""
     return _unfinished(state, head)
 

@@ -484,12 +484,7 @@ def test_questions_that_differ_in_charges_tags_or_moments_are_not_one(make, atom
     assert asked_about.repeats.new.times and not asked_about.repeats.findings(asked_about.kT)
 
 
-@pytest.mark.parametrize(
-    ("symbol", "name"), [("Ar", "an Ar atom"), ("Fe", "an Fe atom"), ("Cu", "a Cu atom")]
-)
-def test_elements_have_their_article(symbol: str, name: str):
-    atoms = crystal()
-    atoms.set_chemical_symbols([symbol] * len(atoms))
-    rows = planted.asked("alone", Good, atoms).tables["Atoms alone"]
-    named = [row["atoms"] for row in rows if row["atoms"].startswith(("a ", "an "))]
-    assert named and all(one.startswith(name) for one in named)
+def test_no_element_has_a_wrong_article():
+    rows = planted.asked("alone", Good, crystal()).tables["Atoms alone"]
+    assert any("one Ar atom" in row["atoms"] for row in rows)
+    assert not any("a Ar" in row["atoms"] for row in rows)

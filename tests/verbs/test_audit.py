@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ase import Atoms
+from ase.build import bulk
+from ase.calculators.lj import LennardJones
 from ase.io import read
 from ase.io import write as write_structure
 from audit import planted
@@ -21,7 +23,7 @@ from other_package import install
 
 import mdnum
 from mdnum.audit import checks
-from mdnum.audit.base import CheckResult, answers, finding, in_order
+from mdnum.audit.base import CheckResult, Meter, answers, finding, in_order
 from mdnum.audit.causes import heads
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
@@ -73,6 +75,41 @@ def test_what_is_right_is_safe_and_in_the_folder(good):
     titles = [section.title for section in good.page.sections]
     assert {"Smoothness", "Invariance", "Forces", "Curl", "Memory", "Dynamics"} <= set(titles)
     assert "Reproduce" not in titles and not (good.folder / "reproduce.py").exists()
+
+
+def lennard_jones():
+    """Switched off smoothly, and with room for 79 neighbors of each atom."""
+    return LennardJones(sigma=3.405, epsilon=0.0103, rc=8.5, ro=7.0, smooth=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [planted.Good, planted.ByAppearance, lennard_jones])
+def test_calls_that_a_check_does_not_need_are_for_those_after_it(make, tmp_path):
+    """Clean small potentials are asked everything, within the sum of the limits."""
+    calls = []
+
+    def counted():
+        made = make()
+        calculate = made.calculate
+        made.calculate = lambda *words, **more: (calls.append(1), calculate(*words, **more))
+        return made
+
+    atoms = bulk("Ar", cubic=True).repeat(2) if make is lennard_jones else None
+    outcome = mdnum.audit_calculator(counted, atoms, out=tmp_path / "a", report=False)
+    assert all(one["asked"] == one["possible"] for one in outcome.summary["parts"])
+    assert "as far as asked" not in outcome.summary["headline"] and len(calls) <= 12_000
+
+
+def test_a_check_leaves_the_calls_that_it_does_not_make():
+    meter = Meter()
+    asked = planted.subject(planted.Good)
+    asked.meter = meter
+    checks.CHECKS["alone"]()(asked)
+    spare = checks.CHECKS["alone"].calls - meter.calls
+    assert meter.spare == spare > 0
+    before = meter.calls
+    checks.CHECKS["curl"]()(asked)
+    assert meter.most == before + checks.CHECKS["curl"].calls + spare
 
 
 def test_a_mistake_is_evidence_that_others_can_see(bad):

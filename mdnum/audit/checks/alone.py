@@ -92,7 +92,7 @@ class AloneCheck(AuditCheck):
             # who numbers species by what is there gives the last one other numbers without the first
             two = _boxed(Atoms([last] * 2, [[0, 0, 0], [nearest_distance(atoms), 0, 0]]))
             together = total(energy(f"two {last} atoms", two, lone=slice(0)), single[first])
-            what = f"{_a(first)} atom {_FAR:g} Å from two {last} atoms"
+            what = f"one {first} atom {_FAR:g} Å from two {last} atoms"
             energy(what, _apart(two, Atoms(first)), together, slice(2, None))
         cluster = _boxed(atoms[: min(len(atoms), _CLUSTER)])
         near = subject.fresh().try_both(cluster)
@@ -104,7 +104,7 @@ class AloneCheck(AuditCheck):
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
         elif self.takes_atoms:
-            both, what = _apart(cluster, Atoms(first)), f"{_a(first)} atom {_FAR:g} Å from a cluster"
+            both, what = _apart(cluster, Atoms(first)), f"one {first} atom {_FAR:g} Å from a cluster"
             energy(what, both, total(near[0], single.get(first)), slice(-1, None))
         else:
             one = _boxed(whole(atoms, molecules(atoms)[0]))
@@ -134,11 +134,6 @@ def _boxed(part: Atoms) -> Atoms:
     there = Atoms(part.numbers, part.positions - part.positions.min(axis=0) + [1.0, 2.0, 3.0])
     there.set_cell([_BOX + float(np.ptp(there.positions, axis=0).max())] * 3)
     return there
-
-
-def _a(symbol: str) -> str:
-    """A symbol, read by its letters, with its article: an Ar, an Fe, a Cu, a U."""
-    return f"{'an' if symbol[0] in 'AEFHILMNORSX' else 'a'} {symbol}"
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:

@@ -65,9 +65,8 @@ class CallerCheck(AuditCheck):
         # one that keeps its answer whatever has changed is reported once
         if unseen := [one for one in observed if one.code == "CHANGE_NOT_SEEN"]:
             worst = max(unseen, key=lambda one: one.values["force"])
-            changed = [one.values["changed"] for one in unseen]
-            *most, last = changed
-            worst.values["changed"] = " and ".join([", ".join(most), last] if most else [last])
+            *most, last = (one.values["changed"] for one in unseen)
+            worst.values["changed"] = f"{', '.join(most)} and {last}" if most else last
             worst.values["n"] = 2 if most or last.endswith("s") else 1
             observed = [worst, *(one for one in observed if one not in unseen)]
         return CheckResult((["caller_wrong" if observed else "caller_right"], {}), observed, **vars(ways))
