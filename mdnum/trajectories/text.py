@@ -25,6 +25,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from ase.data import chemical_symbols
 from ase.io.formats import UnknownFileTypeError, filetype, get_ioformat
 from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Float
@@ -39,6 +40,7 @@ from mdnum.units import get as units_named
 
 _NOT_READ = "Columns {} are not read as velocities, which are taken from {} alone."
 _MOMENTA = "a column momenta in ASE's units"
+_SYMBOLS = np.array(chemical_symbols)  # by atomic number: a frame has many atoms
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -60,7 +62,7 @@ class AseFrames(Trajectory):
         if names := ignored_velocities(first.arrays):
             self.notes += (_NOT_READ.format(", ".join(f"“{name}”" for name in names), _MOMENTA),)
         order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
-        return AtomTable.plain([first.get_chemical_symbols()[at] for at in order])
+        return AtomTable.plain(_SYMBOLS[first.numbers[order]].tolist())
 
     def _frame(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
@@ -68,7 +70,7 @@ class AseFrames(Trajectory):
         if momenta is not None:
             velocities = np.asarray(momenta, np.float64) / atoms.get_masses()[:, None] * self._per_time
         timed = self._timed and "time" in atoms.info
-        labels, identified = np.array(atoms.get_chemical_symbols()), _ids(atoms) is not None
+        labels, identified = _SYMBOLS[atoms.numbers], _ids(atoms) is not None
         if identified:
             order = self._by_id(number, atoms.arrays["id"])
             atoms, labels = atoms[order], labels[order]

@@ -112,3 +112,24 @@ def test_an_id_that_is_gone_ends_the_file(tmp_path):
         atoms.set_array("id", np.array([1, 1, 2, 2]))
     ase.io.write(tmp_path / "run.extxyz", images)
     assert len(list(open_trajectory(tmp_path / "run.extxyz").frames())) == 3
+
+
+@pytest.mark.parametrize("suffix", ["traj", "extxyz"])
+def test_elements_of_a_file_are_not_spelled_out_for_each_atom(tmp_path, suffix, monkeypatch):
+    """That would take time with the square of the number of atoms."""
+    spelled = 0
+    symbols = Atoms.get_chemical_symbols
+
+    def counted(self):
+        nonlocal spelled
+        spelled += 1
+        return symbols(self)
+
+    rng = np.random.default_rng(1)
+    images = [Atoms("ArKr" * 100, rng.uniform(0, 20, (200, 3)), cell=[20] * 3, pbc=True) for _ in range(3)]
+    ase.io.write(tmp_path / f"many.{suffix}", images)
+    monkeypatch.setattr(Atoms, "get_chemical_symbols", counted)
+    trajectory = open_trajectory(tmp_path / f"many.{suffix}")
+    assert trajectory.table.species.tolist() == ["Ar", "Kr"] * 100
+    assert [frame.labels.tolist() for frame in trajectory.frames()] == [["Ar", "Kr"] * 100] * 3
+    assert spelled <= 10
