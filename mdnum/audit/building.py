@@ -176,9 +176,10 @@ class _Builder:
             scale, relaxed = _least_energy(subject, cell, self.least, start)
             for how in ((scale, relaxed), (start, False))[: 1 + (scale != start)]:
                 made = _grown(subject, cell, kind, *how, self.cutoff)
-                if made is not None and _feels(subject, made):
+                if made is not None and ((felt := _feels(subject, made)) or len(made) > len(self.best)):
                     self.best = made
-                    return made
+                    if felt:
+                        return made
         return None
 
 
