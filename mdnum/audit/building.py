@@ -114,8 +114,11 @@ class _Builder:
             except CalculatorError as error:
                 why, saved = error.message, error.structure
                 continue
+            wet = _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
             if felt:
-                return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+                return wet
+            self.best = self.best or wet
+            break
         # after water, since a calculator of molecules may take any atoms in threes for them
         made = made or self._first(others) or self._first(self.likely, paired=False)
         if made is None and self.best is not None:
