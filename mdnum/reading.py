@@ -71,6 +71,10 @@ class FrameError(InputError):
         self.frame = frame
 
 
+class EarlierFramesError(FrameError):
+    """This frame shows that none of those before it can be right: there is nothing to keep."""
+
+
 class UnreadableFrame(FrameError):
     """A frame in the middle of a file cannot be read; those before it were given out."""
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
+from mdnum.reading import EarlierFramesError
 from mdnum.trajectories.frame import AtomIndices, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
@@ -85,7 +86,7 @@ def _usable(
                 break
             stepped = step(*frames)
         except InputError as error:
-            if not found.frames:
+            if not found.frames or isinstance(error, EarlierFramesError):
                 raise
             found.stopped = error
             if not hasattr(error, "frame"):

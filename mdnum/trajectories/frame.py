@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mdnum.reading import FrameError
+from mdnum.reading import EarlierFramesError, FrameError
 from mdnum.reading import UnreadableFrame as UnreadableFrame
 from mdnum.trajectories.collective import Collective
 
@@ -176,7 +176,9 @@ class FrameCheck:
         some, far = x[:: max(1, len(x) // _SOME)], _LEAP_BOXES * frame.box.longest
         if lay := self.collective.left(some, len(x)):
             what = f" is the first in which not all atoms have {lay}: the frames before it cannot be right"
-            yield what, f"Leave them out, and begin with this one (@{frame.index}:)"
+            remedy = f"Leave them out, and begin with this one (@{frame.index}:)"
+            message = f"frame {frame.index}{what}"
+            raise EarlierFramesError(message, frame=frame.index, remedy=remedy, where=self.where)
         if (why := self.collective.refuse(some, len(x), frame.box.shortest, far)) is not None:
             yield f": {why}", failed
 

@@ -213,12 +213,9 @@ class FlipsView(View):
 
     def again(self, again: Sequence[Mapping[str, Any]]) -> list[str]:
         """Which frames have the times of earlier ones, in words."""
-        told = []
-        for one in again[:_RANGES]:
-            times = plain(one["time"], 9), self.time(plain(one["to"], 9))
-            kind = "one" if one["first"] == one["last"] else "many"
-            told.append(TEXTS(f"again_{kind}", **{**one, "time": times[0], "to": times[1]}))
-        return told
+        kinds = ["one" if one["first"] == one["last"] else "many" for one in again[:_RANGES]]
+        times = [{"time": plain(one["time"], 9), "to": self.time(plain(one["to"], 9))} for one in again]
+        return [TEXTS(f"again_{kind}", **{**again[k], **times[k]}) for k, kind in enumerate(kinds)]
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
         """(label, values) of an axis along the trajectory."""

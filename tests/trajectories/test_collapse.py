@@ -272,3 +272,16 @@ def test_the_analysis_stops_there_too_and_may_run_again(tmp_path, parts):
             analysis.run(n_parts=parts)
         assert analysis.frames.tolist() == [0, 1, 2, 3, 4]
     assert len(NeighborFlips(universe, 5.0).run(start=5).frames) == 3
+
+
+@pytest.mark.parametrize("bad", [1, 2])
+def test_a_file_whose_first_frames_collapsed_is_refused_and_read_from_the_good_one_on(tmp_path, bad):
+    frames = [
+        Atoms("Ar40", put(2, 2**31 / 100)(x) if k < bad else x, cell=[SIDE] * 3, pbc=True)
+        for k, x in enumerate(liquid())
+    ]
+    ase.io.write(tmp_path / "run.extxyz", frames)
+    with pytest.raises(FrameError, match=f"frame {bad} is the first in which .*@{bad}:"):
+        mdnum.flips(tmp_path / "run.extxyz", cutoffs=[5.0], out=tmp_path / "a", report=False)
+    found = mdnum.flips(tmp_path / f"run.extxyz@{bad}:", cutoffs=[5.0], out=tmp_path / "a", report=False)
+    assert found.summary["frames"] == 8 - bad and found.summary["status"] != "stopped"
