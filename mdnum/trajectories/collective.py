@@ -110,7 +110,8 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
     Less the share with the second: in a crystal one is as frequent as the other.
     """
-    repeated = np.count_nonzero(np.diff(np.sort(x, axis=0), axis=0) == 0, axis=0)
+    ordered = np.sort(x, axis=0)
+    repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)
     axis = int(np.argmax(repeated))
     if repeated[axis] < _FEW:
         return 0.0, axis, 0.0
