@@ -37,7 +37,7 @@ _FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
 class SmoothnessCheck(AuditCheck):
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
 
-    name, title, order, calls = "smoothness", "Smoothness", 50, 2500
+    name, title, order, calls = "smoothness", "Smoothness", 50, 2100
     needed_to = ("differentiate",)
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2
