@@ -189,7 +189,7 @@ ASES_OWN = {
     "morse": ("morse:MorsePotential(epsilon=0.5, r0=2.6)", "Ar", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
     "tip3p": ("tip3p:TIP3P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
     "tip4p": ("tip4p:TIP4P(rc=5.5, width=1.0)", None, [(4.5, 2), (5.5, 2)]),
-    "emt": ("emt:EMT", None, [(5.8768, 0)]),
+    "emt": ("emt:EMT", "Cu", [(5.8768, 0)]),
     "eam": (f"eam:EAM(potential={str(COPPER)!r})", "Cu", [(5.50679, 1)]),
     "tersoff": ("tersoff:Tersoff.from_lammps('silicon.tersoff')", "Si", [(2.7, 2), (3.0, 2)]),
 }  # fmt: skip

@@ -158,7 +158,7 @@ def slab() -> Atoms:
     return atoms
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("kind", "checks", "named"),
     [
@@ -191,7 +191,7 @@ def test_a_mistake_is_named_in_other_systems(kind, checks, named, structure, tmp
     assert "NEIGHBOR_CAP_BY_ORDER" not in {one.code for one in outcome.verdict.findings}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("copies", [1, 5])
 def test_a_sum_in_single_precision_has_one_answer_at_both_sizes(copies: int, tmp_path: Path):
     outcome = mdnum.audit_calculator(
