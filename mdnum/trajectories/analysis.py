@@ -28,7 +28,7 @@ from mdnum.trajectories.frame import Frame, FrameCheck
 from mdnum.trajectories.lattice import shortest
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
-from mdnum.trajectories.repeats import Repeats, digest
+from mdnum.trajectories.repeats import RepeatedFrames, digest
 from mdnum.trajectories.resolution import FLOAT32, Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.topology import AtomTable, formats_of
@@ -119,7 +119,7 @@ class NeighborFlips(AnalysisBase):
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
     finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
-    `results.repeats` which frames repeat earlier ones (see `repeats.Repeats`).
+    `results.repeats` which frames repeat earlier ones (see `repeats.RepeatedFrames`).
     `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
@@ -365,7 +365,7 @@ class NeighborFlips(AnalysisBase):
             _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
         ]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
-        repeats = Repeats()
+        repeats = RepeatedFrames()
         for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):
             repeats.see(int(number), digested)
         results.repeats = repeats.stretches

@@ -19,12 +19,12 @@ from mdnum.trajectories.frame import AtomIndices, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
-from mdnum.trajectories.repeats import Repeats
+from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.search import image_distances
 from mdnum.trajectories.separation import (
-    Flight,
+    FreeFlight,
     Separation,
     common_shift,
     flight_of,
@@ -77,7 +77,7 @@ def _usable(
     streams = []
     for one in files:
         one.check = FrameCheck(atoms, str(one.path), radius, one.bits, species=species)
-        one.repeats = Repeats(one.drop_repeats)
+        one.repeats = RepeatedFrames(one.drop_repeats)
         streams.append(one.repeats(map(one.check, one.frames())))
     while True:
         try:
@@ -155,7 +155,7 @@ class Pass:
     rules: list[Followed]
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
-    flights: list[Flight] = field(default_factory=list)  # from one to the next of the first frames
+    flights: list[FreeFlight] = field(default_factory=list)  # from one to the next of the first frames
     # (number of the frame, atom, how far) of what no atom does between two frames
     leaps: list[tuple[int, int, float]] = field(default_factory=list)
 

@@ -56,7 +56,7 @@ Estimate = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Motion:
+class FrameMotion:
     """How far atoms get from frame to frame, as root mean squares."""
 
     growth: tuple[float, float, float]  # displacement in 1, 2 and 4 frames over that many times the one in 1
@@ -73,7 +73,7 @@ class Motion:
         second: Int[np.ndarray, "second"] | None = None,
         *,
         timed: bool = True,
-    ) -> Motion | None:
+    ) -> FrameMotion | None:
         """That of frames in a row, by the atoms on both sides of a pair; None for few, or below rounding."""
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
@@ -114,7 +114,7 @@ class LostFlips:
 
 
 def lost_flips(
-    found: Strides, motion: Motion | None = None, flux: Any = None, reach: float = math.nan
+    found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
     """What is lost between the frames; None with fewer than three strides, or no flips.
 
@@ -153,7 +153,7 @@ def lost_flips(
     return LostFlips("estimate", *seen, parts, lost, low if lost > _MAYBE_NONE else 0.0, high)
 
 
-def _of_motion(motion: Motion, reach: float, bound: float) -> dict[str, Estimate]:
+def _of_motion(motion: FrameMotion, reach: float, bound: float) -> dict[str, Estimate]:
     """The estimates by persistence, and by velocities where there are any."""
     taken, few = -np.diff(np.log(motion.growth)), 1 / math.sqrt(motion.atoms)
     found = {"persistence": _carried_on(taken, np.hypot((_LAW["persistence"] + few) * taken, _LEAST))}

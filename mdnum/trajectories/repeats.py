@@ -31,7 +31,7 @@ def digest(frame: Frame) -> bytes:
 
 
 @dataclass
-class Repeats:
+class RepeatedFrames:
     """Which frames repeat earlier ones. Memory: a digest for each frame that differs from all before.
 
     Attributes:

@@ -127,7 +127,7 @@ def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> d
     return {"kind": "other", "factor": products[1] / products[0], "correlation": correlation}
 
 
-class Flight(NamedTuple):
+class FreeFlight(NamedTuple):
     """Displacements between two frames next to what velocities say."""
 
     moved: float  # root mean square displacement over that of velocities times time
@@ -136,7 +136,7 @@ class Flight(NamedTuple):
     kept: float  # correlation of the velocities with those of the frame before
 
 
-def flight_of(start: Frame, end: Frame, step: float = 0.0) -> Flight | None:
+def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """How displacements between two frames compare with velocities; None without either, or without motion.
 
     `moved` is near 1 where atoms fly straight and below it where they turn around in between: never far
@@ -153,7 +153,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> Flight | None:
     if not min(expected, size, uu, vv) > 0:
         return None
     resolved = size > moved.size * (_STEPS * step) ** 2
-    return Flight(
+    return FreeFlight(
         resolved * float(np.sqrt(size / uu)) / (end.time - start.time),
         float(np.vdot(mean, moved)) / expected,
         float(np.vdot(mean, moved)) / float(np.sqrt(expected * size)),
@@ -161,7 +161,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> Flight | None:
     )
 
 
-def odd_flight(flights: Sequence[Flight]) -> dict[str, Any] | None:
+def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
     """Whether displacements contradict velocities and times, from their medians over some frames.
 
     That atoms move less than their velocities say is no contradiction where they turn around between two
@@ -183,7 +183,7 @@ def odd_flight(flights: Sequence[Flight]) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True)
-class Growth:
+class GrowthLaw:
     """How a separation grows: lines through its logarithm over time, and over the logarithm of time."""
 
     frames: int  # used
@@ -199,7 +199,7 @@ def growth(
     length: Float[np.ndarray, "frames"],
     limit: float,
     began: tuple[float, float],
-) -> Growth | None:
+) -> GrowthLaw | None:
     """The law by which a separation grows.
 
     A force or a velocity that is wrong by a constant separates two runs as a low power of the time since
@@ -230,4 +230,4 @@ def growth(
     slow, exponent = min((one for one in laws if 0 < one[1] <= _STEEPEST), default=(1.0, None))
     law = "power" if slow * _BETTER < left else "either"
     law = "exponential" if exponent is None or left * _BETTER < slow else law
-    return Growth(len(x), rate, 1.0 - left, exponent, 1.0 - slow, law)
+    return GrowthLaw(len(x), rate, 1.0 - left, exponent, 1.0 - slow, law)

@@ -27,7 +27,7 @@ from jaxtyping import Int
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK, FrameError, UnreadableFrame, check_claim, first_line, reading
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
-from mdnum.trajectories.repeats import Repeats
+from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.topology import AtomTable, read_topology
 
 #: Frames from which the resolution of a file is read.
@@ -76,7 +76,7 @@ class Trajectory(ABC):
     _ids: np.ndarray | None = None
     # whether frames that repeat earlier ones are left out; which did, and what was found of frames, when read
     drop_repeats = False
-    repeats: Repeats
+    repeats: RepeatedFrames
     check: FrameCheck
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):

@@ -26,7 +26,7 @@ from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
     from mdnum.trajectories.history import History
-    from mdnum.trajectories.lost import Motion
+    from mdnum.trajectories.lost import FrameMotion
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.statistics import Classes, Statistics
     from mdnum.trajectories.topology import AtomTable
@@ -92,7 +92,7 @@ def flips(
         FolderError: the folder cannot be used.
     """
     from mdnum.trajectories.follow import follow
-    from mdnum.trajectories.lost import Motion
+    from mdnum.trajectories.lost import FrameMotion
     from mdnum.trajectories.resolution import infer
     from mdnum.trajectories.trajectory import open_trajectory
 
@@ -123,7 +123,7 @@ def flips(
         frames = folder.read("frames")
         steps = _steps(frames, opened)
         timed = steps["timed"] and found.odd is None
-        motion = Motion.of(sample, resolution, *groups, timed=timed)
+        motion = FrameMotion.of(sample, resolution, *groups, timed=timed)
         told = [
             _rule_told(folder, number, one, found, frames, steps, opened, groups, window, motion, log)
             | {"grid": _grid(sample, resolution, one, groups)}
@@ -357,7 +357,7 @@ def _rule_told(
     trajectory: Trajectory,
     groups: Groups,
     window: int,
-    motion: Motion | None,
+    motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
@@ -421,7 +421,7 @@ def _rule_told(
 
 
 def _counted(
-    total: Statistics, motion: Motion | None, flux: Mapping[str, Any] | None, reach: float
+    total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float
 ) -> dict[str, Any]:
     """Plain values of what was counted, lengths of time in frames."""
     from mdnum.trajectories.lost import lost_flips

@@ -11,7 +11,7 @@ from trajectories.membership import ledger, random_membership
 
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.history import History, Strides, doublings
-from mdnum.trajectories.lost import Motion, lost_flips
+from mdnum.trajectories.lost import FrameMotion, lost_flips
 from mdnum.trajectories.resolution import infer
 
 
@@ -163,7 +163,7 @@ def test_the_range_holds_what_planted_systems_lose(name: str) -> None:
         strides = Strides.of_history(history_of(seen), doublings(len(frames)))
         for velocities in (v, [None] * len(v)):
             sample = [Frame(n, n * STEP, x[n] % side, box, velocities[n]) for n in frames[:8]]
-            motion = Motion.of(sample, infer(sample))
+            motion = FrameMotion.of(sample, infer(sample))
             found = lost_flips(strides, motion, reach=radius)
             assert found is not None and motion is not None
             assert math.isfinite(motion.moved) == (velocities is v)

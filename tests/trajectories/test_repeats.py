@@ -14,7 +14,7 @@ import mdnum
 from mdnum.store import RunFolder
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.repeats import Repeats, digest
+from mdnum.trajectories.repeats import RepeatedFrames, digest
 from mdnum.verbs.flips_compare import ComparisonView
 from mdnum.verbs.flips_compare import judge as judge_both
 from mdnum.verbs.flips_page import judge
@@ -132,7 +132,7 @@ def test_a_position_a_box_or_a_bit_makes_another_frame():
 
 
 def test_memory_is_that_of_digests():
-    repeats = Repeats(drop=True)
+    repeats = RepeatedFrames(drop=True)
     frames = (Frame(k, 0.0, np.full((50_000, 3), float(k % 3)), Box()) for k in range(9))
     assert [one.index for one in repeats(frames)] == [0, 1, 2]
     assert all(len(one) == 16 for one in repeats._known) and len(repeats._known) == 3
