@@ -111,7 +111,8 @@ def fork_map(
                 "loss": found.loss, "energy": found.energy,
             },
             "boundaries": [{name: edge[name] for name in edge if name not in said} for edge in edges],
-            "intervals": intervals,
+            # a loss that is not finite is a number of the table, and none of the summary
+            "intervals": [vars(one) for one in found.intervals],
         }  # fmt: skip
     return answer.outcome
 
