@@ -16,7 +16,6 @@ box repeats; then every atom of the bin is compared with all of them.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -121,18 +120,15 @@ def shortest(
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
     """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
-    span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)
-            for w, p in zip(lattice.widths, lattice.periodic, strict=True)]  # fmt: skip
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
-    found = []
-    for s in itertools.product(*span):
-        if s > (0, 0, 0):
-            d = s[0] * lattice.vectors[0] + s[1] * lattice.vectors[1] + s[2] * lattice.vectors[2]
-            square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-            if square <= radius * radius:
-                found.append(float(square))
-    return np.sort(np.array(found, np.float64))
+    vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
+    spans = np.meshgrid(*(np.arange(-n, n + 1) for n in most), indexing="ij")
+    # of each two opposite vectors the later one
+    x, y, z = (span.reshape(-1, 1)[span.size // 2 + 1 :] for span in spans)
+    d = x * vectors[0] + y * vectors[1] + z * vectors[2]
+    squares = d[:, 0] * d[:, 0] + d[:, 1] * d[:, 1] + d[:, 2] * d[:, 2]
+    return np.sort(squares[squares <= radius * radius])
 
 
 # inlined: a call that takes arrays costs more than what is done here

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from mdnum.bits import digit_order
-from mdnum.trajectories.search import Changed
 
 
 class Columns:
@@ -91,55 +88,3 @@ class FlipTable(Columns):
         """No row."""
         whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
         return cls(whole, whole, whole, whole, yes, real, real, real, real, real, yes)
-
-
-class Thresholds(NamedTuple):
-    """What distances are compared with at two frames."""
-
-    directed: bool  # whether they are those of an atom; else those of a pair of species
-    species: Int[np.ndarray, "atoms"]  # of each atom that takes part
-    radii: Float[np.ndarray, "species species"]  # by species, length
-    last_in: Float[np.ndarray, "limits"]  # of each atom, now, length; see `search.Chosen`
-    first_out: Float[np.ndarray, "limits"]
-    old_last_in: Float[np.ndarray, "old_limits"]  # of each atom, at the frame before, length
-    old_first_out: Float[np.ndarray, "old_limits"]
-
-
-class LedgerRows:
-    """Makes the rows of frame after frame; labels are the numbers in the file of the atoms that take part."""
-
-    def __init__(self, labels: Int[np.ndarray, "participants"], atoms: int):
-        self.labels, self.atoms = labels, atoms
-        # kept from frame to frame: pages that are new to a process can cost more than what is done in them
-        self._keys = np.empty((4, 0), np.int64)
-
-    def flips(
-        self,
-        frame: int,
-        changed: Changed,
-        distances: tuple[Float[np.ndarray, "flips"], Float[np.ndarray, "flips"]],
-        thresholds: Thresholds,
-        bound: float,
-    ) -> FlipTable:
-        """The rows of one frame from indices among the atoms that take part, and distances now and before."""
-        count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
-        if self._keys.shape[1] < count:
-            self._keys = np.empty((4, count + count // 8), np.int64)
-        i, j = self.labels[changed.i], self.labels[changed.j]
-        if not thresholds.directed:
-            i, j = np.minimum(i, j), np.maximum(i, j)
-        self._keys[0, :count] = (i * self.atoms + j) * ranks + changed.rank
-        order = digit_order(self._keys, count, self.atoms**2 * ranks)
-        distance, before = (one[order] for one in distances)
-        a, b, entered = changed.i[order], changed.j[order], changed.entered[order]
-        if thresholds.directed:
-            limit = np.where(entered, thresholds.last_in[a], thresholds.first_out[a])
-            old_limit = np.where(entered, thresholds.old_first_out[a], thresholds.old_last_in[a])
-        else:
-            limit = old_limit = thresholds.radii[thresholds.species[a], thresholds.species[b]]
-        margin, margin_before = limit - distance, old_limit - before
-        ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
-        return FlipTable(
-            np.full(count, frame), i[order], j[order], changed.rank[order], entered, distance, before,
-            margin, margin_before, np.full(count, bound), ambiguous,
-        )  # fmt: skip

@@ -56,19 +56,6 @@ class Tiled(NamedTuple):
         return cls(first, second, np.empty(tiles, np.uint8), rows, inside)
 
 
-class Flips(NamedTuple):
-    """Room for pairs that came to differ."""
-
-    i: Int[np.ndarray, "room"]
-    j: Int[np.ndarray, "room"]
-    entered: np.ndarray
-
-    @classmethod
-    def room(cls, pairs: int) -> Flips:
-        """Room for so many."""
-        return cls(*(np.empty(pairs, kind) for kind in (np.int64, np.int64, np.bool_)))
-
-
 class _Numbers(NamedTuple):
     """What a frame's exact numbers are computed from."""
 
@@ -103,7 +90,7 @@ class Tiles:
     clear: float  # every pair within this of its radius is in a tile, length
     columns: Float32[np.ndarray, "clusters 3 16"]  # followed coordinates less the center, at the last frame
     boxes: Float32[np.ndarray, "clusters 6"]  # around each cluster then
-    flips: Flips
+    flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
         """Follow the atoms to a frame; whether every pair within clear of its radius is in a tile there."""
@@ -174,15 +161,15 @@ class Tiles:
                     close, smallest = close + near, min(smallest, least)
                     if at == len(tiled.first):
                         break
-                    larger = Flips.room(2 * len(self.flips.i))
+                    larger = Changed.room(2 * len(self.flips.i))
                     for old, new in zip(self.flips, larger, strict=True):
                         new[:count] = old[:count]
                     self.flips = larger
             if not record or smallest <= seen or seen >= max(bound, horizon):
                 break
             seen = max(bound, min(horizon, 16.0 * seen))
-        i, j, entered = (column[:count].copy() for column in self.flips)
-        return Changed(i, j, np.zeros(count, np.int64), entered), int(close), float(smallest)
+        self.flips.rank[:count] = 0
+        return Changed(*(column[:count].copy() for column in self.flips)), int(close), float(smallest)
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
@@ -221,7 +208,7 @@ def tiles_of(
     columns, boxes = _aligned(clusters), np.empty((2, clusters, 6), np.float32)
     made = Tiles(
         order, [], home, center, lattice.vectors, boxes[0], clear, columns, boxes[0],
-        Flips.room(4096) if spare is None else spare.flips,
+        Changed.room(4096) if spare is None else spare.flips,
     )  # fmt: skip
     made._follow(before, before, np.zeros((3, 3)))
     old_columns, old_home = columns.copy(), made.home.copy()

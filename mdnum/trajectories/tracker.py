@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.bits import digit_order
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
 from mdnum.trajectories.lattice import (
@@ -19,7 +20,7 @@ from mdnum.trajectories.lattice import (
     lattice_of,
     own_images,
 )
-from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
+from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.search import (
     Changed,
@@ -105,6 +106,8 @@ class Tracker:
         self._list: Tiles | None = None
         # one that has served, whose memory the next can use
         self._spare: Tiles | None = None
+        # room for sorting, kept: pages that are new to a process can cost more than what is done in them
+        self._keys = np.empty((4, 0), np.int64)
         self._who: Participants
         self._box: Box | None = None
         self._last: Moment | None = None
@@ -176,7 +179,6 @@ class Tracker:
             self._who = _participants(self.rule, self._first, self._second, self._species, atoms)
             if not self.rule.directed:
                 self._who = _by_place(self._who, frame)
-            self._ledger = LedgerRows(self._who.labels, atoms)
         if atoms != self._atoms:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
@@ -283,14 +285,29 @@ class Tracker:
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
         """The flips as columns, from indices among the atoms that take part."""
-        directed, who = self.rule.directed, self._who
+        directed, who, count = self.rule.directed, self._who, len(changed.i)
+        i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
+        if not directed:
+            i, j = np.minimum(i, j), np.maximum(i, j)
+        if self._keys.shape[1] < count:
+            self._keys = np.empty((4, count + count // 8), np.int64)
+        self._keys[0, :count] = (i * self._atoms + j) * images + changed.rank
+        order = digit_order(self._keys, count, self._atoms**2 * images)
         ids = (changed.i, changed.j, changed.rank, directed)
-        thresholds = Thresholds(
-            directed, who.species, who.radii, now.last_in, now.first_out, before.last_in, before.first_out
-        )
+        distance, distance_before = (image_distances(one, *ids)[order] for one in (now, before))
+        a, b, rank, entered = (column[order] for column in changed)
+        if directed:
+            limit = np.where(entered, now.last_in[a], now.first_out[a])
+            limit_before = np.where(entered, before.first_out[a], before.last_in[a])
+        else:
+            limit = limit_before = who.radii[who.species[a], who.species[b]]
+        margin, margin_before = limit - distance, limit_before - distance_before
         bound = self.bound + max(before.rounding, now.rounding)
-        distances = image_distances(now, *ids), image_distances(before, *ids)
-        return self._ledger.flips(self.frames, changed, distances, thresholds, bound)
+        ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
+        return FlipTable(
+            np.full(count, self.frames), i[order], j[order], rank, entered, distance, distance_before,
+            margin, margin_before, np.full(count, bound), ambiguous,
+        )  # fmt: skip
 
 
 def _participants(
