@@ -149,11 +149,11 @@ class MDAnalysisTrajectory(Trajectory):
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
         with reading(path):
-            self._universe, said = self._universe_of(format)
+            self.universe, said = self._universe_of(format)
             if topology is None:
-                self.table = AtomTable.of(self._universe.atoms)
-            self.table.give_elements(self._universe)
-            trajectory = self._universe.trajectory
+                self.table = AtomTable.of(self.universe.atoms)
+            self.table.give_elements(self.universe)
+            trajectory = self.universe.trajectory
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
             self.time = "frame" if _has_no_times(trajectory, said) else "ps"
@@ -161,13 +161,9 @@ class MDAnalysisTrajectory(Trajectory):
             self._boxes = Boxes(trajectory)
             self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
-    @property
-    def universe(self) -> Any:
-        return self._universe
-
     def other_box(self, number: int) -> tuple[str, Box] | None:
         with reading(self.path, number):
-            return self._boxes.other(self._universe.trajectory[number], number)
+            return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
         """A Universe of the trajectory, and the warnings that opening it gave."""
@@ -193,7 +189,7 @@ class MDAnalysisTrajectory(Trajectory):
 
     @contextmanager
     def _reader(self) -> Iterator[Callable[[int], Frame]]:
-        trajectory, at = self._universe.trajectory, None
+        trajectory, at = self.universe.trajectory, None
         with reading(self.path):
             frames = LibraryFrames(trajectory)
 
@@ -208,7 +204,7 @@ class MDAnalysisTrajectory(Trajectory):
         yield get
 
     def _behind(self) -> str | None:
-        return left_over(self._universe.trajectory)
+        return left_over(self.universe.trajectory)
 
     def _frame(self, number: int, raw: Frame) -> Frame:
         return raw

@@ -47,16 +47,8 @@ class _Membership:
 
     directed = False
     needs_species = False
-
-    @property
-    def name(self) -> str:
-        """In words."""
-        raise NotImplementedError
-
-    @property
-    def reach(self) -> float:
-        """Distance beyond which nothing is a neighbor, length."""
-        raise NotImplementedError
+    name: str  # in words
+    reach: float  # distance beyond which nothing is a neighbor, length
 
     @property
     def shortest(self) -> float:

@@ -78,6 +78,7 @@ class Trajectory(ABC):
     drop_repeats = False
     repeats: RepeatedFrames
     check: FrameCheck
+    universe: Any = None  # the MDAnalysis Universe behind it, where there is one
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):
         self.path, self.slice = path, slice
@@ -138,11 +139,6 @@ class Trajectory(ABC):
         """Frames that `frames` gives; None where they are not known without reading the file."""
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
-    @property
-    def universe(self) -> Any:
-        """The MDAnalysis Universe behind it, or None: another reader has none."""
-        return None
-
     def frames(self) -> Iterator[Frame]:
         """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
 
@@ -179,8 +175,7 @@ class Trajectory(ABC):
         """
         sample = []
         try:
-            for frame in islice(self.frames(), SAMPLE):
-                sample.append(frame)
+            sample.extend(islice(self.frames(), SAMPLE))
         except InputError:
             if not sample:
                 raise
@@ -307,16 +302,17 @@ def open_trajectory(
         )
     if file.is_dir() and file.suffix != ".bundle":
         raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
-    for one in (file, None if topology is None else Path(topology).expanduser()):
-        if one is not None and not one.exists():
+    for one in (file, *([] if topology is None else [Path(topology).expanduser()])):
+        if not one.exists():
             raise InputError("no such file", remedy="Check the path", where=str(one))
-        if one is not None and one.is_file() and not one.stat().st_size:
+        if one.is_dir():
+            continue
+        if not one.is_file():
+            # a reader would wait for what comes, or read without end
+            raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
+        if not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
-        if one is not None and not one.is_dir():
-            if not one.is_file():
-                # a reader would wait for what comes, or read without end
-                raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
-            check_claim(one)
+        check_claim(one)
     opened = _reader_of(file, format)(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
