@@ -89,15 +89,6 @@ class _ProcessPart:
         self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
 
 
-@dataclass(frozen=True)
-class _Failure:
-    """Why a part ended before its last frame: whether reading failed, or what was read was wrong."""
-
-    frame: int
-    message: str
-    read: bool
-
-
 @dataclass
 class _Guarded:
     """Frames of a trajectory one after the other, each checked before the library reads it."""
@@ -181,10 +172,8 @@ class NeighborFlips(AnalysisBase):
         seen = atoms_of((self._first, self._second))
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
-            raise InputError(
-                f"bound = {bound!r}; expected a length of 0 or more, Å",
-                remedy="Leave it out for what the resolution of the file gives",
-            )
+            message = f"bound = {bound!r}; expected a length of 0 or more, Å"
+            raise InputError(message, remedy="Leave it out for what the resolution of the file gives")
         self._bound = bound
         self._resolution: Resolution | None = None
         self._numbers = np.zeros(0, np.int64)
@@ -206,14 +195,8 @@ class NeighborFlips(AnalysisBase):
         super().run(*args, **kwargs)
         failure = self.results.failure
         if failure is not None:
-            kind = UnreadableFrame if failure.read else FrameError
-            where = getattr(self._trajectory, "filename", None)
-            raise kind(
-                failure.message,
-                frame=failure.frame,
-                where=str(where) if where is not None else "the trajectory",
-                remedy=f"The results of the {len(self.frames):,} frames before it are kept",
-            )
+            remedy = f"The results of the {len(self.frames):,} frames before it are kept"
+            raise type(failure)(failure.message, frame=failure.frame, where=self._where, remedy=remedy)
         return self
 
     def _configure_backend(self, backend: Any, *args: Any, **kwargs: Any) -> Any:
@@ -240,10 +223,8 @@ class NeighborFlips(AnalysisBase):
         back = np.flatnonzero(np.diff(self._numbers) <= 0)
         if back.size:
             after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
-            raise InputError(
-                f"the frames go backward or stand still: frame {after} after frame {before}",
-                remedy="Give them in ascending order: flips follow time",
-            )
+            message = f"the frames go backward or stand still: frame {after} after frame {before}"
+            raise InputError(message, remedy="Give them in ascending order: flips follow time")
         sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
             try:
@@ -289,7 +270,7 @@ class NeighborFlips(AnalysisBase):
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            failure = _Failure(error.frame, error.message, isinstance(error, UnreadableFrame))
+            failure = error
         if failure is not None:
             self.results.failures, done = [failure], max(self._done, 0)
             self.frames, self.times = self.frames[:done], self.times[:done]
@@ -377,11 +358,16 @@ class NeighborFlips(AnalysisBase):
             for name, value in vars(found[0]).items():
                 results[name] = value
 
-    def _behind_the_last(self) -> _Failure | None:
+    @property
+    def _where(self) -> str:
+        return str(getattr(self._trajectory, "filename", None) or "the trajectory")
+
+    def _behind_the_last(self) -> FrameError | None:
         """A frame behind the last one that the library has, which it leaves out."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
-        count = int(self._trajectory.n_frames)
-        return None if rest is None else _Failure(count, f"frame {count} cannot be read ({rest})", True)
+        count, where = int(self._trajectory.n_frames), self._where
+        said = f"frame {count} cannot be read ({rest})"
+        return None if rest is None else UnreadableFrame(said, frame=count, where=where)
 
 
 def _changed(before: Frame, after: Frame) -> float:
@@ -406,10 +392,8 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
-            raise InputError(
-                f"two processes found other pairs at the frame between them (number {done - 1} of all)",
-                remedy="The file was changed while it was read; run again",
-            )
+            message = f"two processes found other pairs at the frame between them (number {done - 1} of all)"
+            raise InputError(message, remedy="The file was changed while it was read; run again")
         for table in part.flips:
             # a part after the first has counted the frame before its own too
             table.frame[:] += done - (done > 0)
@@ -471,7 +455,5 @@ def _cutoff(value: Any) -> Rule:
             return SpeciesCutoffs({pair: length(one) for pair, one in value.items()})
         return CutoffRule(length(value))
     except (TypeError, ValueError):
-        raise InputError(
-            f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species",
-            remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them',
-        ) from None
+        message = f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species"
+        raise InputError(message, remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them') from None

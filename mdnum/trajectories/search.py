@@ -101,7 +101,7 @@ def search(
     doubtful = max(open_room or int(1.1 * expected * share), 1024)
     while True:
         found = Candidates.room(sure, doubtful)
-        count, left = meet(atoms, SearchLimits.of(radii, kind, band), 0, len(atoms.start) - 1, found)
+        count, left = meet(atoms, SearchLimits.of(radii, kind, band), found)
         # what is open may come to be inside
         if left <= doubtful and (kind != INSIDE or count + left <= sure):
             break

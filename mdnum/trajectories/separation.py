@@ -82,7 +82,7 @@ def separation(
         float(np.sqrt(square.mean())),
         at if atoms is None else int(atoms[at]),
         int(np.abs(whole).max()),
-        (0.0, 0.0, 0.0) if shift is None else (float(shift[0]), float(shift[1]), float(shift[2])),
+        (0.0, 0.0, 0.0) if shift is None else tuple(shift.tolist()),
     )
 
 

@@ -136,11 +136,9 @@ def format_of(path: Path) -> str:
         with reading(path, by="ASE"):
             return filetype(str(path))
     except UnknownFileTypeError as error:
-        raise InputError(
-            "neither MDAnalysis nor ASE knows this format",
-            remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
-            where=str(path),
-        ) from error
+        message = "neither MDAnalysis nor ASE knows this format"
+        remedy = "Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it"
+        raise InputError(message, remedy=remedy, where=str(path)) from error
 
 
 def _units(path: Path) -> Units:
@@ -363,10 +361,8 @@ class LammpsDump(TextTrajectory):
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
         if "id" not in columns:
-            raise self._refused(
-                "the dump has no ids, and LAMMPS changes the order of atoms as they move",
-                "Dump the column id",
-            )
+            message = "the dump has no ids, and LAMMPS changes the order of atoms as they move"
+            raise self._refused(message, "Dump the column id")
         return self._by_id(number, rows[:, columns.index("id")].astype(np.int64))
 
     def _block(self, lines: Any) -> list[str] | None:

@@ -117,10 +117,8 @@ class Tiles:
 
     def doubt(self, now: Placed, radius: float) -> float:
         """How far a distance near the radius can be off through float32, length."""
-        largest, vectors = (
-            float(np.abs(self.boxes).max(initial=0.0)),
-            float(np.abs(now.lattice.vectors).sum()),
-        )
+        largest = float(np.abs(self.boxes).max(initial=0.0))
+        vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
         return 2.0 * _UNIT * (3.0 * largest + 2.0 * vectors + 4.0 * radius) + 8.0 * now.rounding
 
@@ -333,11 +331,8 @@ def _nodes(boxes, runs):
     Of a node with n clusters the first half begins one node further, the second twice as many nodes as the
     first half has clusters.
     """
-    nodes, spans, stack = (
-        np.empty((2 * runs[-1], 6), np.float32),
-        np.empty((2 * runs[-1], 2), np.int64),
-        [(0, 0, 0)],
-    )
+    nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
+    stack = [(0, 0, 0)]
     for run in range(runs.shape[0] - 1):
         stack.append((2 * runs[run], runs[run], runs[run + 1]))
         while len(stack) > 1:
@@ -576,22 +571,15 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         alone, held = i == j and code == np.uintp(_NONE), np.uintp(0)
         while left != np.uintp(0):
             row = lowest_bit(left)
-            left &= left - np.uintp(1)
+            atom, left = order[np.uintp(CLUSTER) * i + row], left & (left - np.uintp(1))
             bits = _lanes(scratch_at + np.uintp(4) * row, j_at, low, high)
             if alone:
                 bits &= ((np.uintp(0xFFFE) << row) & np.uintp(0xFFFF)) * np.uintp(0x10001)
             now = bits & np.uintp(0xFFFF)
             doubtful = now ^ (bits >> np.uintp(16))
             if doubtful != np.uintp(0):
-                now, near, least = _settled(
-                    now,
-                    doubtful,
-                    order[np.uintp(CLUSTER) * i + row],
-                    np.uintp(CLUSTER) * j,
-                    code,
-                    numbers,
-                    limits,
-                )
+                slot = np.uintp(CLUSTER) * j
+                now, near, least = _settled(now, doubtful, atom, slot, code, numbers, limits)
                 close += near
                 smallest = min(smallest, least)
             held |= np.uintp(now != np.uintp(0)) << row
@@ -602,7 +590,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
                     lane = lowest_bit(changed)
                     changed &= changed - np.uintp(1)
                     place = np.uintp(count)
-                    flips.i[place] = order[np.uintp(CLUSTER) * i + row]
+                    flips.i[place] = atom
                     flips.j[place] = order[np.uintp(CLUSTER) * j + lane]
                     flips.entered[place] = (now >> lane) & np.uintp(1)
                     count += 1

@@ -94,11 +94,9 @@ class Tracker:
         self.rule, self.bound = rule, float(bound)
         self._first, self._second = _indices(first, "first"), _indices(second, "second")
         if rule.needs_species and species is None:
-            raise InputError(
-                f"{rule.name} needs to know which species the atoms are of",
-                remedy="Give a topology that names elements or types, or use one cutoff for all",
-                where="species",
-            )
+            message = f"{rule.name} needs to know which species the atoms are of"
+            remedy = "Give a topology that names elements or types, or use one cutoff for all"
+            raise InputError(message, remedy=remedy, where="species")
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
         # how many were decided from the coordinates as stored last time, to make room for as many
@@ -180,20 +178,16 @@ class Tracker:
             if not self.rule.directed:
                 self._who = _by_place(self._who, frame)
         if atoms != self._atoms:
-            raise InputError(
-                f"{atoms} atoms, {self._atoms} in the frames before",
-                remedy="Split the trajectory where the number of atoms changes",
-                where=where,
-            )
+            message = f"{atoms} atoms, {self._atoms} in the frames before"
+            remedy = "Split the trajectory where the number of atoms changes"
+            raise InputError(message, remedy=remedy, where=where)
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
-            raise InputError(
-                f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}",
-                remedy="Stop before this frame (a slice of the file), and find out why the run broke",
-                where=where,
-            )
+            message = f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}"
+            remedy = "Stop before this frame (a slice of the file), and find out why the run broke"
+            raise InputError(message, remedy=remedy, where=where)
         lattice, radius = self._lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
@@ -322,17 +316,11 @@ def _participants(
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
         if len(chosen) and chosen.max() >= atoms:
-            raise InputError(
-                f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)",
-                remedy="Select atoms of this trajectory",
-                where=name,
-            )
+            message = f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)"
+            raise InputError(message, remedy="Select atoms of this trajectory", where=name)
     if species is not None and len(species) != atoms:
-        raise InputError(
-            f"{len(species)} species for frames of {atoms} atoms",
-            remedy="Use the topology that belongs to the trajectory",
-            where="species",
-        )
+        message = f"{len(species)} species for frames of {atoms} atoms"
+        raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")
     centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
     centers[first], others[second] = True, True
     labels = np.flatnonzero(centers | others)
@@ -372,9 +360,7 @@ def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarra
     if made.size == 0:
         return np.zeros(0, np.int64)
     if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
-        raise InputError(
-            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
-            remedy="Give the indices of the atoms in the trajectory, from 0",
-            where=where,
-        )
+        message = f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}"
+        remedy = "Give the indices of the atoms in the trajectory, from 0"
+        raise InputError(message, remedy=remedy, where=where)
     return np.unique(made.astype(np.int64))

@@ -295,11 +295,9 @@ def open_trajectory(
         RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
-        raise InputError(
-            "this folder holds results, and no trajectory",
-            remedy="Give the trajectory itself; a run keeps one with --save-every 1 (or another number)",
-            where=str(file),
-        )
+        message = "this folder holds results, and no trajectory"
+        remedy = "Give the trajectory itself; a run keeps one with --save-every 1 (or another number)"
+        raise InputError(message, remedy=remedy, where=str(file))
     if file.is_dir() and file.suffix != ".bundle":
         raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
     for one in (file, *([] if topology is None else [Path(topology).expanduser()])):
@@ -391,21 +389,17 @@ def parse_slice(words: str, where: str = "") -> slice:
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:
-        raise InputError(
-            f"{words!r} names no frames",
-            remedy="Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame",
-            where=where or None,
-        )
+        message = f"{words!r} names no frames"
+        remedy = "Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame"
+        raise InputError(message, remedy=remedy, where=where or None)
     colon = match[2]
     start, stop, step = (None if match[k] is None else int(match[k]) for k in (1, 3, 5))
     if colon is None:
         return slice(None) if start is None else slice(start, start + 1 or None)
     if step is not None and step < 1:
-        raise InputError(
-            f"the frames {words!r} go backward or nowhere",
-            remedy="Write a stride of 1 or more: flips follow time",
-            where=where or None,
-        )
+        message = f"the frames {words!r} go backward or nowhere"
+        remedy = "Write a stride of 1 or more: flips follow time"
+        raise InputError(message, remedy=remedy, where=where or None)
     return slice(start, stop, step or 1)
 
 

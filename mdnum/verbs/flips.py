@@ -224,11 +224,9 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
         pass
     if not isinstance(radius, int | float):
         unit = f" in {trajectory.length}" if trajectory.length else ""
-        raise InputError(
-            "no rule says which pairs count",
-            remedy=f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K',
-            where=str(trajectory.path),
-        )
+        message = "no rule says which pairs count"
+        remedy = f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K'
+        raise InputError(message, remedy=remedy, where=str(trajectory.path))
     return rules([float(radius)])
 
 

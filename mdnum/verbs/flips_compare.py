@@ -45,10 +45,8 @@ def compare(
         InputError: they are not of the same atoms.
     """
     if a.atoms != b.atoms:
-        raise InputError(
-            f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
-            remedy="Compare trajectories of the same atoms",
-        )
+        message = f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}"
+        raise InputError(message, remedy="Compare trajectories of the same atoms")
     groups = selected(a, between)
     samples = [one.sample() for one in (a, b)]
     resolutions = [infer(some, one.bits, one.format) for some, one in zip(samples, (a, b), strict=True)]
@@ -82,28 +80,25 @@ def compare(
             }
             for one in sets
         ]  # fmt: skip
-        answer.result, answer.summary = (
-            found,
-            {
-                **about(a, "flips-compare", between),
-                "other": name_of(b),
-                "other_file": str(b.path),
-                "other_format": b.format,
-                "same_species": _alike(a, b),
-                "rules": told,
-                "in_file": [one.count for one in (a, b)],
-                "times": [a.time, b.time],
-                "timed": a.time != "frame",
-                "interval": 1.0,
-                "resolution": resolutions[0],
-                "other_resolution": resolutions[1],
-                **{name: value for name, value in vars(found).items() if name not in ("stopped", "other")},
-                "repeats": [one.repeats.plain() for one in (a, b)],
-                # steps, units and numbers of frames are not compared with one another
-                "times_differ": found.times_differ if a.time == b.time else 0,
-                **ending(found.stopped, interrupted),
-            },
-        )
+        answer.result, answer.summary = found, {
+            **about(a, "flips-compare", between),
+            "other": name_of(b),
+            "other_file": str(b.path),
+            "other_format": b.format,
+            "same_species": _alike(a, b),
+            "rules": told,
+            "in_file": [one.count for one in (a, b)],
+            "times": [a.time, b.time],
+            "timed": a.time != "frame",
+            "interval": 1.0,
+            "resolution": resolutions[0],
+            "other_resolution": resolutions[1],
+            **{name: value for name, value in vars(found).items() if name not in ("stopped", "other")},
+            "repeats": [one.repeats.plain() for one in (a, b)],
+            # steps, units and numbers of frames are not compared with one another
+            "times_differ": found.times_differ if a.time == b.time else 0,
+            **ending(found.stopped, interrupted),
+        }  # fmt: skip
     return answer.outcome
 
 

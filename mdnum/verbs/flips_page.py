@@ -67,8 +67,7 @@ def _evidence(view: FlipsView) -> Iterator[str]:
     yield resolution(view.summary["resolution"], view.unit)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
         if view.summary["frames"] > 1 and not len(_disagreeing(view, place)):
-            numbers = {name: one[name] for name in ("flips", "entered", "left")}
-            yield TEXTS("algebra", rule=view.rule(one), **numbers)
+            yield TEXTS("algebra", **{**one, "rule": view.rule(one)})
         life = one["lifetime"]
         if life["followed"] and life["leaves"]:
             values = {"median": view.life(one), "mean": view.life(one, "mean_by_rate")}
@@ -185,11 +184,8 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
     if (flight := summary["flight"]) is not None:
         factor, lower = flight["factor"], flight["at_least"]
-        known = (
-            []
-            if lower
-            else [word for word, one in TEXTS.entries["odd_units"].items() if abs(factor / one - 1) < 0.05]
-        )
+        units = () if lower else TEXTS.entries["odd_units"].items()
+        known = [word for word, one in units if abs(factor / one - 1) < 0.05]
         code = "at_least" if lower else "large" if factor > 1 else "small"
         values = {"factor": factor, "inverse": 1 / factor, "units": " or ".join(known)}
         yield TEXTS.finding("VELOCITIES_ODD", code, *["known"] * bool(known), **values)

@@ -56,11 +56,7 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
         "question": question,
         "system": name_of(trajectory),
         "file": str(trajectory.path),
-        "format": trajectory.format,
-        "reader": trajectory.reader,
-        "atoms": trajectory.atoms,
-        "length": trajectory.length,
-        "time": trajectory.time,
+        **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
         "slice": trajectory.slice_words,
         "between": between,
         "notes": trajectory.notes,
@@ -245,8 +241,5 @@ def resolution(kept: Mapping[str, Any], length: str) -> str:
         code = "narrowed"
     unit = "of the box" if kept["kind"] == "fractions" else length
     text = TEXTS(f"resolution_{code}", step=kept["step"], digits=kept["digits"], unit=unit)
-    return (
-        text
-        if kept["moved"] or not kept["told"] or not kept["step"]
-        else f"{text} {TEXTS('resolution_still')}"
-    )
+    still = kept["told"] and kept["step"] and not kept["moved"]
+    return f"{text} {TEXTS('resolution_still')}" if still else text
