@@ -67,7 +67,7 @@ _PATIENCE = 10_000
 class FrameError(InputError):
     """A frame holds what cannot be right; it has this number in its file, from 0."""
 
-    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
+    def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
         self.frame = frame
 

@@ -317,7 +317,7 @@ class NeighborFlips(AnalysisBase):
             return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
         except InputError as error:
             raise FrameError(
-                f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
+                f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy
             ) from error
 
     def _bound_of(self, frame: Frame) -> float:

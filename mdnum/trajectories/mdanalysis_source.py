@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import math
 import struct
 import sys
 import warnings
@@ -103,14 +104,9 @@ class LibraryFrames:
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
         """A frame from a timestep, copied; errors as of `timestep`."""
         with self._reading(number):
-            return Frame(
-                index=number,
-                time=float(number) if untimed else float(ts.time),
-                positions=np.array(ts.positions, np.float64),
-                box=self._box(ts, number),
-                velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
-                labels=self.labels(number),
-            )
+            time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
+            velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
+            return Frame(number, time, x, self._box(ts, number), velocities, self.labels(number))
 
     def _box(self, ts: Any, number: int) -> Box:
         if isinstance(self._guard, TrrFile) and not self._guard.has_box(number):
@@ -157,7 +153,7 @@ class MDAnalysisTrajectory(Trajectory):
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
             self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-            self._time_factor = _time_factor(trajectory)
+            self._time_factor, self.swapped = _time_factors(trajectory)
             self._boxes = Boxes(trajectory)
             self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
@@ -259,17 +255,17 @@ def _length_of(trajectory: Any) -> str:
     return "Å" if str(unit) in ("A", "Angstrom", "angstrom") else str(unit)
 
 
-def _time_factor(trajectory: Any) -> float:
-    """Times in a DCD file over MDAnalysis's, which takes the step in this machine's byte order."""
-    if "DCD" not in formats_of(trajectory):
-        return 1.0
+def _time_factors(trajectory: Any) -> tuple[float, float]:
+    """Times in a DCD file over MDAnalysis's, which has the step in this machine's byte order; `swapped`."""
+    read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
+    if not read:
+        return 1.0, math.nan
     with Path(trajectory.filename).open("rb") as file:
         head = file.read(88)
-    order = "<" if head[:1] == b"T" else ">"
     # without a version, it is X-PLOR's
-    (step,) = struct.unpack_from(order + ("f" if any(head[84:]) else "d"), head, 44)
-    read = trajectory._file.header["delta"]
-    return step / read if step and read else 1.0
+    kind, orders = "f" if any(head[84:]) else "d", "<>" if head[:1] == b"T" else "><"
+    step, other = (struct.unpack_from(order + kind, head, 44)[0] for order in orders)
+    return (step / read, other / step) if step else (1.0, math.nan)
 
 
 def _has_no_times(trajectory: Any, said: list[str]) -> bool:
@@ -352,14 +348,11 @@ def _behind_text(file: Any) -> str | None:
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
     """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
-    if path.suffix not in _COMPRESSED:
-        size = path.stat().st_size
-        with path.open("rb") as raw:
-            raw.seek(max(size - _LAST_BYTES, 0))
-            return raw.read(), size
-    last, size = b"", 0
-    with _COMPRESSED[path.suffix](path, "rb") as packed:
-        while part := packed.read(_PART):
+    packed = path.suffix in _COMPRESSED
+    last, size = b"", 0 if packed else max(path.stat().st_size - _LAST_BYTES, 0)
+    with _COMPRESSED.get(path.suffix, open)(path, "rb") as file:
+        file.seek(size)
+        while part := file.read(_PART):
             last, size = (last + part)[-_LAST_BYTES:], size + len(part)
     return last, size
 

@@ -9,6 +9,7 @@ float32 (`Trajectory.bits`).
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 import zlib
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,8 @@ class Trajectory(ABC):
     repeats: RepeatedFrames
     check: FrameCheck
     universe: Any = None  # the MDAnalysis Universe behind it, where there is one
+    # the time step with its bytes in the other order, over that one, where the file has one
+    swapped: float = math.nan
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):
         self.path, self.slice = path, slice
@@ -95,10 +98,9 @@ class Trajectory(ABC):
     def _belongs(self, topology: int, atoms: int) -> None:
         """Refuses a topology with another number of atoms."""
         if self.topology is not None and topology != atoms:
-            raise self._refused(
-                f"the topology {self.topology.name} has {topology:,} atoms and the trajectory {atoms:,}",
-                "Give the topology that the trajectory was written with, or a selection of it",
-            )
+            seen = f"the topology {self.topology.name} has {topology:,} atoms and the trajectory {atoms:,}"
+            remedy = "Give the topology that the trajectory was written with, or a selection of it"
+            raise self._refused(seen, remedy)
 
     def _refused(self, message: str, remedy: str = CHECK) -> InputError:
         return InputError(message, remedy=remedy, where=str(self.path))
@@ -116,11 +118,6 @@ class Trajectory(ABC):
     def other_box(self, number: int) -> tuple[str, Box] | None:
         """(code of a finding, another box that a frame may be taken to have); None without one."""
         return None
-
-    @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.path.name
 
     @property
     def in_file(self) -> int | None:
@@ -154,11 +151,9 @@ class Trajectory(ABC):
                         return
                     frame = self._frame(number, raw)
                 if len(frame.positions) != self.atoms:
-                    raise self._odd(
-                        number,
-                        f"has {len(frame.positions):,} atoms and the first {self.atoms:,}",
-                        "Leave out the frames with another number of atoms: a flip needs the pair before",
-                    )
+                    seen = f"has {len(frame.positions):,} atoms and the first {self.atoms:,}"
+                    remedy = "Leave out the frames with another number of atoms: a flip needs the pair before"
+                    raise self._odd(number, seen, remedy)
                 yield frame
         end = self.in_file or 0
         if number is None or not (self.slice.stop is None or self.slice.stop > end):
@@ -212,11 +207,8 @@ class Trajectory(ABC):
         if not np.array_equal(known, ids[order]):
             lost = np.setdiff1d(known, ids)
             seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise self._odd(
-                number,
-                f"{seen} of the first frame: {len(ids):,} atoms, and {len(known):,} there",
-                "Dump one group of atoms that stays the same",
-            )
+            seen += f" of the first frame: {len(ids):,} atoms, and {len(known):,} there"
+            raise self._odd(number, seen, "Dump one group of atoms that stays the same")
         return order
 
     @contextmanager
@@ -403,15 +395,11 @@ def parse_slice(words: str, where: str = "") -> slice:
     return slice(start, stop, step or 1)
 
 
-def chosen(frames: slice, count: int | None) -> Iterator[int]:
-    """The numbers of the frames, upward; without an end where neither the slice nor a count has one."""
-    if count is not None:
-        yield from range(*frames.indices(count))
-        return
-    number, stop, step = frames.start or 0, frames.stop, frames.step or 1
-    while stop is None or number < stop:
-        yield number
-        number += step
+def chosen(frames: slice, total: int | None) -> Iterator[int]:
+    """The numbers of the frames, upward; without an end where neither the slice nor a total has one."""
+    if total is not None:
+        return iter(range(*frames.indices(total)))
+    return islice(count(), frames.start, frames.stop, frames.step)
 
 
 # ---- atoms by words, in MDAnalysis's selection language, whoever reads the file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -285,12 +284,12 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
     interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else math.nan
     backward = int(np.count_nonzero(steps <= 0))
     seconds = abs(interval) * _SECONDS.get(trajectory.time, math.nan)
-    absurd = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST)
+    absurd, swapped = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST), interval * trajectory.swapped
     return {
         # frames are counted where their times do not go forward
         "timed": timed and not backward and not absurd,
         "absurd": absurd,
-        "swapped": _swapped(trajectory, interval) if absurd else None,
+        "swapped": swapped if absurd and _SHORTEST < swapped * _SECONDS["ps"] < _LONGEST else None,
         "has_times": timed and not (len(steps) and (steps == 0).all()),
         "first_time": float(times[0]),
         "last_time": float(times[-1]),
@@ -298,18 +297,6 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
         "even": bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True,
         "backward": backward,
     }
-
-
-def _swapped(trajectory: Trajectory, interval: float) -> float | None:
-    """The time between frames if the step in a DCD's head has its bytes in the other order; None for none."""
-    with trajectory.path.open("rb") as file:
-        head = file.read(48)
-    if trajectory.format != "DCD" or head[4:8] != b"CORD":
-        return None
-    orders = "<>" if head[:4] == struct.pack("<i", 84) else "><"
-    (step,), (other,) = (struct.unpack(f"{order}f", head[44:48]) for order in orders)
-    found = interval * other / step
-    return found if _SHORTEST < found * _SECONDS["ps"] < _LONGEST else None
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
@@ -389,18 +376,13 @@ def _rule_told(
         names = [labels.residues.names[at] for at in busy]
         append("residues", {"residue": names, "between": between[busy], "within": within[busy]})
     entered, left = int(rows["entered"].sum()), int(rows["left"].sum())
-    count, margins = len(rows["pairs"]), rows["min_margin"]
+    inside, margins, count = rows["pairs"], rows["min_margin"], found.frames
     told = {
         "rule": one.rule.name,
         "directed": one.rule.directed,
-        "pairs_first": int(rows["pairs"][0]),
-        "pairs_last": int(rows["pairs"][-1]),
-        "pairs_mean": float(rows["pairs"].mean()),
-        "pairs_least": int(rows["pairs"].min()),
-        "pairs_most": int(rows["pairs"].max()),
-        "entered": entered,
-        "left": left,
-        "flips": entered + left,
+        "pairs_first": int(inside[0]), "pairs_last": int(inside[-1]), "pairs_mean": float(inside.mean()),
+        "pairs_least": int(inside.min()), "pairs_most": int(inside.max()),
+        "entered": entered, "left": left, "flips": entered + left,
         "flips_per_frame": (entered + left) / (count - 1) if count > 1 else None,
         "ambiguous": int(rows["ambiguous"].sum()),
         "near_mean": float(rows["near"].mean()),

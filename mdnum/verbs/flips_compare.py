@@ -45,7 +45,7 @@ def compare(
         InputError: they are not of the same atoms.
     """
     if a.atoms != b.atoms:
-        message = f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}"
+        message = f"{a.path.name} has {a.atoms:,} atoms and {b.path.name} {b.atoms:,}"
         raise InputError(message, remedy="Compare trajectories of the same atoms")
     groups = selected(a, between)
     samples = [one.sample() for one in (a, b)]

@@ -45,7 +45,7 @@ def stem(trajectory: Trajectory) -> str:
 def name_of(trajectory: Trajectory) -> str:
     """What a file is called on a page; a run's trajectory by its folder, because all have one name."""
     own = trajectory.path.name == "trajectory.traj"
-    name = trajectory.path.resolve().parent.name if own else trajectory.name
+    name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
 
 
