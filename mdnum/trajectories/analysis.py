@@ -180,7 +180,6 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._library: LibraryFrames | None = None
-        self._done = 0
         self._to_the_end = False
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
@@ -193,8 +192,7 @@ class NeighborFlips(AnalysisBase):
             FrameError: likewise, a frame that holds what cannot be right.
         """
         super().run(*args, **kwargs)
-        failure = self.results.failure
-        if failure is not None:
+        if (failure := self.results.failure) is not None:
             remedy = f"The results of the {len(self.frames):,} frames before it are kept"
             raise type(failure)(failure.message, frame=failure.frame, where=self._where, remedy=remedy)
         return self
@@ -263,17 +261,13 @@ class NeighborFlips(AnalysisBase):
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
-        self._done = 0
         # what it knows of earlier frames is of another part, or of another run
         self._check.collective = Collective()
-        self.results, failure = Results(failures=[None]), None
+        self.results = Results(failures=[None])
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            failure = error
-        if failure is not None:
-            self.results.failures, done = [failure], max(self._done, 0)
-            self.frames, self.times = self.frames[:done], self.times[:done]
+            self.results.failures = [error.with_traceback(None)]
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.end(tracker.members())
         # what a process sends back is what it found, not what it needed for that; an open file cannot be sent
@@ -290,11 +284,9 @@ class NeighborFlips(AnalysisBase):
         self.results.bounds, self.results.digests = [[]], [[]]
         if self._at:
             # the frame before the first of this part
-            self._done = -1
             self._examined(self.library.timestep(int(self._numbers[self._at - 1])))
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
                 part.first = tracker.members()
-            self._done = 0
 
     def _single_frame(self) -> None:
         bound, found = self._examined(self._ts)
@@ -305,20 +297,14 @@ class NeighborFlips(AnalysisBase):
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
         self.results.digests[0].append(self._digest)
-        self._done += 1
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
-        try:
-            # a margin among the nearest is the difference of two distances
-            return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
-        except InputError as error:
-            raise FrameError(
-                f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy
-            ) from error
+        # a margin among the nearest is the difference of two distances
+        return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
 
     def _bound_of(self, frame: Frame) -> float:
         """How far a distance in the frame that was just read can be off, length."""
@@ -342,9 +328,8 @@ class NeighborFlips(AnalysisBase):
         kept = failed[0] + 1 if failed else len(failures)
         done = sum(len(one) for one in results.bounds[:kept])
         self.frames, self.times = self.frames[:done], self.times[:done]
-        found = [
-            _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
-        ]
+        parts = results.parts[:kept]
+        found = [_joined(rule, [part[k] for part in parts]) for k, rule in enumerate(self.rules)]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
         repeats = RepeatedFrames()
         for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):

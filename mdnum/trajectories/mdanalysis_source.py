@@ -8,8 +8,6 @@ a run that was killed leaves, is no file at all to them: it is read here (amberm
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import math
 import struct
 import sys
@@ -50,7 +48,6 @@ _LINES = {"XYZ": "xyzfile", "TXYZ": "xyzfile", "ARC": "xyzfile", "TRJ": "trjfile
 _BEGINS = {"XYZ": "_offsets", "PDB": "_start_offsets", "ENT": "_start_offsets"}
 # enough of a file's end for some lines
 _LAST_BYTES = 20_000
-_COMPRESSED: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 _PART = 1 << 22
 
 
@@ -348,9 +345,11 @@ def _behind_text(file: Any) -> str | None:
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
     """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
-    packed = path.suffix in _COMPRESSED
+    from MDAnalysis.lib.util import anyopen
+
+    packed = path.suffix in (".gz", ".bz2")
     last, size = b"", 0 if packed else max(path.stat().st_size - _LAST_BYTES, 0)
-    with _COMPRESSED.get(path.suffix, open)(path, "rb") as file:
+    with anyopen(str(path), "rb") as file:
         file.seek(size)
         while part := file.read(_PART):
             last, size = (last + part)[-_LAST_BYTES:], size + len(part)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from mdnum.bits import digit_order
 from mdnum.errors import InputError
+from mdnum.reading import FrameError
 from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
 from mdnum.trajectories.lattice import (
     INSIDE,
@@ -107,7 +108,7 @@ class Tracker:
         # room for sorting, kept: pages that are new to a process can cost more than what is done in them
         self._keys = np.empty((4, 0), np.int64)
         self._who: Participants
-        self._box: Box | None = None
+        self._box = b""
         self._last: Moment | None = None
         self.frames = self.pairs = self.near = 0
         self.min_margin = np.inf
@@ -119,11 +120,18 @@ class Tracker:
             frame: the next one; its own index does not matter.
             bound: of this frame and from here on, length; None for the one before.
         Raises:
-            InputError: a position that is not finite; a direction that repeats without a vector; another
-                number of atoms than before.
+            FrameError: a position that is not finite; a direction that repeats without a vector; another
+                number of atoms than before; more pairs than fit into memory.
         """
         if bound is not None:
             self.bound = float(bound)
+        try:
+            return self._stepped(frame)
+        except InputError as error:
+            message = f"frame {frame.index}: {error.message}"
+            raise FrameError(message, frame=frame.index, remedy=error.remedy, where=error.where) from error
+
+    def _stepped(self, frame: Frame) -> FlipTable:
         before, now = self._last, self._moment(frame)
         flips = None if before is None or self.rule.directed else self._from_list(before, now)
         if flips is None:
@@ -171,7 +179,7 @@ class Tracker:
 
     def _moment(self, frame: Frame) -> Moment:
         """A frame that can be decided on."""
-        where, atoms = f"frame {frame.index}", len(frame.positions)
+        atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
             self._who = _participants(self.rule, self._first, self._second, self._species, atoms)
@@ -179,35 +187,29 @@ class Tracker:
                 self._who = _by_place(self._who, frame)
         if atoms != self._atoms:
             message = f"{atoms} atoms, {self._atoms} in the frames before"
-            remedy = "Split the trajectory where the number of atoms changes"
-            raise InputError(message, remedy=remedy, where=where)
+            raise InputError(message, remedy="Split the trajectory where the number of atoms changes")
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
             message = f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}"
             remedy = "Stop before this frame (a slice of the file), and find out why the run broke"
-            raise InputError(message, remedy=remedy, where=where)
+            raise InputError(message, remedy=remedy)
         lattice, radius = self._lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
-            raise InputError(
-                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them",
-                remedy="Check the unit, and that the file's coordinates are not broken",
-                where=where,
+            message = (
+                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them"
             )
+            raise InputError(message, remedy="Check the unit, and that the file's coordinates are not broken")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _lattice_of(self, box: Box) -> ReducedLattice:
-        last = self._box
-        same = (
-            last is not None and np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
-        )
-        if not same:
-            # a copy: readers reuse their arrays
-            self._box = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
-            self._lattice = lattice_of(self._box)
+        # copies: readers reuse their arrays
+        copied = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
+        if (known := copied.matrix.tobytes() + copied.pbc.tobytes()) != self._box:
+            self._box, self._lattice = known, lattice_of(copied)
         return self._lattice
 
     def _decided(self, now: Moment) -> Moment:
