@@ -31,20 +31,15 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """The pairs inside at one frame, sorted by (i, j, rank), each once.
+    """The pairs inside at one frame, sorted by (i, j, rank), each once."""
 
-    Attributes:
-        i: first atom, an index into the file's atoms. Where a rule is symmetric, i <= j.
-        j: second atom; i == j for an atom and an image of itself.
-        rank: 0 for the nearest image of j, 1 for the next, and so on. A name for images that wrapping an
-            atom back into its box does not change.
-        distance: length.
-    """
-
-    i: Int[np.ndarray, "pairs"]
-    j: Int[np.ndarray, "pairs"]
+    i: Int[
+        np.ndarray, "pairs"
+    ]  # first atom, an index into the file's atoms; i <= j where a rule is symmetric
+    j: Int[np.ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
+    # 0 for the nearest image of j, 1 for the next, and so on, which wrapping an atom does not change
     rank: Int[np.ndarray, "pairs"]
-    distance: Float[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]  # length
 
     @classmethod
     def none(cls) -> Members:

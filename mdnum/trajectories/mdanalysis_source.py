@@ -383,16 +383,15 @@ class NetcdfFile(netcdf_file):
         return int(vars(self)["_recsize"])
 
     @property
-    def records(self) -> int | None:
-        """How many there should be; None where the writer did not get to say."""
-        count = int(vars(self)["_recs"])
-        return None if count < 0 else count
+    def told(self) -> int:
+        """How many its head tells of; -1 where the writer did not get to say."""
+        return int(vars(self)["_recs"])
 
     @property
     def whole(self) -> int:
         """How many there are from beginning to end."""
         room = max(self._behind, 0) // self.record
-        return room if self.records is None else min(room, self.records)
+        return room if self.told < 0 else min(room, self.told)
 
     # what scipy reads
     _recs = whole
@@ -405,11 +404,6 @@ class NetcdfFile(netcdf_file):
     @property
     def _behind(self) -> int:
         return Path(self.filename).stat().st_size - self._begin
-
-    @property
-    def cut(self) -> bool:
-        """Whether the file ends before its head says."""
-        return self.records is not None and self.whole < self.records
 
 
 def netcdf_of(path: str | Path) -> NetcdfFile | None:
@@ -456,7 +450,7 @@ class NetcdfTrajectory(Trajectory):
 
     @property
     def _ends(self) -> str:
-        return f"the file ends in it, and its head tells of {self._file.records or 0:,} frames"
+        return f"the file ends in it, and its head tells of {max(self._file.told, 0):,} frames"
 
     def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
         box, velocities = Box(), raw.get("velocities")

@@ -276,7 +276,7 @@ def grid_effect(
         draws: pairs drawn, or triples.
 
     Returns:
-        None where the frames cannot tell: fewer than two, nothing moves, or every coordinate is 0.
+        None where the frames cannot tell: fewer than two, nothing moves, every coordinate is 0, or no radius.
 
     Error: the atoms of a pair are taken to move independently and straight on, and pairs to be spread
         evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
@@ -284,7 +284,7 @@ def grid_effect(
         the 4 nearest to 0.02 and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Atoms bonded
         to one another move together, and less against each other than this takes them to.
     """
-    if len(sample) < 2 or not len(sample[0].positions):
+    if len(sample) < 2 or not len(sample[0].positions) or not radius > 0:
         return None
     steps = _steps(resolution, sample[0])
     size = float(np.abs(steps).max())

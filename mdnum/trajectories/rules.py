@@ -42,7 +42,12 @@ class _Membership:
     directed = False
     needs_species = False
     name: str  # in words
-    reach: float  # distance beyond which nothing is a neighbor, length
+    radius: float
+
+    @property
+    def reach(self) -> float:
+        """Distance beyond which nothing is a neighbor, length."""
+        return self.radius
 
     @property
     def shortest(self) -> float:
@@ -72,10 +77,6 @@ class CutoffRule(_Membership):
     @property
     def name(self) -> str:
         return f"r < {self.radius:g}"
-
-    @property
-    def reach(self) -> float:
-        return self.radius
 
 
 @dataclass(frozen=True)
@@ -183,10 +184,6 @@ class Capped(_Membership):
     @property
     def name(self) -> str:
         return f"r < {self.radius:g}, at most {self.most} neighbors"
-
-    @property
-    def reach(self) -> float:
-        return self.radius
 
 
 Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped

@@ -98,7 +98,8 @@ class Tiles:
             return False
         change = now.lattice.vectors - before.lattice.vectors
         most, second, _ = self._follow(before, now, change)
-        drift = _drift(now.lattice.vectors - self.vectors)
+        # a component of a sum of lattice vectors, each at most once, can have come so far
+        drift = float(np.abs(now.lattice.vectors - self.vectors).sum(axis=0).max())
         return (
             clear + 2.0 * self.doubt(now, radius) <= self.clear
             and _one_image(before, now, radius, most + second + float(np.abs(change).sum()))
@@ -177,11 +178,6 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
     )
 
 
-def _drift(change: Float[np.ndarray, "3 3"]) -> float:
-    """How far a component of a sum of lattice vectors, each at most once, can have come, length."""
-    return float(np.abs(change).sum(axis=0).max())
-
-
 def tiles_of(
     before: Placed, now: Placed, who: Participants, clear: float, pairs: int, spare: Tiles | None = None
 ) -> Tiles | None:
@@ -213,7 +209,7 @@ def tiles_of(
     made.boxes = boxes[1]
     change = now.lattice.vectors - lattice.vectors
     most, second, typical = made._follow(before, now, change)
-    drift = _drift(change)
+    drift = float(np.abs(change).sum(axis=0).max())
     free = now.lattice.narrowest - radius - clear - 2.0 * (most + drift)
     one_image = _one_image(before, now, radius, most + second + float(np.abs(change).sum()))
     if typical > FURTHEST * radius or not one_image or free < 0:

@@ -328,7 +328,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     known: set[str] = set(MDAnalysis._READERS)
     if format is not None and word in own:
         return own[word]
-    if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) is not None and head.cut:
+    if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) and head.whole < head.told:
         return mdanalysis_source.NetcdfTrajectory
     if format is not None and word.upper() in known:
         return library

@@ -92,7 +92,7 @@ def flips(
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.lost import FrameMotion
-    from mdnum.trajectories.resolution import infer
+    from mdnum.trajectories.resolution import grid_effect, infer
     from mdnum.trajectories.trajectory import open_trajectory
 
     if window < 1:
@@ -125,7 +125,7 @@ def flips(
         motion = FrameMotion.of(sample, resolution, *groups, timed=timed)
         told = [
             _rule_told(folder, number, one, found, frames, steps, opened, groups, window, motion, log)
-            | {"grid": _grid(sample, resolution, one, groups)}
+            | {"grid": grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)}
             for number, one in enumerate(found.rules)
         ]
         leaps = found.leaps
@@ -365,10 +365,8 @@ def _rule_told(
     append("neighbors", {"neighbors": seen, "counted": one.neighbors.seen[seen]})
     append("lifetimes", total.curves(rows["pairs"], steps["interval"]))
     busiest = vars(total.busiest)
-    words = {
-        name: _atom_words(trajectory.table, busiest[of]) for name, of in (("first", "i"), ("second", "j"))
-    }
-    append("busiest", {**busiest, **words})
+    first, second = (_atom_words(trajectory.table, busiest[of]) for of in "ij")
+    append("busiest", {**busiest, "first": first, "second": second})
     if total.residues is not None and labels.residues is not None:
         between, within = total.residues.between, total.residues.within
         busy = np.flatnonzero(between + within)
@@ -443,13 +441,6 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
     if (a in first and b in second) or not (b in first and a in second):
         return row
     return row | {"first": b, "second": a}
-
-
-def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups) -> Any:
-    """What writing positions with so few digits did to the flips, estimated; None where it cannot be."""
-    from mdnum.trajectories.resolution import grid_effect
-
-    return grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked) if one.reach > 0 else None
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
