@@ -38,25 +38,15 @@ from mdnum.trajectories.trajectory import SAMPLE
 
 @dataclass(frozen=True)
 class RuleResult:
-    """What one membership rule gave.
-
-    Attributes:
-        rule: the rule.
-        flips: a row per decision that differs from the frame before.
-        pairs: pairs inside, per frame.
-        near: pairs whose margin is within the bound, per frame: the file cannot tell them.
-        min_margin: smallest |margin|, per frame, length.
-        initial: the pairs inside at the first frame.
-        last: and at the last.
-    """
+    """What one membership rule gave."""
 
     rule: Rule
-    flips: FlipTable
-    pairs: Int[np.ndarray, "frames"]
-    near: Int[np.ndarray, "frames"]
-    min_margin: Float[np.ndarray, "frames"]
-    initial: Members
-    last: Members
+    flips: FlipTable  # a row per decision that differs from the frame before
+    pairs: Int[np.ndarray, "frames"]  # inside, per frame
+    near: Int[np.ndarray, "frames"]  # pairs whose margin is within the bound: the file cannot tell them
+    min_margin: Float[np.ndarray, "frames"]  # smallest |margin|, per frame, length
+    initial: Members  # the pairs inside at the first frame
+    last: Members  # and at the last
 
     @property
     def ambiguous(self) -> float:

@@ -152,8 +152,8 @@ class Pass:
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
     flights: list[FreeFlight] = field(default_factory=list)  # from one to the next of the first frames
-    # (number of the frame, atom, how far) of what no atom does between two frames
-    leaps: list[tuple[int, int, float]] = field(default_factory=list)
+    # number of the frame, atom and distance of what no atom does between two frames
+    leaps: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def odd(self) -> dict[str, Any] | None:
@@ -196,7 +196,7 @@ def follow(
             ):
                 found.flights.append(flight)
             if (far := leap(last, frame, atoms)) is not None:
-                found.leaps.append((frame.index, *far))
+                found.leaps.append({"frame": frame.index, "atom": far[0], "distance": far[1]})
         last = frame
         for number, (one, new) in enumerate(zip(found.rules, stepped, strict=True)):
             _hand_on(sink, number, one, new, frame, found.frames, (trajectory.atoms, groups))

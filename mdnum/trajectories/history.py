@@ -77,10 +77,8 @@ class History:
         rows[1:] = np.cumsum(np.bincount(pairs[flip], minlength=len(heads))) if count else 0
         source = order[flip] - starts
         i, j, rank = (column[heads] for column in columns)
-        frame, entered, ambiguous = (
-            np.asarray(flips[name])[source] for name in ("frame", "entered", "ambiguous")
-        )
-        return cls(i, j, rank, inside, rows, frame, entered, ambiguous, frames)
+        told = {name: np.asarray(flips[name])[source] for name in ("frame", "entered", "ambiguous")}
+        return cls(i, j, rank, inside, rows, frames=frames, **told)
 
     def __len__(self) -> int:
         return len(self.i)

@@ -77,13 +77,10 @@ def lattice_of(box: Box) -> ReducedLattice:
 
     pbc = np.asarray(box.pbc, bool)
     matrix = np.where(pbc[:, None], np.asarray(box.matrix, np.float64), 0.0)
-    for axis in np.flatnonzero(pbc):
-        if not np.isfinite(matrix[axis]).all() or not matrix[axis].any():
-            raise InputError(
-                f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}",
-                remedy="Give the frame a box, or say that this direction does not repeat",
-                where="box",
-            )
+    for axis in box.broken:
+        message = f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}"
+        remedy = "Give the frame a box, or say that this direction does not repeat"
+        raise InputError(message, remedy=remedy, where="box")
     combination, vectors = np.eye(3, dtype=np.int64), matrix
     if pbc.any():
         scaled = matrix[pbc] / np.linalg.norm(matrix[pbc], axis=1)[:, None]

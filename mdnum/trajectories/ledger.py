@@ -50,33 +50,21 @@ class Members(Columns):
 
 @dataclass(frozen=True)
 class FlipTable(Columns):
-    """A row per decision that differs from the frame before, sorted by (frame, i, j, rank).
+    """A row per decision that differs from the frame before, sorted by (frame, i, j, rank)."""
 
-    Attributes:
-        frame: position among the frames looked at (not the number in the file); never 0.
-        i: first atom, as in `Members`.
-        j: second atom.
-        rank: image, as in `Members`.
-        entered: whether the pair is inside at `frame`.
-        distance: at `frame`, length.
-        before: distance at the frame before, length; nan where it is not known.
-        margin: signed distance to the threshold at `frame`, positive inside, length.
-        margin_before: the same at the frame before; nan where it is not known.
-        bound: how far a margin can be off through the file's resolution and rounding, length.
-        ambiguous: one of the two margins is within the bound: the file cannot tell that the flip happened.
-    """
-
-    frame: Int[np.ndarray, "flips"]
-    i: Int[np.ndarray, "flips"]
+    frame: Int[
+        np.ndarray, "flips"
+    ]  # position among the frames looked at, not the number in the file; never 0
+    i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
     j: Int[np.ndarray, "flips"]
     rank: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    distance: Float[np.ndarray, "flips"]
-    before: Float[np.ndarray, "flips"]
-    margin: Float[np.ndarray, "flips"]
-    margin_before: Float[np.ndarray, "flips"]
-    bound: Float[np.ndarray, "flips"]
-    ambiguous: Bool[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]  # whether the pair is inside at `frame`
+    distance: Float[np.ndarray, "flips"]  # at `frame`, length
+    before: Float[np.ndarray, "flips"]  # distance at the frame before, length; nan where it is not known
+    margin: Float[np.ndarray, "flips"]  # signed distance to the threshold at `frame`, positive inside, length
+    margin_before: Float[np.ndarray, "flips"]  # at the frame before; nan where it is not known
+    bound: Float[np.ndarray, "flips"]  # how far a margin can be off by resolution and rounding, length
+    ambiguous: Bool[np.ndarray, "flips"]  # one of the margins is within the bound: the file does not tell
 
     @classmethod
     def none(cls) -> FlipTable:

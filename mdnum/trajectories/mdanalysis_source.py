@@ -149,7 +149,9 @@ class MDAnalysisTrajectory(Trajectory):
             trajectory = self.universe.trajectory
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
-            self.time = "frame" if _has_no_times(trajectory, said) else "ps"
+            # a frame may have its time without a step between frames
+            untimed = "time" not in trajectory.ts.data and any("no dt information" in one for one in said)
+            self.time = "frame" if untimed else "ps"
             self._time_factor, self.swapped = _time_factors(trajectory)
             self._boxes = Boxes(trajectory)
             self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
@@ -159,7 +161,7 @@ class MDAnalysisTrajectory(Trajectory):
             return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
-        """A Universe of the trajectory, and the warnings that opening it gave."""
+        """A Universe of the trajectory, and the warnings that opening it and its time step gave."""
         import MDAnalysis
 
         path = self.path
@@ -174,10 +176,17 @@ class MDAnalysisTrajectory(Trajectory):
                 other = atoms_in(path, atoms, format)
                 check_claim(path, other or 0)
                 self._belongs(atoms, atoms if other is None else other)
-                _loaded(universe, path, format)
+                try:
+                    universe.load_new(str(path), format=format)
+                except ValueError as error:
+                    # an H5MD file may say nothing of its units
+                    if "convert_units" not in str(error):
+                        raise
+                    universe.load_new(str(path), format=format, convert_units=False)
             # a topology without coordinates has no trajectory at all
             if not len(getattr(universe, "trajectory", ())):
                 raise self._empty()
+            _ = universe.trajectory.dt
         return universe, [str(one.message) for one in caught]
 
     @contextmanager
@@ -233,16 +242,6 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
     return of
 
 
-def _loaded(universe: Any, path: Path, format: str | None) -> None:
-    try:
-        universe.load_new(str(path), format=format)
-    except ValueError as error:
-        # an H5MD file may say nothing of its units
-        if "convert_units" not in str(error):
-            raise
-        universe.load_new(str(path), format=format, convert_units=False)
-
-
 def _length_of(trajectory: Any) -> str:
     """Unit of length in words; "" where the file has one of its own (GSD)."""
     unit = trajectory.units.get("length")
@@ -263,16 +262,6 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
     kind, orders = "f" if any(head[84:]) else "d", "<>" if head[:1] == b"T" else "><"
     step, other = (struct.unpack_from(order + kind, head, 44)[0] for order in orders)
     return (step / read, other / step) if step else (1.0, math.nan)
-
-
-def _has_no_times(trajectory: Any, said: list[str]) -> bool:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        _ = trajectory.dt
-    # a frame may have its time without a step between frames
-    return "time" not in trajectory.ts.data and any(
-        "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
-    )
 
 
 # ---- behind the last frame
@@ -349,7 +338,8 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 
     packed = path.suffix in (".gz", ".bz2")
     last, size = b"", 0 if packed else max(path.stat().st_size - _LAST_BYTES, 0)
-    with anyopen(str(path), "rb") as file:
+    opened_file: Any = anyopen(str(path), "rb")
+    with opened_file as file:
         file.seek(size)
         while part := file.read(_PART):
             last, size = (last + part)[-_LAST_BYTES:], size + len(part)

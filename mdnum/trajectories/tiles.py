@@ -48,13 +48,6 @@ class Tiled(NamedTuple):
     rows: UInt16[np.ndarray, "tiles"]  # bits of the rows that hold a pair inside
     inside: UInt16[np.ndarray, "tiles 16"]  # bits of the pairs inside, by row
 
-    @classmethod
-    def room(cls, tiles: int) -> Tiled:
-        """Room for so many, nothing inside."""
-        first, second = np.empty((2, tiles), np.int32)
-        rows, inside = np.zeros(tiles, np.uint16), np.zeros((tiles, CLUSTER), np.uint16)
-        return cls(first, second, np.empty(tiles, np.uint8), rows, inside)
-
 
 class _Numbers(NamedTuple):
     """What a frame's exact numbers are computed from."""
@@ -268,9 +261,9 @@ def _tiled(
         if count <= room:
             break
         room = count
-    tiled = Tiled.room(count)
-    tiled.first[:], tiled.second[:], tiled.vector[:] = made[:, :count]
-    return tiled
+    first, second, vector = made[:, :count]
+    rows, inside = np.zeros(count, np.uint16), np.zeros((count, CLUSTER), np.uint16)
+    return Tiled(first.copy(), second.copy(), vector.astype(np.uint8), rows, inside)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -128,7 +128,6 @@ def flips(
             | {"grid": grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)}
             for number, one in enumerate(found.rules)
         ]
-        leaps = found.leaps
         answer.result, answer.summary = found, {
             **about(opened, "flips", between),
             "box": sample[0].box.plain(),
@@ -138,9 +137,7 @@ def flips(
             "resolution": resolution,
             "rules": told,
             "flight": found.odd,
-            "leaps": None if not leaps else {
-                "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
-            },
+            "leaps": {"frames": len(found.leaps), **found.leaps[0]} if found.leaps else None,
             "alternative_box": _with_other_box(opened, sample[0], found, groups),
             "repeats": opened.repeats.plain(),
             "retyped": opened.check.retyped,

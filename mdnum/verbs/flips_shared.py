@@ -31,9 +31,8 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     """Indices of the atoms on either side."""
     from mdnum.trajectories.trajectory import select
 
-    return (
-        (None, None) if between is None else (select(trajectory, between[0]), select(trajectory, between[1]))
-    )
+    first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
+    return first, second
 
 
 def stem(trajectory: Trajectory) -> str:
