@@ -412,15 +412,15 @@ def _plot(
     view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
 ) -> Plot:
     """A figure along the frames, of values with a role; those that others are compared with are dashed."""
-    table, summary, text = view.table("apart"), view.summary, TEXTS.entries[f"plot_{name}"]
+    table, summary = view.table("apart"), view.summary
     timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]
     beyond, first = summary["beyond"], summary["rules"][0]["first"]
     marks = [(float(x[beyond]), "positions differ")] if beyond else []
     marks += [(float(x[first["frame"]]), "sets differ")] if first is not None else []
     series = [Series(label, x, y, role=role, dashed=role == "muted") for label, (y, role) in lines.items()]
-    labels = text["title"], f"time ({summary['time']})" if timed else "frame", text["y"] + unit
-    return Plot(name, *labels, tuple(series), y_scale="log", verticals=tuple(marks), caption=text["caption"])
+    along = f"time ({summary['time']})" if timed else "frame"
+    return TEXTS.plot(name, series, marks, along=along, unit=unit)
 
 
 def _separation(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterator[Plot]:

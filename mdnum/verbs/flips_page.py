@@ -383,15 +383,18 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         whole = view.table(table)
         return {name: values[whole["rule"] == place] for name, values in whole.items()}
 
-    def plot(name: str, x: str, series: Iterable[Series], y: str = "", **more: Any) -> tuple[str, Plot]:
-        text = TEXTS.entries[f"plot_{name}"]
-        labels, name = (text["title"], x, text["y"] + y), f"rule{place}-{name}"
-        return text["section"], Plot(name, *labels, tuple(series), caption=text["caption"], **more)
+    def plot(section: str, name: str, series: Iterable[Series], **values: Any) -> tuple[str, Plot]:
+        return section, replace(TEXTS.plot(name, series, **values), name=f"rule{place}-{name}")
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
     label, x = view.axis(frames)
     if moving:
-        yield plot("pairs", label, [Series("pairs inside", x, frames["pairs"].astype(float))])
+        yield plot(
+            "Pairs and flips",
+            "pairs",
+            [Series("pairs inside", x, frames["pairs"].astype(float))],
+            along=label,
+        )
     if one["flips"]:
         columns = [x[1:], *(frames[name][1:].astype(float) for name in ("entered", "left", "ambiguous"))]
         width = -(-len(columns[0]) // _DENSE)
@@ -399,7 +402,8 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         at, entered, left, unsure = (values[:whole].reshape(-1, width).mean(1) for values in columns)
         series = [Series("entered", at, entered), Series("left", at, left, role="second")]
         series += [Series("undecidable", at, unsure, role="bad")] * bool(unsure.any())
-        yield plot("flips", label, series, f", mean over {width}" if width > 1 else "")
+        mean = f", mean over {width}" if width > 1 else ""
+        yield plot("Pairs and flips", "flips", series, along=label, mean=mean)
     if view.summary["frames"] > 2:
         table = rows("lifetimes")
         lags = table["frames"] * (view.summary["interval"] if view.timed else 1.0)
@@ -416,24 +420,24 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         ]
         if series:
             x_label = f"time ({view.summary['time']})" if view.timed else "frames"
-            yield plot("lifetimes", x_label, series, x_scale="log")
+            yield plot("How long contacts last", "lifetimes", series, along=x_label)
     stride = one["stride"]
     of = np.array(stride["of"], float)
     if len(of) > 2 and of.all():
         left = [Series("", np.array(stride["stride"]), np.array(stride["flips"]) / of, mark="line+points")]
-        yield plot("stride", "every nth frame", left, x_scale="log")
+        yield plot("Between the frames", "stride", left)
     if one["chatter"]["undone"]:
         after, counts = np.arange(1, one["chatter"]["window"] + 1), one["chatter"]
         back = {"left again": counts["inside"], "entered again": counts["outside"]}
         lines = {label: np.array(values[1:], float) for label, values in back.items()}
-        yield plot("chatter", "after so many frames", curves(after, lines, "line+points", log=False))
+        yield plot("Between the frames", "chatter", curves(after, lines, "line+points", log=False))
     if moving and np.any(frames["fewest"] != frames["most"]):
         around = {"mean": "neighbors", "most": "most", "fewest": "fewest"}
         lines = {label: frames[name].astype(float) for label, name in around.items()}
-        yield plot("neighbors", label, curves(x, lines, log=False))
+        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label)
     table = rows("neighbors")
     if len(table["neighbors"]) > 1:
         numbers = np.arange(table["neighbors"].min(), table["neighbors"].max() + 1)
         share = np.zeros(len(numbers))
         share[table["neighbors"] - numbers[0]] = table["counted"] / table["counted"].sum()
-        yield plot("distribution", "neighbors", [Series("", numbers, share, mark="line+points")])
+        yield plot("Neighbors", "distribution", [Series("", numbers, share, mark="line+points")])
