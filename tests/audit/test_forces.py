@@ -101,6 +101,22 @@ def test_a_wrong_force_is_found_under_rounding(places: int, brief: bool):
     assert found["FORCES_NOT_GRADIENT"] == "error"
 
 
+def test_directions_in_which_a_wrong_force_shows_are_counted_and_the_largest_error_is_named():
+    """A force on one atom that is wrong by 0.1 and 0.02 eV/Å along two axes shows where that atom moves there."""
+    off = np.array([0.1, 0.0, -0.02])
+    result = asked("forces", through(forces=lambda f: f + np.outer(np.arange(len(f)) == 1, off)), chain())
+    rows = result.tables["Derivative of the energy along a direction"]
+    wrong = [row for row in rows if not row["agree"]]
+    # three ways of all atoms, and what moves atom 1 along x and z, of four atoms along three axes
+    assert [row["moved"].split(" (")[0] for row in wrong if row["moved"].startswith("atom")] == ["atom 1"] * 2
+    assert (len(rows), len(wrong)) == (15, 5)
+    (found, values) = result.numbers, result.says[1]
+    assert (found["directions"], found["disagree"], values["wrong"], values["clear"]) == (15, 5, 5, 15)
+    assert found["largest_difference"] == values["gap"] == values["clear_gap"] == pytest.approx(0.1, rel=1e-6)
+    assert found["largest_error"] == values["error"] == max(row["error"] for row in rows)
+    assert result.says[0] == ["forces_wrong"] and found["could_not_tell"] == values["unclear"] == 0
+
+
 def test_a_step_at_the_structure_is_told_from_a_wrong_force():
     pair = {r: Atoms("Ar2", positions=[[0, 0, 0], [r, 0, 0]]) for r in (planted.R_CUT, 3.0)}
     found, line = subject(planted.HardEdge), np.array([[0.0, 0, 0], [1.0, 0, 0]])

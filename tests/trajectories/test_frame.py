@@ -121,7 +121,9 @@ def test_floats_that_tell_no_distance_there_are_said_to():
     assert far_out(drifted, radius=2.5, bits=64) is None
     found = far_out(drifted, radius=2.5, bits=32)
     assert found is not None and "float32 tells distances no better than to" in found[2] and found[1] == 60
-    assert smallest_radius([Nearest(3), CutoffRule(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
+    # the shortest of every rule's own radii, wherever it is written
+    for radii in ({("A", "B"): 2.0, ("A", "A"): 6.0}, {("A", "A"): 6.0, ("A", "B"): 2.0}):
+        assert smallest_radius([Nearest(3), CutoffRule(4.0), SpeciesCutoffs(radii)]) == 2.0
     assert smallest_radius([Nearest(3)]) == np.inf
 
 
