@@ -135,7 +135,9 @@ def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept, finished):
 
 
 @pytest.mark.parametrize("when", ["before it is written", "before it is renamed", "after it is renamed"])
-def test_a_run_killed_at_any_write_of_a_checkpoint_resumes_from_the_old_or_the_new_one(tmp_path, monkeypatch, when):
+def test_a_run_killed_at_any_write_of_a_checkpoint_resumes_from_the_old_or_the_new_one(
+    tmp_path, monkeypatch, when
+):
     folder = RunFolder.create(tmp_path / "killed")
     write_run(folder, 0, 20)
     folder.append("series", series_rows(20, 30))

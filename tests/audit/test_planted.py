@@ -345,7 +345,8 @@ def test_an_energy_that_alone_is_cut_is_seen_where_thresholds_are_known(make, ex
     assert codes(result) == expected
     if expected:
         told = values(result, "TWO_ENERGIES")
-        assert told["places"] == "between Ar-Ar at 3.4 Å, by 0.01 eV" and told["variants"] == ["wrong"]
+        assert told["variants"] == ["wrong"]
+        assert all(part in told["places"] for part in ("Ar-Ar", "3.4 Å", "0.01 eV"))
 
 
 @pytest.mark.parametrize(("name", "what"), [("invariance", "lattice"), ("state", "sheared")])

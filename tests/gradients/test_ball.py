@@ -64,10 +64,10 @@ def test_a_gain_that_no_iteration_used_is_said_not_to_matter():
         found = gradient("unrolled", relaxation(1.0, (0.25,), rule), "k", "y0")
         assert found.gradient["k"] == 0.0
         assert found.depends == {"k": False, "y0": True}
-        assert found.notes["k"] == "the loop ended before k was used: the loss does not depend on k"
+        assert found.notes.keys() == {"k"}
     flying = gradient("unrolled", bouncing(y0=100.0), "restitution")
     assert not flying.depends["restitution"]
-    assert flying.notes["restitution"].startswith("no ball touched the floor")
+    assert "restitution" in flying.notes
 
 
 @pytest.mark.slow

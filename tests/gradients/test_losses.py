@@ -52,7 +52,9 @@ def run(smooth):
 def test_a_frame_is_shared_by_the_steps_since_the_frame_before(first, every, steps):
     """And the first one by the same number of steps before it, so that shares add up to the frames."""
     pace = pace_of(EinsteinDiffusion(every=every, first=first), steps)
-    found = np.array([0.004 * pace.share(jnp.int64(step), jnp.float64(0.004)) for step in range(-9, steps + 1)])
+    found = np.array(
+        [0.004 * pace.share(jnp.int64(step), jnp.float64(0.004)) for step in range(-9, steps + 1)]
+    )
     frames = range(first, steps + 1, every)
     expected = [any(0 <= frame - step < every for frame in frames) / every for step in range(-9, steps + 1)]
     np.testing.assert_allclose(found, expected, rtol=1e-14)

@@ -16,7 +16,7 @@ TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
 
 
 def sentences(path: Path) -> list[str]:
-    """Those of a text file: they stand in tables, and what stands by itself is none, such as lines of a script."""
+    """Those of a text file: they are in tables; what is outside of these, such as a script, is none."""
     tables = [each for each in tomllib.loads(path.read_text()).values() if isinstance(each, dict)]
     return [text for table in tables for text in table.values() if isinstance(text, str)]
 

@@ -135,7 +135,7 @@ def test_a_budget_notices_a_flip_that_was_not_told(fluid, tmp_path):
 
 
 def test_a_budget_notices_the_smallest_jump_of_a_mixture():
-    """Jumps of pairs that differ ten times: a budget that may be off by a tenth of the largest hides others."""
+    """Jumps ten times apart: a budget with an allowed error of a tenth of the largest hides all others."""
     depths = {"Ni-Ni": 1.0, "Ni-P": 0.1, "P-P": 0.01}
     pairs = {pair: {"sigma": 1.0, "epsilon": depth} for pair, depth in depths.items()}
     potential = {"kind": "lennard-jones", "pairs": pairs}

@@ -12,11 +12,11 @@ from small_systems import KOB_ANDERSEN, make, mixture
 
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.neighbors import PairTable, RebuildRule
+from mdnum.rollout import lockstep as lockstep_module
 from mdnum.rollout.compared import Apart, ReferenceFrame, differ, in_user_order
 from mdnum.rollout.engine import Engine, Segment
 from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import true_pairs
-from mdnum.rollout import lockstep as lockstep_module
 from mdnum.rollout.lockstep import Counterfactual, lockstep
 from mdnum.rollout.program import pair_margin
 from mdnum.rollout.tracks import Handed, Overridden, Rows
@@ -154,7 +154,7 @@ def test_a_counterfactual_ends_before_the_first_decision_beyond_its_guard(crysta
 
 @pytest.mark.parametrize("compare", ["r2 <", "r <"])
 def test_the_nearest_decision_of_a_mixture_is_no_further_than_any_pair_from_its_cutoff(compare):
-    """As a length, from a margin alone, which does not say whose cutoff it was: the longest is the safe one."""
+    """As a length, from a margin that does not say whose cutoff it was: the longest is the safe one."""
     cutoff = {"kind": "hard", "radius": 2.5, "pairs": {"Ni-P": 1.4, "P-P": 0.8}, "compare": compare}
     simulation = build(make(mixture(), KOB_ANDERSEN, cutoff))
     radii, away = np.array(simulation.decider.r_cut), np.array([-0.3, -1e-3, 1e-9, 0.02, 0.4])

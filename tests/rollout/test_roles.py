@@ -90,7 +90,7 @@ def test_one_narrow_role_at_a_time(path, tmp_path, role):
 
 
 def test_ambiguous_pairs_are_counted_where_a_shell_sits_at_the_cutoff(tmp_path):
-    """A perfect crystal with a second shell just inside the cutoff of its large atoms, closer than their bound;
+    """A perfect crystal whose second shell is inside the cutoff of its large atoms by less than their bound;
     the first shell of its small ones is outside theirs by more than their bound, which is a smaller one."""
     # 1.7 has rounding in every coordinate
     atoms = bulk("Ar", "fcc", a=1.7, cubic=True) * (3, 3, 3)
@@ -105,7 +105,7 @@ def test_ambiguous_pairs_are_counted_where_a_shell_sits_at_the_cutoff(tmp_path):
         return write_system(
             tmp_path, atoms, cutoff={"radius": 1.5, "pairs": radii}, neighbors={"skin": 0.4},
             dynamics={"temperature": 0.0}, precision={"decision": "float32"},
-            potential={"kind": "lennard-jones", "pairs": {kind: ARGON for kind in (*shells, "Ar-Ne")}},
+            potential={"kind": "lennard-jones", "pairs": dict.fromkeys((*shells, "Ar-Ne"), ARGON)},
         )  # fmt: skip
 
     first = build(load(written(dict.fromkeys(shells, 0.0))))

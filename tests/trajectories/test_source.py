@@ -143,9 +143,7 @@ def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path
     text = ""
     for step, order in ((0, (0, 1, 2)), (5, (2, 0, 1))):
         rows = "\n".join(f"{k + 1} {'OHH'[k]} {' '.join(map(repr, scaled[k].tolist()))} 1 2 3" for k in order)
-        text += DUMP.format(
-            time=0.5 * step, step=step, bounds=bounds, columns="xs ys zs vx vy vz", rows=rows
-        )
+        text += DUMP.format(time=0.5 * step, step=step, bounds=bounds, columns="xs ys zs vx vy vz", rows=rows)
     (tmp_path / "run.lammpstrj").write_text(text)
     trajectory = open_trajectory(tmp_path / "run.lammpstrj")
     frames = list(trajectory.frames())
@@ -170,7 +168,9 @@ def test_a_lammps_dump_agrees_with_ase():
 
 
 def test_lammps_atoms_without_ids_are_refused(tmp_path):
-    text = DUMP.format(time=0, step=0, bounds="0 9 0\n0 9 0\n0 9 0", columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2").replace("id ", "")
+    text = DUMP.format(
+        time=0, step=0, bounds="0 9 0\n0 9 0\n0 9 0", columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2"
+    ).replace("id ", "")
     (tmp_path / "run.dump").write_text(text)
     with pytest.raises(InputError, match="no ids"):
         open_trajectory(tmp_path / "run.dump")
