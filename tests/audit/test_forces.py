@@ -140,6 +140,32 @@ def test_the_error_of_a_difference_covers_its_error(make):
     assert max(one.error for one in found) < (1e-4 if make is planted.Single else 1e-9)
 
 
+class Quintic(CalculatorSubject):
+    """One atom whose energy is 2 x + b x³ + c x⁵ along x."""
+
+    def __init__(self, b: float, c: float):
+        super().__init__("quintic", Good, Atoms("Ar"))
+        self.b, self.c = b, c
+
+    def energy(self, atoms: Atoms) -> float:
+        x = float(atoms.positions[0, 0])
+        return 2 * x + self.b * x**3 + self.c * x**5
+
+
+@pytest.mark.parametrize(("b", "c"), [(50.0, 0.0), (0.0, 900.0), (-30.0, 400.0)])
+def test_differences_are_extrapolated_to_the_fourth_order(b: float, c: float):
+    """D(h) = 2 + b h² + c h⁴: of steps h and h/4 the square cancels, and c h⁴ / 16 is left, with a minus."""
+    found, line = Quintic(b, c), np.array([[1.0, 0.0, 0.0]])
+    # so loud that the longest steps are the best
+    told = slope(found, Atoms("Ar"), line, np.array([[-2.0, 0.0, 0.0]]), NoiseFloor(1e-4, 0.0))
+    longest, shortest = 0.064, 0.004
+    assert told.step == pytest.approx(shortest, rel=1e-12) and told.agrees
+    left = [c * step**4 / 16 for step in (longest, longest / 4)]
+    assert told.difference == pytest.approx(2.0 - left[1], abs=1e-11)
+    assert told.error == pytest.approx(abs(left[0] - left[1]) + 2 * 1e-4 / shortest, rel=1e-9)
+    np.testing.assert_allclose(told.gaps[:2], [abs(b * h**2 + c * h**4) for h in (0.064, 0.016)], rtol=1e-8)
+
+
 class Stairs(CalculatorSubject):
     """One atom whose energy is a smooth curve with steps; the force knows nothing of the steps."""
 

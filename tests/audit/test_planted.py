@@ -52,6 +52,15 @@ class Breaks(Good):
         return super().answer(atoms)
 
 
+class Periodic(Good):
+    """Takes no structure without periods, however often it is asked about one, and all others after it."""
+
+    def answer(self, atoms):
+        if not atoms.pbc.any():
+            raise RuntimeError("no periods")
+        return super().answer(atoms)
+
+
 class Once(Good):
     """Has no room for fewer atoms than it has seen."""
 
@@ -261,7 +270,10 @@ def test_what_is_said_and_nothing_else(name: str, make, atoms: Atoms, expected: 
         case("state", Once, STALE_STATE="error"),
         case("state", Breaks, BROKEN_BY_FAILURE="info", STALE_STATE=None),
         # what nobody answers is no memory
-        case("state", planted.OnlyRectangles, STALE_STATE=None),
+        *(
+            case("state", make, STALE_STATE=None, BROKEN_BY_FAILURE=None)
+            for make in (planted.OnlyRectangles, Periodic)
+        ),
         case("alone", planted.MeanNeighbor, LONELY_NOT_FINITE="error"),
         case("alone", planted.EmptyList, LONELY_FAILS="warning"),
         case("alone", planted.Background, LONELY_ENERGY="warning"),

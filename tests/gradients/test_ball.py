@@ -64,7 +64,7 @@ def test_a_gain_that_no_iteration_used_is_said_not_to_matter():
         found = gradient("unrolled", relaxation(1.0, (0.25,), rule), "k", "y0")
         assert found.gradient["k"] == 0.0
         assert found.depends == {"k": False, "y0": True}
-        assert found.notes.keys() == {"k"}
+        assert "k" in found.notes
     flying = gradient("unrolled", bouncing(y0=100.0), "restitution")
     assert not flying.depends["restitution"]
     assert "restitution" in flying.notes

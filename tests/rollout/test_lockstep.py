@@ -161,10 +161,10 @@ def test_the_nearest_decision_of_a_mixture_is_no_further_than_any_pair_from_its_
     r = radii[:, None] + away
     margin = (radii[:, None] ** 2 - r**2 if compare == "r2 <" else radii[:, None] - r).ravel()
     x = np.zeros((margin.size, 3, 1))
-    for sign in (np.abs(margin), np.full(margin.size, np.inf)):
-        rows = Rows(0, x, x, np.zeros(margin.size), nearest=sign)
+    for smallest in (np.abs(margin), np.full(margin.size, np.inf)):
+        rows = Rows(0, x, x, np.zeros(margin.size), nearest=smallest)
         told = lockstep_module._nearest(simulation, rows, rows)
-        true = np.where(np.isinf(sign), np.inf, np.abs(np.tile(away, len(radii))))
+        true = np.where(np.isinf(smallest), np.inf, np.abs(np.tile(away, len(radii))))
         assert (told <= true * (1 + 1e-6)).all() and (told > 0).all()
     # of the longest cutoff it is that distance, of pairs outside
     outside = Rows(0, x[:3], x[:3], np.zeros(3), nearest=np.abs(margin.reshape(3, 5)[np.argmax(radii), 2:]))

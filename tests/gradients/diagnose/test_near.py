@@ -98,7 +98,7 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
 
 
 def test_the_term_of_a_near_miss_is_the_mean_over_the_depths_it_may_have():
-    """Two crossings at a depth d add 2 w / sqrt(2 a d): the mean by quadrature, the value at a known depth."""
+    """Two crossings at a depth d add 2 w / sqrt(2 a d): the mean by quadrature, or that of a known depth."""
     shift, bend, weight = np.array([3e-4, 1e-3, 5e-5, 2e-4]), np.array([4.0, 0.3, 7.0, 2.0]), 0.8
     moved = np.array([[1.0, -0.2], [0.5, 3.0], [-2.0, 0.1], [0.7, 0.0]])
     table = {"step": np.arange(4), "shift": shift, "bend": bend, "weight": np.full(4, weight), "moved": moved}
