@@ -17,7 +17,10 @@ TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
 
 def sentences(path: Path) -> list[str]:
     """Those of a text file: they are in tables; what is outside of these, such as a script, is none."""
-    tables = [each for each in tomllib.loads(path.read_text()).values() if isinstance(each, dict)]
+    entries = tomllib.loads(path.read_text())
+    tables = [
+        each for each in (*entries.values(), *entries.get("plots", {}).values()) if isinstance(each, dict)
+    ]
     return [text for table in tables for text in table.values() if isinstance(text, str)]
 
 
