@@ -14,17 +14,17 @@ from mdnum.audit.base import (
     TIME_UP,
     AuditCheck,
     CalculatorError,
-    CallsUp,
     CheckResult,
     Observed,
     Progress,
     Skipped,
     TimeUp,
+    Ways,
     finding,
 )
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
-from mdnum.audit.structures import pairs
+from mdnum.audit.structures import modified, pairs
 from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
@@ -59,21 +59,19 @@ class StateCheck(AuditCheck):
         # two atoms first, which most calculators answer for quickly
         approached, skipped = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
-        total, done = sum(map(len, sequences.values())), 0
         rows: list[Comparison] = []
-        for name, sequence in sequences.items():
-            left = sum(one.compared for one in sequence)
-            try:
-                with subject.meter.limited():
-                    for reached, row in _through(subject, sequence, noise, name):
-                        rows.append(row)
-                        left -= 1
-                        progress(done + reached, total, {"phase": "state", "unit": "structures"})
-            except TimeUp as up:
-                skipped.append((f"{left} questions of the sequence “{name}”", up.why))
-            done += len(sequence)
+
+        def asked(name: str) -> None:
+            for row in _through(subject, sequences[name], noise, name):
+                rows.append(row)
+
+        def unanswered(name: str) -> str:
+            left = sum(one.compared for one in sequences[name]) - sum(row.sequence == name for row in rows)
+            return f"{left} questions of the sequence “{name}”"
+
+        Ways(skipped).each(subject, [*sequences], unanswered, asked, progress, self.name, unit="sequences")
         if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
-            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
+            raise subject.meter.up or TimeUp
         repeats = _repeated(subject, atoms)
         tolerance = _tolerance(subject, atoms)
         stale = [row for row in rows if row.remembers and not row.broken]
@@ -191,13 +189,13 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
-) -> Iterator[tuple[int, Comparison]]:
+) -> Iterator[Comparison]:
     """One object through a sequence: each answer, compared with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
     size, failed = 0.0, False
-    for place, asked in enumerate(sequence):
+    for asked in sequence:
         old = used.try_both(asked.atoms)
         was_broken, failed = failed, isinstance(old, CalculatorError)
         previous, before = before or asked.atoms, asked.atoms
@@ -223,7 +221,7 @@ def _through(
             row.allowed = noise.allowed.energy * share
             force = share * noise.louder(NoiseFloor(0.0, _EPS * max(1.0, largest(new[1])))).allowed.force
             row.remembers = row.energy > row.allowed or row.force > force
-        yield place + 1, row
+        yield row
 
 
 def _again(
@@ -232,7 +230,7 @@ def _again(
     """Whether another object, on the way on which the worst difference showed, answers as that one did."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
-    ((_, again),) = _through(subject, way, noise, worst.sequence)
+    (again,) = _through(subject, way, noise, worst.sequence)
     if worst.refused or again.refused:
         return isinstance(worst.old, CalculatorError) and isinstance(again.old, CalculatorError)
     # both must come again: what objects in use answer, and what new ones do
@@ -311,12 +309,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     if not atoms.pbc.any():
         return kept
     edge = float(np.max(atoms.cell.lengths()))
-
-    def stretched(place: float) -> Atoms:
-        there = atoms.copy()
-        there.set_cell((1 + place / edge) * atoms.cell.array)
-        return there
-
+    stretched = lambda place: modified(atoms, cell=(1 + place / edge) * atoms.cell.array)  # noqa: E731
     return max(kept, _kept_within(subject, _TINY[::2], stretched))
 
 
