@@ -296,7 +296,7 @@ def settled(
 
     Args:
         at_least: atoms; a smaller cell is repeated, where it repeats.
-        brief: take the first draw, and do not look for steps.
+        brief: take the first draw, and do not look at other orders.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
@@ -323,8 +323,8 @@ def settled(
         with contextlib.suppress(CalculatorError):
             noise = noise.louder(along_a_line(subject, many, rng))
     # what goes in steps may not move at all on so short a line
+    noise = noise.louder(rounding(subject, there))
     if not brief:
-        noise = noise.louder(rounding(subject, there))
         # another order of the same sum is rounded otherwise, which no line shows
         subject.known["order"] = order_change(subject, there, noise, rng)
         noise = noise.louder(subject.known["order"][1])

@@ -32,7 +32,6 @@ from mdnum.audit.noise import (
     displaced,
     order_change,
     precision,
-    rounding,
     settled,
     steps,
 )  # fmt: skip
@@ -132,14 +131,6 @@ class ForcesCheck(AuditCheck):
             lambda way: slope(worker, atoms, way[1], forces, noise, way[0]),
             progress, self.name, spread=True, required=True, most=1 if self.brief else None,
         )  # fmt: skip
-        if self.brief and not (
-            all(one.agrees for one in found.values())
-            and all(row["found"] <= row["rounding explains"] for row in _sums(atoms, forces, noise))
-        ):
-            # before forces are called wrong, how coarsely answers are rounded
-            noise = noise.louder(rounding(worker, atoms))
-            for place in found:
-                found[place] = slope(worker, atoms, wanted[place][1], forces, noise, wanted[place][0])
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = [
             finding(
