@@ -242,6 +242,12 @@ def order_change(
     return energy, NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
 
 
+def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
+    """Noise along a line, and what other orders of the atoms add to it."""
+    noise = along_a_line(subject, atoms, rng)
+    return noise.louder(order_change(subject, atoms, noise, rng)[1])
+
+
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
@@ -286,7 +292,7 @@ def under_jitter(
 
 
 def settled(
-    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = 1, brief: bool = False
+    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
     """The structure with its atoms moved a little, away from any threshold, and the noise there.
 

@@ -345,7 +345,8 @@ def _summary(state: AuditState) -> dict[str, Any]:
             "safe_to_run": said["run"], "safe_to_differentiate": said["differentiate"],
             "parts": [
                 {
-                    "name": one.name, "title": one.title, "says": _says(one), "tables": one.tables,
+                    "name": one.name, "title": one.title, "tables": one.tables,
+                    "says": " ".join(TEXTS(name, **one.says[1]) for name in one.says[0]),
                     "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
                     "seconds": one.seconds,
                 }
@@ -395,11 +396,6 @@ def _in_units(value: Any, given: units.Units) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{name: _in_units(item, given) for name, item in vars(value).items()})
     return value
-
-
-def _says(result: CheckResult) -> str:
-    names, values = result.says
-    return " ".join(TEXTS(name, **values) for name in names)
 
 
 # -- what it means ---------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
-from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
+from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
 #: Å; the loop with the smaller error counts.
@@ -60,7 +60,7 @@ class CurlCheck(AuditCheck):
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
         with subject.meter.limited():
-            atoms, noise = settled(worker, rng, at_least=FEW, brief=self.brief)
+            atoms, noise = settled(worker, rng, brief=self.brief)
             wanted = list(_planes(worker, atoms, rng))
 
         def asked(plane: tuple[str, Displacement, Displacement]) -> Loop:

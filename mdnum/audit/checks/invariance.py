@@ -12,7 +12,7 @@ from ase import Atoms
 from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
-from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, order_change, settled, under_jitter
+from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, measured, settled, under_jitter
 from mdnum.audit.places import wrong_places
 from mdnum.audit.structures import group, modified, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
@@ -120,18 +120,14 @@ class InvarianceCheck(AuditCheck):
         differences = list(found.values())
         wrong = [one for one in differences if not one.agrees]
         worst = max(wrong or differences, key=lambda one: one.energy, default=None)
-        values = {
-            "ways": len(differences), "wrong": len(wrong), "refused": len(refused),
-            "noise": judge.noise.energy, "energy": worst.energy if worst else 0.0,
-            "worst": worst.same.what if worst else "",
-            "force": max((one.force for one in wrong), default=0.0),
-        }  # fmt: skip
         numbers = {
             "ways": len(differences), "told_apart": len(wrong), "refused": len(refused),
             "noise_energy": judge.noise.energy, "noise_force": judge.noise.force,
             "largest": max((one.energy for one in differences), default=0.0),
             "largest_force": max((one.force for one in differences), default=0.0),
         }  # fmt: skip
+        values = {"energy": worst.energy, "worst": worst.same.what} if worst else {}
+        values |= numbers | {"force": max((one.force for one in wrong), default=0.0)}
         says = "invariance_wrong" if wrong else "invariance_right" if differences else "invariance_none"
         return CheckResult(
             says=([says, "invariance_refused"] if refused else [says], values),
@@ -216,7 +212,7 @@ class _Judge:
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
-        self.atoms, self.noise = settled(self.worker, rng)
+        self.atoms, self.noise = settled(self.worker, rng, at_least=1)
         self.notes: list[Observed] = []
         # by structures, which are kept so that their ids are theirs
         self._known: dict[tuple[int, int], tuple[Atoms, float, Forces, NoiseFloor]] = {}
@@ -236,8 +232,7 @@ class _Judge:
                 noise = found.allowed
                 for there, copies in ((base, 1), (same.atoms, same.copies)):
                     other = self.subject.fresh()
-                    line = along_a_line(other, there, self._rng)
-                    line = line.louder(order_change(other, there, line, self._rng)[1]).allowed
+                    line = measured(other, there, self._rng).allowed
                     noise = noise.louder(replace(line, energy=line.energy / copies))
                 found = replace(found, allowed=noise)
             # who stands alone may have answered so by chance, and is asked again

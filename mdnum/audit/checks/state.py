@@ -9,20 +9,8 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import (
-    CALLS_UP,
-    TIME_UP,
-    AuditCheck,
-    CalculatorError,
-    CheckResult,
-    Observed,
-    Progress,
-    Skipped,
-    TimeUp,
-    Ways,
-    finding,
-)
-from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
+from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
+from mdnum.audit.noise import NoiseFloor, digits, displaced, settled
 from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
 from mdnum.audit.structures import modified, pairs
 from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
@@ -53,11 +41,11 @@ class StateCheck(AuditCheck):
         """One object, asked again and again, beside new ones."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
-            atoms, noise = settled(subject.fresh(), rng, at_least=FEW, brief=self.brief)
+            atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
             if self.brief:
                 return self._brief(subject, atoms, rng)
         # two atoms first, which most calculators answer for quickly
-        approached, skipped = _approached(subject)
+        approached, ways = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
         rows: list[Comparison] = []
 
@@ -69,11 +57,13 @@ class StateCheck(AuditCheck):
             left = sum(one.compared for one in sequences[name]) - sum(row.sequence == name for row in rows)
             return f"{left} questions of the sequence “{name}”"
 
-        Ways(skipped).each(subject, [*sequences], unanswered, asked, progress, self.name, unit="sequences")
-        if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
-            raise subject.meter.up or TimeUp
+        ways.each(subject, [*sequences], unanswered, asked, progress, self.name, unit="sequences")
+        if not rows and (up := subject.meter.up):
+            raise up
         repeats = _repeated(subject, atoms)
-        tolerance = _tolerance(subject, atoms)
+        tolerance, grain = _tolerance(subject, atoms), _grain(atoms)
+        severity = "error" if tolerance > max(_HARMLESS, grain) else "warning"
+        kept = [finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=grain)] if tolerance else []
         stale = [row for row in rows if row.remembers and not row.broken]
         worst = max(stale, key=lambda row: row.energy, default=None)
         chance: dict[str, Any] = {"answers": 0}
@@ -97,7 +87,7 @@ class StateCheck(AuditCheck):
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
                 *self._memory(stale),
-                *_kept(tolerance, atoms),
+                *kept,
                 *self._failures(rows),
             ],
             tables={
@@ -106,7 +96,10 @@ class StateCheck(AuditCheck):
             },
             numbers=numbers,
             limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
-            skipped=[*skipped, *((row.what, row.why) for row in rows if row.refused and not row.remembers)],
+            skipped=[
+                *ways.skipped,
+                *((row.what, row.why) for row in rows if row.refused and not row.remembers),
+            ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
@@ -174,7 +167,7 @@ class Comparison:
         }  # fmt: skip
 
 
-def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], list[Skipped]]:
+def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
     """Sequences of two atoms at the cutoff; what could not be, and why."""
     what = "two atoms at the cutoff"
     try:
@@ -182,9 +175,11 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
         with subject.trying():
             found = pairs(subject)[0]
     except CalculatorError as error:
-        return {}, [(what, error.message)]
+        return {}, Ways([(what, error.message)])
     radii = [one.radius for one in thresholds if found and set(one.species) == set(found[0].species)]
-    return (dict(approaches(found[0], max(radii))), []) if radii else ({}, [(what, "no cutoff was found")])
+    if not radii:
+        return {}, Ways([(what, "no cutoff was found")])
+    return dict(approaches(found[0], max(radii))), Ways()
 
 
 def _through(
@@ -339,9 +334,3 @@ def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[fl
 def _grain(atoms: Atoms) -> float:
     """The last digit of the largest coordinate in single precision, Å."""
     return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
-
-
-def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
-    if tolerance:
-        severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
-        yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))

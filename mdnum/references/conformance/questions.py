@@ -44,11 +44,11 @@ def catalog() -> Iterator[Case]:
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
         for row in _WRITTEN.get(area, ()):
-            drawn = {}
+            given: dict[str, Any] = {word: row[word] for word in row if word != "gas"}
             if "gas" in row:
                 count, *more = row["gas"]
-                drawn = {"positions": gas(count, row["cell"], *more)}
-            yield once(area=area, **{word: row[word] for word in row if word != "gas"}, **drawn)
+                given["positions"] = gas(count, row["cell"], *more)
+            yield once(area=area, **given)
 
 
 def crowds() -> Iterator[Case]:
@@ -146,10 +146,7 @@ def _ties() -> Named:
         r_cut = 2.5 + ulps * float(np.spacing(2.5))
         corner = [[1.0, 1, 1], [3.5, 1, 1], [1, 3.5, 1]]
         yield f"pairs {-ulps:+d} ulp from the cutoff", corner, 8.0, True, r_cut
-    rng = np.random.default_rng(50)
-    direction = rng.normal(size=(30, 3))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    yield "30 atoms on a sphere of the cutoff", np.vstack([np.zeros((1, 3)), direction]) + 4.0, 9.0
+    yield "30 atoms on a sphere of the cutoff", np.vstack([np.zeros((1, 3)), _sphere(30)]) + 4.0, 9.0
 
 
 def _crowds() -> Named:
