@@ -26,6 +26,7 @@ class Program(Protocol):
         steps: that the system's own run makes.
         timestep: in the units of the system's file.
         scale: the length that tolerances are shares of: the longest cutoff, the largest start height.
+        ulp: of the largest coordinate of its start, length: no smaller displacement can be written down.
         streams: whether runs may go on beyond the steps that were asked for; one that is kept whole does not.
         imposable: why decisions cannot be imposed on it; None where they can.
     """
@@ -38,6 +39,8 @@ class Program(Protocol):
     def timestep(self) -> float: ...
     @property
     def scale(self) -> float: ...
+    @property
+    def ulp(self) -> float: ...
     @property
     def streams(self) -> bool: ...
     @property

@@ -7,8 +7,8 @@ A false verdict needs a truth that is known apart from the verdict:
     placebo    the hard cutoff, but in place of the run under the other's decisions stands a further free
                run from a perturbed start: the two differ in nothing. Right: not accelerated.
     hard       a hard cutoff at 2 sigma (1.8 in the mixture). The truth is what most of 16 further repeats
-               do, none of which the verdict saw: split more than one e-folding later without the flips, or
-               not.
+               at either displacement do, none of which the verdict saw: split more than one e-folding later
+               without the flips, or not.
     violent    the same with a cutoff at 1.5 sigma (1.4 in the mixture), inside the well.
     crystal    argon/crystal-108, whose second shell lies at a hard cutoff. The truth: repeats under the
                other's decisions do not split at all.
@@ -40,16 +40,14 @@ from scipy.stats import beta
 
 from mdnum.forks import fork
 from mdnum.forks.choices import parse
-from mdnum.forks.pair import SPLIT, perturbation
+from mdnum.forks.pair import SPLIT, displacements
 from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, count, growth, judge
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System, SystemSpec, build, load
 
 STEPS = 4000
-#: Repeats that no verdict sees, where it was clear: the truth.
+#: Repeats that no verdict sees, at either displacement: the truth, and more pairs for a placebo.
 UNSEEN = 16
-#: Of the crystal, where a repeat takes 4,000 steps.
-UNSEEN_CRYSTAL = 2
 #: Share of false verdicts that is aimed at: below it.
 TARGET = 0.05
 SHARES = (0.002 / 1.5874, SPLIT, 0.02, 0.04, 0.1 / 1.5874)
@@ -110,28 +108,29 @@ def liquid(name: str, seed: int) -> Atoms:
 # --- what is run --------------------------------------------------------------------------------------
 
 
-def gather(made: System, share: float, unseen: int, *, always: bool = False) -> dict[str, np.ndarray]:
+def gather(made: System, share: float, unseen: int) -> dict[str, np.ndarray]:
     """What a verdict needs, and the truth, of one start.
 
     Args:
         made: the system.
         share: the split tolerance over the cutoff.
-        unseen: repeats for the truth.
-        always: whether to run those where the verdict is not clear or asked for none, too.
+        unseen: repeats for the truth, at either displacement, where the runs split either way.
     """
     twin = parse("precision").make(made)
     found = fork(twin, STEPS, split=share * twin.a.scale, back=False)
-    truth: list[Delay] = []
-    clear = found.verdict.word in ("accelerated", "bystander")
-    if unseen and found.dates.split is not None and (clear or always):
-        programs = twin.b.nudged(perturbation(found), unseen, seed=1)
+    sizes = displacements(found)
+    truth: list[list[Delay]] = [[], []]
+    for place in (0, 1) if unseen and found.verdict.count is not None else ():
+        programs = twin.b.nudged(sizes[place], unseen, seed=2 + place)
         runs = twin.a.repeats(programs, found.steps, found.tolerance, 3 * found.tolerance)
-        truth = [Delay.of(free, under, found.tolerance) for free, under in runs]
+        truth[place] = [Delay.of(free, under, found.tolerance) for free, under in runs]
     # the separations are stored in full: a verdict must be the same from the file
     kept = {name: found.series[name] for name in ("B", "B|A")}
-    delays = {"seen": _rows(found.repeats), "unseen": _rows(truth)}
+    for place, end in enumerate(("", "_other")):
+        kept |= {f"seen{end}": _rows(found.repeats[place]), f"unseen{end}": _rows(truth[place])}
     dates = [-1 if at is None else at for at in vars(found.dates).values()]
-    return {**kept, **delays, "dates": np.array(dates), "tolerance": np.array(found.tolerance)}
+    numbers = {"dates": dates, "tolerance": found.tolerance, "displacements": sizes}
+    return kept | {name: np.array(value) for name, value in numbers.items()}
 
 
 def _rows(delays: Sequence[Delay]) -> np.ndarray:
@@ -147,17 +146,15 @@ def tasks() -> Iterator[tuple[str, Callable[[int], dict[str, np.ndarray]]]]:
             unseen = 0 if cutoff == "switched" else UNSEEN
             yield f"{name} {cutoff}", partial(_of_liquid, name, cutoff, unseen)
     for share in SHARES:
-        # only the pair is run at other tolerances than the default one
-        yield f"crystal {share * 1.5874:.4f}", partial(_of_crystal, share, UNSEEN_CRYSTAL * (share == SPLIT))
+        yield f"crystal {share * 1.5874:.4f}", partial(_of_crystal, share)
 
 
 def _of_liquid(name: str, cutoff: str, unseen: int, seed: int) -> dict[str, np.ndarray]:
     return gather(system(name, liquid(name, seed), cutoff, seed), SPLIT, unseen)
 
 
-def _of_crystal(share: float, unseen: int, seed: int) -> dict[str, np.ndarray]:
-    made = load("argon/crystal-108", {"dynamics.seed": seed}, world="md")
-    return gather(made, share, unseen, always=True)
+def _of_crystal(share: float, seed: int) -> dict[str, np.ndarray]:
+    return gather(load("argon/crystal-108", {"dynamics.seed": seed}, world="md"), share, 0)
 
 
 def fill(store: Path, seeds: int, only: Sequence[str]) -> None:
@@ -193,19 +190,18 @@ def delays(rows: np.ndarray) -> list[Delay]:
     ]
 
 
-def verdict(
-    one: dict[str, np.ndarray], repeats: list[Delay], handed: np.ndarray | None = None
-) -> ForkVerdict:
+def verdict(one: dict[str, np.ndarray]) -> ForkVerdict:
     """The verdict of a start, with as many repeats as it wants."""
     dates = Dates(*(None if at < 0 else int(at) for at in one["dates"]))
-    told = one["B|A"] if handed is None else handed
-    tolerance, used = float(one["tolerance"]), 0
+    repeats, used = [delays(one[name]) for name in ("seen", "seen_other")], [0, 0]
     while True:
-        found = judge(dates, one["B"], told, tolerance, repeats[:used])
-        wanted = min(found.wanted, len(repeats) - used)
+        first, other = (rows[:end] for rows, end in zip(repeats, used, strict=True))
+        found = judge(dates, one["B"], one["B|A"], float(one["tolerance"]), first, other=other)
+        place = int(found.other is not None)
+        wanted = min(found.wanted, len(repeats[place]) - used[place])
         if not wanted:
             return found
-        used += wanted
+        used[place] += wanted
 
 
 def threshold(one: dict[str, np.ndarray]) -> float:
@@ -216,22 +212,26 @@ def threshold(one: dict[str, np.ndarray]) -> float:
 
 def placebo(one: dict[str, np.ndarray]) -> str:
     """The verdict where every run under the other's decisions is a free run instead."""
-    free = delays(one["seen"])
-    pairs = [
-        Delay(a.free, b.free, a.free_until, b.free_until) for a, b in zip(free[::2], free[1::2], strict=False)
-    ]
-    used = 1
-    while True:
-        found = count(tuple(pairs[:used]), threshold(one), len(pairs))
-        if not found.wanted:
-            return "undecided" if found.delayed is None else "accelerated" if found.delayed else "bystander"
-        used += found.wanted
+    said = []
+    for end in ("", "_other"):
+        free = [*delays(one[f"seen{end}"]), *delays(one[f"unseen{end}"])]
+        pairs = tuple(
+            Delay(a.free, b.free, a.free_until, b.free_until)
+            for a, b in zip(free[::2], free[1::2], strict=False)
+        )
+        found = count(pairs[:1], threshold(one), len(pairs))
+        while found.wanted:
+            found = count(pairs[: found.pairs + found.wanted], threshold(one), len(pairs))
+        said.append(found.delayed)
+    first, other = said
+    return "undecided" if first is None or first != other else "accelerated" if first else "bystander"
 
 
-def truth(one: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Of the repeats that no verdict saw: how many split later without the flips, and how many do not."""
-    found = count(tuple(delays(one["unseen"])), threshold(one), 1)
-    return found.later, found.not_later
+def truth(one: dict[str, np.ndarray]) -> list[tuple[int, int]]:
+    """Of the repeats that no verdict saw: how many split later without the flips and how many do not, at
+    either displacement."""
+    found = [count(tuple(delays(one[f"unseen{end}"])), threshold(one), 1) for end in ("", "_other")]
+    return [(one.later, one.not_later) for one in found]
 
 
 WORDS = ("bystander", "undecided", "accelerated", "cause", "open", "no fork")
@@ -273,9 +273,8 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
         f"The target is that each kind of false verdict is the word of fewer than {target} of all starts.",
         f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}.",
         *([f"It is not shown for {named(short, True)}."] if short else []),
-        f"There are {most} starts of some rows and {fewer} of others (hard cutoffs take longest, and a "
-        "placebo can be made of those starts alone that needed more than five repeats), so that their bounds "
-        f"are wider. How often the word is undecided: {open_ or 'never'}; of the others, never.",
+        f"There are {fewer} to {most} starts of a row (the tables say how many); the fewer, the wider the "
+        f"bound. How often the word is undecided: {open_ or 'never'}; of the others, never.",
     )
     return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
 
@@ -287,12 +286,15 @@ def tables(store: Path, seeds: int) -> tuple[str, str]:
         every = stored(store, name, seeds)
         if not every:
             continue
-        found = [verdict(one, delays(one["seen"])) for one in every]
+        found = [verdict(one) for one in every]
         words = Counter(one.word for one in found)
         rows.append((name, len(every), *(words[word] for word in WORDS)))
-        made = [one.count.pairs - 1 for one in found if one.count is not None]
+        counted = [one for one in found if one.count is not None]
+        made = [one.count.pairs - 1 + (one.other.pairs if one.other else 0) for one in counted if one.count]
         if made:
-            repeats.append((name, f"{np.median(made):.0f}", f"{np.mean(made):.1f}"))
+            alone = sum(one.count.delayed is None for one in counted if one.count)
+            split = sum(one.word == "undecided" and one.other is not None for one in counted)
+            repeats.append((name, f"{np.median(made):.0f}", f"{np.mean(made):.1f}", alone, alone + split))
         if name.endswith("switched"):
             wrong.append((name, "cause", words["cause"], len(every)))
             wrong.append((name, "accelerated", words["accelerated"], len(every)))
@@ -302,13 +304,12 @@ def tables(store: Path, seeds: int) -> tuple[str, str]:
         else:
             told = [truth(one) for one in every]
             pairs = list(zip(found, told, strict=True))
-            fast = sum(v.word == "accelerated" and later <= no for v, (later, no) in pairs)
-            slow = sum(v.word == "bystander" and later > no for v, (later, no) in pairs)
+            fast = sum(v.word == "accelerated" and any(a <= b for a, b in seen) for v, seen in pairs)
+            slow = sum(v.word == "bystander" and any(a > b for a, b in seen) for v, seen in pairs)
             wrong.append((name, "cause", words["cause"], len(every)))
             wrong.append((name, "accelerated", fast, len(every)))
             wrong.append((name, "bystander", slow, len(every)))
-            # of five repeats there are two pairs, and two can never be clear
-            kept = [one for one in every if len(one["seen"]) > 9]
+            kept = [one for one in every if len(one["unseen"])]
             empty = Counter(placebo(one) for one in kept)
             rows.append((f"{name}, placebo", len(kept), *(empty[word] for word in WORDS)))
             wrong.append((f"{name}, placebo", "accelerated", empty["accelerated"], len(kept)))
@@ -322,7 +323,7 @@ def tables(store: Path, seeds: int) -> tuple[str, str]:
                 if of
             ],
         ),
-        table(("system", "repeats, median", "mean"), repeats),
+        table(("system", "repeats, median", "mean", "undecided at one displacement", "at two"), repeats),
     ]
     return summed_up(rows, [one for one in wrong if one[-1]]), "\n\n".join(parts)
 

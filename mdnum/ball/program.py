@@ -72,6 +72,11 @@ class BallProgram:
         return float(heights[np.isfinite(heights).all(axis=1)].max()) or 1.0
 
     @property
+    def ulp(self) -> float:
+        """Of the largest start height."""
+        return spacing(float(np.abs(np.asarray(self.problem.y0)).max()), self.problem.world.policy.state)
+
+    @property
     def streams(self) -> bool:
         """Every step that was asked for is compared, and none beyond."""
         return False
@@ -191,7 +196,7 @@ class BallProgram:
         """The program with its start heights displaced at random by up to `size`, an ulp at least."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
-        size = max(size, spacing(float(np.abs(y).max()), self.problem.world.policy.state))
+        size = max(size, self.ulp)
         moved = [y + size * rng.uniform(-1, 1, y.shape) for _ in range(count)]
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 

@@ -39,8 +39,8 @@ _BEYOND = 2.0
 #: A counterfactual ends when an imposed decision is so many tolerances from its threshold.
 _GUARD = 3.0
 #: Repeats are perturbed by what a choice does within so many steps, and by so many tolerances at most: a
-#: choice that changes everything at once still leaves room.
-_SOON, _LARGEST = 100, 1e-3
+#: choice that changes everything at once still leaves room. The other displacement is so many times smaller.
+_SOON, _LARGEST, _DECADES = 100, 1e-3, 100.0
 #: Cross-run flips that are kept; the counts cover all of them.
 FLIPS_KEPT = 100_000
 
@@ -57,7 +57,8 @@ class Fork:
         tolerance: of the split, length.
         dates: first differing bit, fork and split. decision: at the fork; None without one.
         series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
-            (repeats, NaN once all have split), from B "A|B" and "B|A from B"; "cross"; "overridden" and
+            (repeats at the first displacement, then those at the other one; NaN once all have split), from B
+            "A|B" and "B|A from B"; "cross"; "overridden" and
             "furthest" of B|A; "energy A", ...; of molecular dynamics "nearest A", "bound A", "ambiguous A"
             and the same of B.
         flips, flips_total: cross-run flips, the first `FLIPS_KEPT`, and how many there are of all.
@@ -66,7 +67,10 @@ class Fork:
         splits: first step beyond the tolerance by separation; None where there is none.
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
-        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions.
+        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions; at the first
+            displacement and at the other one.
+        displacements: of the starts of repeats, length: as much as the choice separates the runs at first,
+            and about two decades from it; of those that were run.
         failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
             where only one of them does, that is the fork at the latest.
         runs: A, B and the counterfactuals by name, of a world that keeps them whole.
@@ -87,7 +91,8 @@ class Fork:
     table: tuple[SplitCell, ...]
     shares: tuple[Share, ...]
     verdict: ForkVerdict
-    repeats: tuple[Delay, ...]
+    repeats: tuple[tuple[Delay, ...], tuple[Delay, ...]]
+    displacements: tuple[float, ...]
     failed: dict[str, str]
     runs: dict[str, Any]
 
@@ -113,7 +118,8 @@ def fork(
         back: whether to run A under B's decisions too; default where B is run under A's.
         repeats: runs of B at most whose start is displaced at random by as much as the choice separates the
             runs at first (an ulp at least), each free and under A's decisions; default 15. They are run where
-            the runs split either way, until the verdict is clear.
+            the runs split either way, until the verdict is clear; then as many, from starts displaced two
+            decades less, until it is clear there as well.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
@@ -205,33 +211,46 @@ def _beyond(step: int) -> int:
     return int(np.ceil(PATIENCE * step)) + 1
 
 
-def perturbation(fork: Fork) -> float:
-    """How much the starts of repeats are displaced, length: what the choice does to the runs at first.
+def displacements(fork: Fork) -> tuple[float, float]:
+    """Displacements of the starts of repeats, length: as the choice separates the runs at first, and less.
 
-    A smaller perturbation would leave the rounding errors of both runs the same, and their splits with them.
+    The first one moves the runs somewhat further apart than the choice alone does: they split about one
+    e-folding earlier. At a hundredth of it the rounding errors of a repeat begin to be those of the pair, and
+    at much less every repeat is the pair itself, which proves nothing. A majority that both have does not
+    hang on the displacement. Where a hundredth is less than an ulp, the other one is larger instead.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
-    return min(float(np.nanmax(soon, initial=0.0)), _LARGEST * fork.tolerance)
+    ulp, largest = fork.twin.b.ulp, _LARGEST * fork.tolerance
+    first = max(ulp, min(float(np.nanmax(soon, initial=0.0)), largest))
+    less, more = max(ulp, first / _DECADES), max(first, min(first * _DECADES, largest))
+    # of two that are about as far, the smaller one
+    return first, less if first / less > 0.5 * more / first else more
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
     """The same with as many repeats as its verdict wants."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
-    programs: list[Any] = []
+    programs: dict[int, list[Any]] = {}
     while wanted := found.verdict.wanted:
-        programs = programs or b.nudged(perturbation(found), most, seed=0)
-        done = len(found.repeats)
+        place, sizes = int(found.verdict.other is not None), displacements(found)
+        if place not in programs:
+            programs[place] = b.nudged(sizes[place], most + place, seed=place)
+        done, ran = len(found.repeats[place]), sum(map(len, found.repeats))
         if progress is not None:
-            progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
+            phase = f"repeats {done + 1} to {done + wanted} of {most + place}, {sizes[place]:.1g} away"
+            progress(found.steps, found.steps, {"phase": phase})
         delays = []
-        runs = a.repeats(programs[done : done + wanted], found.steps, tolerance, _GUARD * tolerance)
-        for number, (free, under) in enumerate(runs, done + 1):
+        chosen = programs[place][done : done + wanted]
+        runs = a.repeats(chosen, found.steps, tolerance, _GUARD * tolerance)
+        for number, (free, under) in enumerate(runs, ran + 1):
             delays.append(Delay.of(free, under, tolerance))
             series[f"B {number}"] = np.append(free, np.full(found.steps + 1 - len(free), np.nan))
-        repeats = (*found.repeats, *delays)
-        verdict = judge(found.dates, series["B"], series["B|A"], tolerance, repeats, most)
-        found = replace(found, series=series, repeats=repeats, verdict=verdict)
+        first, other = found.repeats
+        repeats = (first, (*other, *delays)) if place else ((*first, *delays), other)
+        given = found.dates, series["B"], series["B|A"], tolerance, repeats[0], most
+        verdict, sizes = judge(*given, other=repeats[1]), sizes[: place + 1]
+        found = replace(found, series=series, repeats=repeats, displacements=sizes, verdict=verdict)
     return found
 
 
@@ -290,6 +309,7 @@ def _judged(
         cells,
         shares(cells, rates["B"].rate),
         judge(dates, free, series.get("B|A"), tolerance, (), most, ended=cause),
+        ((), ()),
         (),
         failed,
         gathered[-1].runs,

@@ -4,8 +4,9 @@ The verdict compares two separations from the first run: of the second run, and 
 arithmetic under the first run's decisions. Only the latter can tell whether the flips did it. Where it splits
 as well, repeats of the pair tell whether the flips accelerated it or only came along, by a sequential sign
 test: where half of such pairs or fewer are delayed by more than a given delay, k or more of n are with the
-probability of k heads or more in n tosses at most, however the delays are distributed.
-docs/verdict-calibration.md has how often it is wrong.
+probability of k heads or more in n tosses at most, however the delays are distributed. "Such pairs" are those
+of one displacement of their starts, and at another the majority may be another: both words need the test to
+come out alike at two displacements. docs/verdict-calibration.md has how often it is wrong.
 """
 
 from __future__ import annotations
@@ -271,7 +272,7 @@ class ForkVerdict:
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
     # pairs such as this split later without them, by more than one e-folding of the separation), "bystander"
     # (the split came before any flip, or most pairs do not split later by that much), "undecided" (the
-    # repeats that were allowed do not tell the two apart)
+    # repeats that were allowed do not tell the two apart, or not alike at both displacements)
     word: Word
     free: int | None  # split of the free run, step
     imposed: int | None  # split of the run under the other's decisions, step; None where there is none
@@ -284,11 +285,17 @@ class ForkVerdict:
     threshold: float | None = None
     # of the pair and its repeats, those that split later; None where none were counted
     count: Count | None = None
+    # of repeats at the other displacement, without the pair; None where the first count is not clear
+    other: Count | None = None
 
     @property
     def wanted(self) -> int:
-        """Further repeats that would have to be run before the next look; 0 for none."""
-        return self.count.wanted if self.word == "undecided" and self.count is not None else 0
+        """Further repeats that would have to be run before the next look; 0 for none.
+
+        At the first displacement, and where `other` is given at the other one.
+        """
+        counts = [count for count in (self.count, self.other) if count is not None]
+        return counts[-1].wanted if counts else 0
 
 
 def judge(
@@ -299,6 +306,7 @@ def judge(
     repeats: Sequence[Delay] = (),
     most: int = REPEATS,
     *,
+    other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
     """The verdict on a pair of runs.
@@ -310,7 +318,8 @@ def judge(
             where there is no counterfactual.
         tolerance: of the split, length.
         repeats: of the pair, the start perturbed by as much as the choice does.
-        most: repeats that may be run in all.
+        most: repeats that may be run; at the other displacement one more, as the pair is not counted there.
+        other: repeats of the pair, the start perturbed by another displacement.
         ended: where the fork is that one run ended and the other did not: values that say which and how.
     """
     last = len(free) - 1
@@ -323,9 +332,9 @@ def judge(
         reasons += () if dates.split is not None else _outlook(free, tolerance)
         return ForkVerdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
-        other = None if imposed is None else split_of(imposed, tolerance)
-        kept = () if other is None else (("together", {"step": other}),)
-        return ForkVerdict("open", None, other, None, (*_outlook(free, tolerance), *kept))
+        late = None if imposed is None else split_of(imposed, tolerance)
+        kept = () if late is None else (("together", {"step": late}),)
+        return ForkVerdict("open", None, late, None, (*_outlook(free, tolerance), *kept))
     if dates.split < dates.fork:
         had: Reason = ("had_split", {"split": dates.split, "fork": dates.fork})
         return ForkVerdict("bystander", dates.split, None, None, (had,))
@@ -335,40 +344,60 @@ def judge(
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
     if delay.imposed is None:
-        return _kept(dates.split, imposed, tolerance, (delay, *repeats), most, rate)
+        return _kept(dates.split, imposed, tolerance, ((delay, *repeats), tuple(other)), most, rate)
     gained = delay.imposed - dates.split
     values = {"split": dates.split, "imposed": delay.imposed, "steps": abs(gained)}
-    return _counted((delay, *repeats), most, rate, gained, (("later" if gained >= 0 else "earlier", values),))
+    reason: Reason = ("later" if gained >= 0 else "earlier", values)
+    return _counted(((delay, *repeats), tuple(other)), most, rate, gained, (reason,))
+
+
+#: The pair and its repeats, and its repeats at the other displacement.
+_Delays = tuple[tuple[Delay, ...], tuple[Delay, ...]]
 
 
 def _counted(
-    delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[Reason, ...]
+    delays: _Delays, most: int, rate: float | None, gained: float, reasons: tuple[Reason, ...]
 ) -> ForkVerdict:
-    """The verdict where the runs split either way: how many of the pair and its repeats split later."""
-    pair = delays[0]
+    """The verdict where the runs split either way: how many of the pair and its repeats split later.
+
+    A word that needs both counts is false no oftener than either: the second one spends no error.
+    """
+    pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
     e_foldings = None if rate is None else rate * gained
     if e_foldings is not None:
         reasons += (("worth", {"e_foldings": e_foldings}),)
-    found = count(delays, threshold, 1 + most)
-    counted = {"repeats": found.pairs - 1, "later": found.later, "not_later": found.not_later}
-    reasons += (("counted_any" if rate is None else "counted", {**counted, "threshold": threshold}),)
-    if unseen := found.pairs - found.later - found.not_later:
-        reasons += (("unseen", {"pairs": unseen}),)
-    made, need = found.delayed, found.needed
-    word: Word = "undecided" if made is None else "accelerated" if made else "bystander"
-    if made is None and need is None:
+    found, other = count(delays[0], threshold, 1 + most), None
+    name = "counted_any" if rate is None else "counted"
+    reasons += ((name, {**_said(found), "repeats": found.pairs - 1, "threshold": threshold}),)
+    if found.delayed is not None:
+        other = count(delays[1], threshold, 1 + most)
+        reasons += (("other", _said(other)),) if other.pairs else ()
+    for one in (found, other) if other is not None else (found,):
+        if unseen := one.pairs - one.later - one.not_later:
+            reasons += (("unseen", {"pairs": unseen}),)
+    last = found if other is None else other
+    word: Word = "undecided"
+    if last.delayed is None and last.needed is None:
         reasons += (("too_few", {"needed": FEWEST}),)
-    elif made is None and need is not None:
-        reasons += (("not_clear", {"need": need[1], "of": need[0]}),)
-    return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found)
+    elif last.delayed is None and last.needed is not None:
+        reasons += (("not_clear", {"need": last.needed[1], "of": last.needed[0]}),)
+    elif last.delayed != found.delayed:
+        reasons += (("disagree", {}),)
+    else:
+        word = "accelerated" if found.delayed else "bystander"
+    return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found, other)
+
+
+def _said(count: Count) -> dict[str, Any]:
+    return {"pairs": count.pairs, "later": count.later, "not_later": count.not_later}
 
 
 def _kept(
     free: int,
     imposed: Float[np.ndarray, "steps"],
     tolerance: float,
-    delays: tuple[Delay, ...],
+    delays: _Delays,
     most: int,
     rate: float | None,
 ) -> ForkVerdict:

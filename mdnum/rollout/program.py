@@ -64,6 +64,12 @@ class MdProgram:
         return self.simulation.r_cut
 
     @property
+    def ulp(self) -> float:
+        """Of the largest coordinate of the start."""
+        x = np.asarray(self.start.state.x)
+        return float(np.spacing(np.abs(x).max().astype(x.dtype)))
+
+    @property
     def streams(self) -> bool:
         """A run may go on for as long as a verdict needs."""
         return True
@@ -139,8 +145,7 @@ class MdProgram:
         By an ulp at least: a smaller displacement would be lost in the first addition.
         """
         rng = np.random.default_rng(seed)
-        x = np.asarray(self.start.state.x)
-        ulp = float(np.spacing(np.abs(x).max().astype(x.dtype)))
+        x, ulp = np.asarray(self.start.state.x), self.ulp
         programs = []
         for _ in range(count):
             noise = rng.standard_normal(x.shape)

@@ -50,7 +50,7 @@ def page(view: View, verdict: Verdict) -> Page:
     return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), _keys(view), [
         Section("Separation", list(_separation(view))),
         Section(DECISION, [*_decision(view), *_around(view)], terminal=True),
-        Section(TWO_BY_TWO, list(_two_by_two(s)), terminal=True),
+        Section(TWO_BY_TWO, list(_two_by_two(view)), terminal=True),
         Section("One decision overridden", list(_pinned(view)), terminal=True),
         Section("Minimal cause", list(_minimal(s)), terminal=True),
         Section("How far the decisions are certain", list(_certain(view)), terminal=True),
@@ -229,8 +229,9 @@ def _atoms(view: View, figure: Canvas) -> None:
         panel.set_xlabel(f"along the pair ({view.units.length})")
 
 
-def _two_by_two(s: Mapping[str, Any]) -> Iterator[Any]:
+def _two_by_two(view: View) -> Iterator[Any]:
     """Whose arithmetic, whose decisions: when each run splits from A and from B, and what each is worth."""
+    s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
         arithmetic, decisions, whose = cell["arithmetic"], cell["decisions"], cell["reference"]
@@ -240,12 +241,15 @@ def _two_by_two(s: Mapping[str, Any]) -> Iterator[Any]:
         lines.setdefault(key, {})[whose] = f"is {whose}" if same else at
     if len(lines) < 3 or all(cell["split"] is None for cell in s["table"]):
         return
-    repeated = s["repeated"]
-    for whose, name in (("its own", "free"), ("A’s", "imposed")) if repeated else ():
-        seen = [one[name] for one in repeated if one[name] is not None]
-        unseen = [f"{len(repeated) - len(seen)} of {len(repeated)} not seen to"] * (len(seen) < len(repeated))
-        steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
-        lines["B, start perturbed", whose] = {"A": "; ".join(steps + unseen)}
+    for size, name in zip(s.get("displacements") or (), ("repeated", "repeated_other"), strict=False):
+        repeated = s[name]
+        label = TEXTS("start_displaced", displacement=size, unit=unit)
+        for whose, run in (("its own", "free"), ("A’s", "imposed")):
+            seen = [one[run] for one in repeated if one[run] is not None]
+            missing = len(repeated) - len(seen)
+            steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
+            steps += [f"{missing} of {len(repeated)} not seen to"] * (missing > 0)
+            lines[label, whose] = {"A": "; ".join(steps)}
     yield TEXTS("two_by_two")
     rows = [(*key, at.get("A"), at.get("B")) for key, at in lines.items()]
     yield Table(("arithmetic", "decisions", "splits from A at", "from B at"), rows)
@@ -436,7 +440,8 @@ def _what(view: View) -> Iterator[Any]:
     if s["imposed_until"] is None:
         rows.append(("Counterfactual", TEXTS("no_counterfactual")))
     if s["count"] and s["count"]["pairs"] > 1:
-        rows.append(("Chance", TEXTS("chance", repeats=s["count"]["pairs"] - 1, agreeing=agreeing(s))))
+        repeats = s["count"]["pairs"] - 1 + (s.get("count_other") or {"pairs": 0})["pairs"]
+        rows.append(("Chance", TEXTS("chance", repeats=repeats, agreeing=agreeing(view))))
     yield pairs([*rows, view.took])
     changed = s.get("differences") or [(key, *values) for key, values in s["changes"].items()]
     if changed:

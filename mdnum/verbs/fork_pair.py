@@ -164,9 +164,15 @@ def _numbers(made: Fork) -> dict[str, Any]:
         values[np.isfinite(values)] for values in
         (made.series.get(name, np.zeros(0)).astype(float) for name in ("B", "B|A", "overridden"))
     )  # fmt: skip
-    count = verdict.count and {
-        **plain(verdict.count), "threshold": verdict.threshold, "needed": verdict.count.needed,
-    }  # fmt: skip
+    # of the pair and its repeats, and of repeats at the other displacement
+    sizes = (*made.displacements, None, None)
+    count, other = (
+        one and {**plain(one), "threshold": verdict.threshold, "needed": one.needed, "displacement": size}
+        for one, size in zip((verdict.count, verdict.other), sizes, strict=False)
+    )
+    repeated, repeated_other = (
+        [{"free": one.free, "imposed": one.imposed} for one in delays] for delays in made.repeats
+    )
     free_runs = made.failed.keys() & {"A", "B"}
     return {
         "difference": made.twin.difference, "changes": made.twin.changes, "steps": made.steps,
@@ -174,7 +180,8 @@ def _numbers(made: Fork) -> dict[str, Any]:
         **{f"{name}_time": None if at is None else at * step for name, at in dates.items()},
         "tolerance": made.tolerance, "effect": verdict.word,
         "reasons": [{"code": code, **values} for code, values in verdict.reasons],
-        "e_foldings": verdict.e_foldings, "count": count, "growth_rate": growth.rate,
+        "e_foldings": verdict.e_foldings, "displacements": made.displacements,
+        "count": count, "count_other": other, "growth_rate": growth.rate,
         "growth_rate_time": growth.rate / step, "r_squared": growth.r_squared,
         "growth": {name: _fit(fit, made.series[name]) for name, fit in made.growth.items()},
         "splits": {name: made.splits[name] for name in ("B", "B|A", "A|B") if name in made.splits},
@@ -184,7 +191,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
              "e_foldings": one.e_foldings}
             for one in made.shares
         ],
-        "repeated": [{"free": one.free, "imposed": one.imposed} for one in made.repeats],
+        "repeated": repeated, "repeated_other": repeated_other,
         "imposed_until": len(imposed) - 1 if len(imposed) else None,
         "imposed_largest": imposed.max() if len(imposed) else None,
         "separation_end": free[-1] if len(free) else None,
@@ -356,8 +363,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
         return why("error", error=error.message)
     if not np.isfinite(found.rate):
         return why("not_finite", steps=steps)
-    # where A's largest coordinate lies: no smaller displacement of it can be written down
-    ulp = float(np.spacing(np.abs(a.positions).max().astype(a.policy.dtype("state"))))
+    ulp = made.twin.a.ulp
     split = found.steps_to(ulp, made.tolerance)
     row = {
         **{name: getattr(found, name) for name in ("rate", "error", "rate_time", "error_time", "steps")},

@@ -54,7 +54,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
     imposed = (s.get("splits") or {}).get("B|A")
     values |= {"imposed": imposed, "until": s.get("imposed_until"), "subject": subject(s)}
     values["compared"] = TEXTS("compared_not" if imposed is None else "compared", **values)
-    values["agreeing"] = agreeing(s)
+    values["agreeing"] = agreeing(view)
     if word == "same":
         return "same_but_decided" if s["decision"] else "same", values
     if fork is None:
@@ -67,16 +67,27 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
     return str(word), values
 
 
-def agreeing(summary: Mapping[str, Any]) -> str:
-    """How many of the pair and its repeats split later without the flips."""
-    count = summary.get("count")
-    return "" if not count else TEXTS("agreeing" if count["threshold"] else "agreeing_any", **count)
+def agreeing(view: View) -> str:
+    """How many of the pair and its repeats split later without the flips, at either displacement."""
+    said = ""
+    for name in ("count", "count_other"):
+        if count := view.summary.get(name):
+            kind = "_other" if said else "" if count["threshold"] else "_any"
+            known = count.get("displacement")
+            displaced = TEXTS("displaced", displacement=known, unit=view.units.length) if known else ""
+            said += TEXTS(f"agreeing{kind}", **count, displaced=displaced)
+    return said
 
 
 def _evidence(view: View) -> Iterator[str]:
-    summary, decision = view.summary, view.summary["decision"]
+    summary, decision, unit = view.summary, view.summary["decision"], view.units.length
+    sizes = summary.get("displacements") or ()
     for reason in summary.get("reasons") or ():
-        yield TEXTS(f"reason_{reason['code']}", **reason, unit=view.units.length)
+        code = reason["code"]
+        size = sizes[code == "other"] if sizes and code in ("counted", "counted_any", "other") else None
+        yield TEXTS(f"reason_{code}", **reason, displacement=size, unit=unit)
+        if size and code != "other":
+            yield TEXTS("repeats_displaced", displacement=size, unit=unit)
     if decision is None:
         return
     values = {**decision, "subject": subject(summary), "unit": view.units.length}
@@ -122,11 +133,14 @@ def _findings(view: View) -> Iterator[Finding]:
         word = (s.get("failed_imposed") or {}).get("B|A")
         yield TEXTS.finding("GUARD", *["failed"] * bool(word), until=until, word=word)
     if s["effect"] == "undecided" and count:
-        more = max(REPEATS, 2 * (count["most"] - 1))
-        of, need = count["needed"] or (None, None)
-        variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
-        variants += ["needed"] * (count["needed"] is not None)
-        values = {"agreeing": agreeing(s), "more": more, "of": of, "need": need}
+        other, more = s.get("count_other"), max(REPEATS, 2 * (count["most"] - 1))
+        of, need = (other or count)["needed"] or (None, None)
+        if "disagree" in [reason["code"] for reason in s.get("reasons") or ()]:
+            variants = ["disagree"]
+        else:
+            variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
+            variants += ["needed"] * (need is not None)
+        values = {"agreeing": agreeing(view), "more": more, "of": of, "need": need}
         yield TEXTS.finding("UNDECIDED", *variants, section=TWO_BY_TWO, **values)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -32,7 +35,7 @@ def judge(*given, **options) -> ForkVerdict:
     """The verdict, each of whose reasons has a sentence for its values."""
     verdict = verdicts.judge(*given, **options)
     for code, values in verdict.reasons:
-        assert TEXTS(f"reason_{code}", **values, unit="σ").endswith(".")
+        assert TEXTS(f"reason_{code}", **values, unit="σ", displacement=1e-9).endswith(".")
     return verdict
 
 
@@ -120,31 +123,41 @@ def later(*gains: int) -> list[Delay]:
 #: One of six not later: it is looked at again after eleven, and after sixteen.
 SIX = (60, 60, 60, 60, 40)
 ELEVEN = (*SIX, 40, 60, 60, 60, 60)
+#: Six that are clear either way.
+FAST, SLOW = later(*6 * [60]), later(*6 * [40])
 
 
 @pytest.mark.parametrize(
-    ("imposed", "repeats", "most", "word", "wanted"),
+    ("imposed", "repeats", "other", "most", "word", "wanted"),
     [
         # two tell nothing, however little they scatter
-        (LATE, later(300, 301), REPEATS, "undecided", 3),
-        (LATE, later(300, 301), 2, "undecided", 0),
-        (LATE, later(*5 * [60]), REPEATS, "accelerated", 0),
-        (LATE, later(*SIX), REPEATS, "undecided", 5),
-        (LATE, later(*SIX, *5 * [60]), REPEATS, "accelerated", 0),
-        (LATE, later(*ELEVEN), REPEATS, "undecided", 5),
-        (LATE, later(*ELEVEN, *5 * [40]), REPEATS, "undecided", 0),
-        *((FREE, later(*5 * [gain]), REPEATS, "bystander", 0) for gain in (0, -40, 40)),
+        (LATE, later(300, 301), [], REPEATS, "undecided", 3),
+        (LATE, later(300, 301), [], 2, "undecided", 0),
+        (LATE, later(*5 * [60]), FAST, REPEATS, "accelerated", 0),
+        (LATE, later(*SIX), [], REPEATS, "undecided", 5),
+        (LATE, later(*SIX, *5 * [60]), FAST, REPEATS, "accelerated", 0),
+        (LATE, later(*ELEVEN), [], REPEATS, "undecided", 5),
+        (LATE, later(*ELEVEN, *5 * [40]), [], REPEATS, "undecided", 0),
+        *((FREE, later(*5 * [gain]), SLOW, REPEATS, "bystander", 0) for gain in (0, -40, 40)),
         # less than one e-folding, beyond any scatter
-        (LITTLE, later(*5 * [40]), REPEATS, "bystander", 0),
-        (LATE, [], 0, "undecided", 0),
-        (FREE, [], 0, "undecided", 0),
+        (LITTLE, later(*5 * [40]), SLOW, REPEATS, "bystander", 0),
+        (LATE, [], [], 0, "undecided", 0),
+        (FREE, [], [], 0, "undecided", 0),
         # what was not seen counts for neither; seen to be later it counts
-        (LATE, [Delay(1600, None, 2999, 1640)] * 5, REPEATS, "undecided", 5),
-        (LATE, [Delay(1600, None, 2999, 1700)] * 5, REPEATS, "accelerated", 0),
+        (LATE, [Delay(1600, None, 2999, 1640)] * 5, [], REPEATS, "undecided", 5),
+        (LATE, [Delay(1600, None, 2999, 1700)] * 5, FAST, REPEATS, "accelerated", 0),
+        # clear at one displacement: the other one is looked at, without the pair, as often as the first
+        (LATE, later(*5 * [60]), [], REPEATS, "undecided", 6),
+        (FREE, later(*5 * [0]), [], REPEATS, "undecided", 6),
+        (LATE, later(*5 * [60]), later(*SIX, 60), REPEATS, "undecided", 5),
+        (LATE, later(*5 * [60]), later(*ELEVEN, 60, *5 * [40]), REPEATS, "undecided", 0),
+        # and the other way there: no word, and no more repeats
+        (LATE, later(*5 * [60]), SLOW, REPEATS, "undecided", 0),
+        (FREE, later(*5 * [0]), FAST, REPEATS, "undecided", 0),
     ],
 )
-def test_words_that_rest_on_repeats(imposed, repeats, most, word, wanted):
-    verdict = judge(DATES, FREE, imposed, TOLERANCE, repeats, most)
+def test_words_that_rest_on_repeats(imposed, repeats, other, most, word, wanted):
+    verdict = judge(DATES, FREE, imposed, TOLERANCE, repeats, most, other=other)
     assert (verdict.word, verdict.wanted) == (word, wanted)
     assert verdict.threshold == pytest.approx(50)
     steps = {id(LATE): 300, id(LITTLE): 40, id(FREE): 0}[id(imposed)]
@@ -153,6 +166,10 @@ def test_words_that_rest_on_repeats(imposed, repeats, most, word, wanted):
     assert verdict.count.later == sum(gain > 50 for gain in [steps, *sure])
     unseen = sum(one.imposed is None and gain <= 50 for one, gain in zip(repeats, sure, strict=True))
     assert verdict.count.not_later == 1 + len(repeats) - verdict.count.later - unseen
+    # the other displacement is looked at where the first one is clear, and named where they disagree
+    assert (verdict.other is not None) == (verdict.count.delayed is not None)
+    clear = {one.delayed for one in (verdict.count, verdict.other) if one is not None}
+    assert ("disagree" in dict(verdict.reasons)) == (clear == {True, False})
 
 
 # --- the sequential sign test ---------------------------------------------------------------------------
@@ -187,6 +204,53 @@ def test_at_the_default_the_error_is_nearly_spent_and_a_clear_majority_is_found(
     assert said.count(True) > 285 and said.count(False) == 0
     # five of five by coins: 1/32; four of four: 1/16
     assert FEWEST == 4 and looks(4) == () and looks(5) == ((5, 5),)
+
+
+def word(first: Sequence[bool], other: Sequence[bool], most: int) -> str:
+    """The verdict on a pair and its repeats, each True for one that is delayed, run as it wants them."""
+    pair, *repeats = later(*(60 if heads else 40 for heads in first))
+    others, used = later(*(60 if heads else 40 for heads in other)), [0, 0]
+    while True:
+        imposed = LATE if pair.beyond(50) else LITTLE
+        given = repeats[: used[0]], most
+        found = judge(DATES, FREE, imposed, TOLERANCE, *given, other=others[: used[1]])
+        if not found.wanted:
+            return found.word
+        used[found.other is not None] += found.wanted
+
+
+@pytest.fixture
+def one_fit(monkeypatch):
+    """The growth of the free run, fitted once: thousands of verdicts on it follow."""
+    fit = growth(FREE, TOLERANCE)
+    monkeypatch.setattr(verdicts, "growth", lambda separation, tolerance: fit)
+
+
+def tosses(coins: int) -> list[tuple[bool, ...]]:
+    return list(product((True, False), repeat=coins))
+
+
+@pytest.mark.usefixtures("one_fit")
+@pytest.mark.parametrize("most", [4, 6])
+def test_a_word_that_needs_two_displacements_spends_no_more_error_than_one(most):
+    """All sequences of coins at either displacement, whatever happens at the other one."""
+    coins = tosses(1 + most)
+    for made, sure in (("accelerated", True), ("bystander", False)):
+        always, never = (most + 1) * (sure,), (most + 1) * (not sure,)
+        # at one of them the word is as good as certain, and at the other half of the pairs are delayed
+        ways = [word(each, always, most) for each in coins], [word(always, each, most) for each in coins]
+        for said in ways:
+            assert 0.015 < said.count(made) / len(said) <= ERROR
+        # where the other one says the opposite there is no word, whatever comes at the first
+        assert not any(word(each, never, most) == made for each in coins)
+        assert word(always, always, most) == made and word(always, never, most) == "undecided"
+
+
+@pytest.mark.usefixtures("one_fit")
+def test_of_coins_at_both_displacements_hardly_one_in_a_thousand_gives_a_word():
+    said = [word(first, other, 4) for first in tosses(5) for other in tosses(5)]
+    assert said.count("accelerated") == said.count("bystander") == 1
+    assert len(said) == 1024 and said.count("undecided") == 1022
 
 
 UNTIL = st.integers(0, 300)
