@@ -5,8 +5,8 @@ arithmetic under the first run's decisions. Only the latter can tell whether the
 as well, repeats of the pair tell whether the flips accelerated it or only came along, by a sequential sign
 test: where half of such pairs or fewer are delayed by more than a given delay, k or more of n are with the
 probability of k heads or more in n tosses at most, however the delays are distributed. "Such pairs" are those
-of one displacement of their starts, and at another the majority may be another: both words need the test to
-come out alike at two displacements. docs/verdict-calibration.md has how often it is wrong.
+of one displacement of their starts, and at another one the majority may be another: where it is, there is no
+word. docs/verdict-calibration.md has how often it is wrong.
 """
 
 from __future__ import annotations
@@ -114,6 +114,13 @@ class Count:
         if need is None:
             return None
         return True if self.later >= need else False if self.not_later >= need else None
+
+    @property
+    def majority(self) -> bool | None:
+        """What more than half of the pairs do, after the last look; None before it, or where no half does."""
+        if self.wanted:
+            return None
+        return True if 2 * self.later > self.pairs else False if 2 * self.not_later > self.pairs else None
 
     @property
     def wanted(self) -> int:
@@ -272,7 +279,7 @@ class ForkVerdict:
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
     # pairs such as this split later without them, by more than one e-folding of the separation), "bystander"
     # (the split came before any flip, or most pairs do not split later by that much), "undecided" (the
-    # repeats that were allowed do not tell the two apart, or not alike at both displacements)
+    # repeats that were allowed do not tell the two apart, or most do otherwise at the other displacement)
     word: Word
     free: int | None  # split of the free run, step
     imposed: int | None  # split of the run under the other's decisions, step; None where there is none
@@ -360,7 +367,7 @@ def _counted(
 ) -> ForkVerdict:
     """The verdict where the runs split either way: how many of the pair and its repeats split later.
 
-    A word that needs both counts is false no oftener than either: the second one spends no error.
+    The second count can only take the word back, so that it spends no error.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -378,14 +385,14 @@ def _counted(
             reasons += (("unseen", {"pairs": unseen}),)
     last = found if other is None else other
     word: Word = "undecided"
-    if last.delayed is None and last.needed is None:
-        reasons += (("too_few", {"needed": FEWEST}),)
-    elif last.delayed is None and last.needed is not None:
-        reasons += (("not_clear", {"need": last.needed[1], "of": last.needed[0]}),)
-    elif last.delayed != found.delayed:
-        reasons += (("disagree", {}),)
-    else:
+    if other is not None and other.majority == found.delayed:
         word = "accelerated" if found.delayed else "bystander"
+    elif other is not None and not other.wanted:
+        reasons += (("disagree", {}),)
+    elif last.needed is not None:
+        reasons += (("not_clear", {"need": last.needed[1], "of": last.needed[0]}),)
+    else:
+        reasons += (("too_few", {"needed": FEWEST}),)
     return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found, other)
 
 

@@ -133,13 +133,12 @@ def _findings(view: View) -> Iterator[Finding]:
         word = (s.get("failed_imposed") or {}).get("B|A")
         yield TEXTS.finding("GUARD", *["failed"] * bool(word), until=until, word=word)
     if s["effect"] == "undecided" and count:
-        other, more = s.get("count_other"), max(REPEATS, 2 * (count["most"] - 1))
-        of, need = (other or count)["needed"] or (None, None)
-        if "disagree" in [reason["code"] for reason in s.get("reasons") or ()]:
-            variants = ["disagree"]
-        else:
-            variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
-            variants += ["needed"] * (need is not None)
+        more = max(REPEATS, 2 * (count["most"] - 1))
+        of, need = count["needed"] or (None, None)
+        variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
+        variants += ["needed"] * (need is not None)
+        # more repeats would not change what the other displacement says
+        variants = ["disagree"] if s.get("count_other") else variants
         values = {"agreeing": agreeing(view), "more": more, "of": of, "need": need}
         yield TEXTS.finding("UNDECIDED", *variants, section=TWO_BY_TWO, **values)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from small_systems import make
 
 from mdnum.errors import InputError
 from mdnum.forks import Fork, fork
-from mdnum.forks.pair import perturbation
+from mdnum.forks.pair import displacements
+from mdnum.numerics.verdicts import Dates
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.program import MdProgram
 from mdnum.systems import System
@@ -68,8 +71,34 @@ def test_nudged_starts_differ_by_the_size_asked_for_and_never_by_nothing(size):
     assert len({x.tobytes() for x in starts}) == 4
 
 
-def test_repeats_are_perturbed_by_what_a_choice_does_at_first():
-    assert 1e-7 < perturbation(followed(1e-7, 120, repeats=0)) < 1e-5
+def test_repeats_are_perturbed_by_what_a_choice_does_at_first_and_by_a_hundredth_of_it():
+    first, other = displacements(followed(1e-7, 120, repeats=0))
+    assert 1e-7 < first < 1e-5 and other == pytest.approx(first / 100)
+
+
+@pytest.mark.parametrize(
+    ("ulp", "separation", "first", "other"),
+    [
+        (1e-15, 1e-6, 1e-6, 1e-8),
+        # never more than a thousandth of the tolerance, and never less than an ulp
+        (1e-15, 1e-3, 2e-5, 2e-7),
+        (1e-15, 0.0, 1e-15, 1e-13),
+        # where a hundredth is less than an ulp, whichever of an ulp and a hundred times as much is further
+        (1e-15, 1e-14, 1e-14, 1e-12),
+        (5e-7, 4e-6, 4e-6, 5e-7),
+        (5e-7, 6e-7, 6e-7, 2e-5),
+        # and there may be no other one
+        (1e-3, 1e-3, 1e-3, 1e-3),
+    ],
+)
+def test_the_other_displacement_is_two_decades_away_where_there_is_room(ulp, separation, first, other):
+    found = followed(1e-6, 37, back=True, repeats=0)
+    program: Any = SimpleNamespace(ulp=ulp)
+    made = replace(
+        found, twin=replace(found.twin, b=program), dates=Dates(0, 80, 200), steps=300, tolerance=0.02,
+        series={"B": np.full(301, separation)},
+    )  # fmt: skip
+    assert displacements(made) == pytest.approx((first, other), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -111,17 +140,23 @@ def test_the_verdict_on_a_liquid_rests_on_repeats():
     found = fork(hot, steps, repeats=4, back=False)
     count = found.verdict.count
     assert count is not None and (count.pairs, count.most) == (5, 5)
-    assert found.verdict.word != "cause" and len(found.repeats) == 4
-    assert {name for name in found.series if name.startswith("B ")} == {"B 1", "B 2", "B 3", "B 4"}
+    first, others = found.repeats
+    assert found.verdict.word != "cause" and len(first) == 4
+    # at the other displacement there are some where the first one was clear, and there without the pair
+    assert len(others) == (5 if count.delayed is not None else 0)
+    assert found.displacements == displacements(found)[: 1 + (count.delayed is not None)]
+    names = {f"B {number + 1}" for number in range(len(first) + len(others))}
+    assert {name for name in found.series if name.startswith("B ")} == names
     # alone, from its start, the pair of runs is followed by another path through the code
-    starts = hot.b.nudged(perturbation(found), 4, seed=0)
-    alone = fork(replace(hot, b=starts[2]), steps, repeats=0, back=False)
-    assert (alone.splits["B"], alone.splits["B|A"]) == (found.repeats[2].free, found.repeats[2].imposed)
+    for place, (size, delays) in enumerate(zip(found.displacements, found.repeats, strict=False)):
+        starts = hot.b.nudged(size, 4 + place, seed=place)
+        alone = fork(replace(hot, b=starts[2]), steps, repeats=0, back=False)
+        assert (alone.splits["B"], alone.splits["B|A"]) == (delays[2].free, delays[2].imposed)
     # and the first starts do not depend on how many there are
     ((free, _),) = hot.a.repeats(
-        hot.b.nudged(perturbation(found), 1, 0), steps, found.tolerance, 3 * found.tolerance
+        hot.b.nudged(found.displacements[0], 1, 0), steps, found.tolerance, 3 * found.tolerance
     )
-    assert int((free > found.tolerance).argmax()) == found.repeats[0].free
+    assert int((free > found.tolerance).argmax()) == first[0].free
 
 
 def test_a_split_near_the_end_is_followed_further():
@@ -130,7 +165,7 @@ def test_a_split_near_the_end_is_followed_further():
     found = fork(twin, steps, back=False)
     assert found.dates.split is not None and 0.9 * steps < found.dates.split <= steps
     assert found.verdict.word == "cause" and found.steps >= 1.2 * found.dates.split > steps
-    assert found.repeats == () and found.verdict.count is None
+    assert found.repeats == ((), ()) and found.displacements == () and found.verdict.count is None
     before = found.dates.split - 1
     assert fork(twin, before, back=False).steps == before
 

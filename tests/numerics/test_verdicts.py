@@ -150,7 +150,10 @@ FAST, SLOW = later(*6 * [60]), later(*6 * [40])
         (LATE, later(*5 * [60]), [], REPEATS, "undecided", 6),
         (FREE, later(*5 * [0]), [], REPEATS, "undecided", 6),
         (LATE, later(*5 * [60]), later(*SIX, 60), REPEATS, "undecided", 5),
-        (LATE, later(*5 * [60]), later(*ELEVEN, 60, *5 * [40]), REPEATS, "undecided", 0),
+        # a majority is enough there, a tie is not
+        (LATE, later(*5 * [60]), later(*ELEVEN, 60, *5 * [40]), REPEATS, "accelerated", 0),
+        (LATE, later(*5 * [60]), later(*ELEVEN, *6 * [40]), REPEATS, "undecided", 0),
+        (LATE, later(*5 * [60]), later(*8 * [60, 40]), REPEATS, "undecided", 0),
         # and the other way there: no word, and no more repeats
         (LATE, later(*5 * [60]), SLOW, REPEATS, "undecided", 0),
         (FREE, later(*5 * [0]), FAST, REPEATS, "undecided", 0),
@@ -168,8 +171,8 @@ def test_words_that_rest_on_repeats(imposed, repeats, other, most, word, wanted)
     assert verdict.count.not_later == 1 + len(repeats) - verdict.count.later - unseen
     # the other displacement is looked at where the first one is clear, and named where they disagree
     assert (verdict.other is not None) == (verdict.count.delayed is not None)
-    clear = {one.delayed for one in (verdict.count, verdict.other) if one is not None}
-    assert ("disagree" in dict(verdict.reasons)) == (clear == {True, False})
+    ended = verdict.other is not None and not verdict.other.wanted
+    assert ("disagree" in dict(verdict.reasons)) == (ended and word == "undecided")
 
 
 # --- the sequential sign test ---------------------------------------------------------------------------
@@ -232,25 +235,24 @@ def tosses(coins: int) -> list[tuple[bool, ...]]:
 
 @pytest.mark.usefixtures("one_fit")
 @pytest.mark.parametrize("most", [4, 6])
-def test_a_word_that_needs_two_displacements_spends_no_more_error_than_one(most):
-    """All sequences of coins at either displacement, whatever happens at the other one."""
+def test_whatever_the_other_displacement_says_no_more_than_a_twentieth_of_coins_gives_a_word(most):
+    """All sequences of coins at either displacement."""
     coins = tosses(1 + most)
     for made, sure in (("accelerated", True), ("bystander", False)):
         always, never = (most + 1) * (sure,), (most + 1) * (not sure,)
-        # at one of them the word is as good as certain, and at the other half of the pairs are delayed
-        ways = [word(each, always, most) for each in coins], [word(always, each, most) for each in coins]
-        for said in ways:
-            assert 0.015 < said.count(made) / len(said) <= ERROR
-        # where the other one says the opposite there is no word, whatever comes at the first
-        assert not any(word(each, never, most) == made for each in coins)
         assert word(always, always, most) == made and word(always, never, most) == "undecided"
+        # half of the pairs are delayed, and the other displacement always says the same, or the opposite
+        said = [word(each, always, most) for each in coins]
+        assert 0.015 < said.count(made) / len(said) <= ERROR
+        assert not any(word(each, never, most) == made for each in coins)
+        # certain at the first, half of the pairs at the other one: half of the words at most are left
+        assert [word(always, each, most) for each in coins].count(made) / len(coins) <= 0.5
 
 
 @pytest.mark.usefixtures("one_fit")
-def test_of_coins_at_both_displacements_hardly_one_in_a_thousand_gives_a_word():
+def test_of_coins_at_both_displacements_one_in_sixty_gives_a_word():
     said = [word(first, other, 4) for first in tosses(5) for other in tosses(5)]
-    assert said.count("accelerated") == said.count("bystander") == 1
-    assert len(said) == 1024 and said.count("undecided") == 1022
+    assert len(said) == 1024 and said.count("accelerated") == said.count("bystander") == 16
 
 
 UNTIL = st.integers(0, 300)

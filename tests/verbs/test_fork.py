@@ -360,9 +360,12 @@ def test_a_prediction_says_what_it_comes_from(crystal):
         assert found["predicted_by"] == by and (found["predicted_split"] is None) == (by is None)
     # repeats that did not split are kept, and a fit that is none has no line
     delays = (Delay(12, 40, 99, 99), Delay(None, 30, 99, 99))
-    made = replace(crystal.result, repeats=delays, growth={"B": Growth(float("nan"), float("nan"), -1, -1)})
+    made = replace(
+        crystal.result, repeats=(delays, delays[1:]), growth={"B": Growth(float("nan"), float("nan"), -1, -1)}
+    )
     found = fork_pair._numbers(made)
     assert found["repeated"] == [{"free": 12, "imposed": 40}, {"free": None, "imposed": 30}]
+    assert found["repeated_other"] == [{"free": None, "imposed": 30}]
     assert found["growth"]["B"]["intercept"] is None
 
 
@@ -468,7 +471,10 @@ CAUSE = {
     "growth": {"B": FIT}, "table": TABLE, "shares": SHARES, "minimal": MINIMAL, "pinned": PINNED,
     "lyapunov": LYAPUNOV, "lyapunov_reason": None, "must_hold": False, "findings": [],
 }  # fmt: skip
-COUNT = {"pairs": 16, "later": 9, "not_later": 7, "most": 16, "threshold": 43.2, "needed": [16, 12]}
+COUNT = {
+    "pairs": 16, "later": 9, "not_later": 7, "most": 16, "threshold": 43.2, "needed": [16, 12],
+    "displacement": 1e-6,
+}  # fmt: skip
 NONE = {"first_bit": None, "fork": None, "split": None, "decision": None}
 
 
@@ -520,10 +526,16 @@ def test_the_page_has_a_figure_and_a_table_for_everything_there_is(crystal):
     assert "1.05 times as fast" in growth["Lyapunov exponent"] and "1,702" in growth["An ulp of the start"]
     # repeats are ranges
     repeated = [{"free": 380, "imposed": 399}, {"free": 370, "imposed": None}]
-    own = shown(cause(crystal, repeated=repeated, count=COUNT))
-    rows = part(own, "Whose decisions, whose arithmetic", Table).rows[-2:]
-    assert [row[2] for row in rows] == ["370 to 380", "399 to 399; 1 of 2 not seen to"]
-    assert "15 repeats" in dict(part(own, "What was compared", Table).rows)["Chance"]
+    other = {"repeated_other": repeated[:1], "count_other": COUNT | {"pairs": 6, "displacement": 1e-8}}
+    sizes = {"displacements": [1e-6, 1e-8]}
+    own = shown(cause(crystal, repeated=repeated, count=COUNT, **other, **sizes))
+    rows = part(own, "Whose decisions, whose arithmetic", Table).rows[-4:]
+    assert [row[2] for row in rows[:2]] == ["370 to 380", "399 to 399; 1 of 2 not seen to"]
+    assert [row[2] for row in rows[2:]] == ["380 to 380", "399 to 399"]
+    assert [row[0] for row in rows[1:3]] == [
+        fork_verdict.TEXTS("start_displaced", displacement=size, unit="σ") for size in (1e-6, 1e-8)
+    ]
+    assert "21 repeats" in dict(part(own, "What was compared", Table).rows)["Chance"]
     # of nothing that was not asked for
     bare = shown(cause(crystal, decision=None, table=[], minimal=None, pinned=None, imposed_until=None))
     assert [one.title for one in bare.sections[1:3]] == ["How far the decisions are certain", "Growth"]
@@ -607,6 +619,24 @@ def test_findings_are_those_that_apply(crystal):
     one = COUNT | {"pairs": 1, "later": 1, "not_later": 0, "most": 1, "needed": None}
     (none,) = findings(effect="undecided", count=one)
     assert none.values["more"] == 15 and none.values["need"] is None
+    # clear at one displacement, and not so at the other one: more repeats would not change it
+    (against,) = findings(effect="undecided", count=COUNT | {"later": 12, "not_later": 4}, count_other=COUNT)
+    assert against.code == "UNDECIDED" and not against.remedy and against.title != more.title
+
+
+def test_a_verdict_names_the_displacements_of_its_repeats(tmp_path):
+    """In the summary, the headline and the page, from a command as anyone gives it."""
+    asked: dict[str, Any] = {"steps": 80, "split": 1e-3, "repeats": 4, "back": False, "lyapunov": False}
+    found = mdnum.fork("argon/crystal-108", "precision.force=bfloat16", **asked, out=tmp_path / "fork")
+    s = json.loads((found.folder / "summary.json").read_text(encoding="utf-8"))
+    # so coarse a choice separates the runs by more than the most that repeats are displaced by
+    assert s["displacements"] == pytest.approx([1e-3 * s["tolerance"], 1e-5 * s["tolerance"]])
+    assert [s[name]["displacement"] for name in ("count", "count_other")] == s["displacements"]
+    assert [len(s[name]) for name in ("repeated", "repeated_other")] == [4, 5]
+    shown = (found.folder / "report.html").read_text(encoding="utf-8")
+    for size in s["displacements"]:
+        displaced = fork_verdict.TEXTS("displaced", displacement=size, unit="σ")
+        assert displaced in found.verdict.headline and displaced in shown
 
 
 def test_a_decision_that_was_overridden_is_said_and_why_another_could_not_be(crystal):
