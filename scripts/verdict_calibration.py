@@ -20,6 +20,7 @@ rule that mdnum has now.
     nice python scripts/verdict_calibration.py --seeds 100 --only switched hard
     nice python scripts/verdict_calibration.py --seeds 30
     python scripts/verdict_calibration.py --seeds 100 --tables docs/verdict-calibration.md
+    python scripts/verdict_calibration.py --seeds 3 --only "Jones hard" --displacements
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ STEPS = 4000
 UNSEEN = 16
 #: Share of false verdicts that is aimed at: below it.
 TARGET = 0.05
+#: Displacements of repeats over that of the choice, and repeats at each, to see what hangs on it.
+SCAN, SCANNED = (100.0, 1.0, 0.1, 0.01, 1e-4, 0.0), 12
 SHARES = (0.002 / 1.5874, SPLIT, 0.02, 0.04, 0.1 / 1.5874)
 POTENTIAL = {"kind": "lennard-jones", "sigma": 1.0, "epsilon": 1.0}
 MIXTURE = {
@@ -139,6 +142,22 @@ def _rows(delays: Sequence[Delay]) -> np.ndarray:
     return np.array(rows, int).reshape(-1, 4)
 
 
+def scan(made: System) -> list[tuple[object, ...]]:
+    """Displacement of the starts, delayed repeats, repeats, and the median of their free splits."""
+    twin = parse("precision").make(made)
+    found = fork(twin, STEPS, back=False, repeats=0)
+    fit = found.growth["B"]
+    rows: list[tuple[object, ...]] = [("the pair", -1, 1, found.dates.split or -1)]
+    for factor in SCAN:
+        programs = twin.b.nudged(factor * displacements(found)[0], SCANNED, seed=7)
+        runs = twin.a.repeats(programs, found.steps, found.tolerance, 3 * found.tolerance)
+        kept = tuple(Delay.of(free, under, found.tolerance) for free, under in runs)
+        later = count(kept, 1.0 / fit.rate if fit.plain else 0.0, 1).later
+        splits = [one.free for one in kept if one.free is not None]
+        rows.append((f"{factor:g}", later, SCANNED, int(np.median(splits)) if splits else -1))
+    return rows
+
+
 def tasks() -> Iterator[tuple[str, Callable[[int], dict[str, np.ndarray]]]]:
     """(name, what gathers a seed) of everything that is run."""
     for name, (*_, radii) in LIQUIDS.items():
@@ -220,9 +239,9 @@ def placebo(one: dict[str, np.ndarray]) -> str:
             for a, b in zip(free[::2], free[1::2], strict=False)
         )
         found = count(pairs[:1], threshold(one), len(pairs))
-        while found.wanted:
-            found = count(pairs[: found.pairs + found.wanted], threshold(one), len(pairs))
-        said.append(found.delayed)
+        while wanted := found.wanted_for_majority if end else found.wanted:
+            found = count(pairs[: found.pairs + wanted], threshold(one), len(pairs))
+        said.append(found.majority if end else found.delayed)
     first, other = said
     return "undecided" if first is None or first != other else "accelerated" if first else "bystander"
 
@@ -346,7 +365,20 @@ def main() -> None:
         "--tables", type=Path, metavar="PAGE",
         help="run nothing: judge what is stored, and put what it says between the marks of this page",
     )  # fmt: skip
+    made.add_argument(
+        "--displacements", action="store_true",
+        help="run liquids again with repeats at six displacements, and store nothing",
+    )  # fmt: skip
     chosen = made.parse_args()
+    if chosen.displacements:
+        for name, (*_, radii) in LIQUIDS.items():
+            for cutoff in radii:
+                if any(word in f"{name} {cutoff}" for word in chosen.only):
+                    for seed in range(1, chosen.seeds + 1):
+                        print(f"{name} {cutoff}, start {seed}")
+                        rows = scan(system(name, liquid(name, seed), cutoff, seed))
+                        print(table(("displacement over the choice's", "delayed", "of", "split"), rows))
+        return
     if chosen.tables is None:
         fill(chosen.store, chosen.seeds, chosen.only)
         print(*tables(chosen.store, chosen.seeds), sep="\n\n")

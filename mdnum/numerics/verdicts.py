@@ -26,6 +26,8 @@ REPEATS = 15
 LOOK = 5
 #: How often a word may be wrong: the chance of it where half of the pairs are delayed.
 ERROR = 0.05
+#: Repeats at the other displacement that are enough if all of them do the same.
+_ALIKE = 4
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,18 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """What more than half of the pairs do, after the last look; None before it, or where no half does."""
-        if self.wanted:
-            return None
-        return True if 2 * self.later > self.pairs else False if 2 * self.not_later > self.pairs else None
+        """What all of the first few pairs do, or more than half of all; None where that is not known."""
+        if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
+            return True
+        return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
+
+    @property
+    def wanted_for_majority(self) -> int:
+        """Pairs that would settle the majority if all did the same; 0 where it is known or cannot be."""
+        if self.pairs < _ALIKE:
+            return _ALIKE - self.pairs
+        more = self.most // 2 + 1 - max(self.later, self.not_later)
+        return 0 if self.majority is not None else min(more, self.most - self.pairs)
 
     @property
     def wanted(self) -> int:
@@ -301,8 +311,9 @@ class ForkVerdict:
 
         At the first displacement, and where `other` is given at the other one.
         """
-        counts = [count for count in (self.count, self.other) if count is not None]
-        return counts[-1].wanted if counts else 0
+        if self.other is not None:
+            return self.other.wanted_for_majority
+        return self.count.wanted if self.count is not None else 0
 
 
 def judge(
@@ -383,16 +394,15 @@ def _counted(
     for one in (found, other) if other is not None else (found,):
         if unseen := one.pairs - one.later - one.not_later:
             reasons += (("unseen", {"pairs": unseen}),)
-    last = found if other is None else other
     word: Word = "undecided"
-    if other is not None and other.majority == found.delayed:
-        word = "accelerated" if found.delayed else "bystander"
-    elif other is not None and not other.wanted:
-        reasons += (("disagree", {}),)
-    elif last.needed is not None:
-        reasons += (("not_clear", {"need": last.needed[1], "of": last.needed[0]}),)
-    else:
+    if other is None and found.needed is not None:
+        reasons += (("not_clear", {"need": found.needed[1], "of": found.needed[0]}),)
+    elif other is None:
         reasons += (("too_few", {"needed": FEWEST}),)
+    elif other.majority == found.delayed:
+        word = "accelerated" if found.delayed else "bystander"
+    elif not other.wanted_for_majority:
+        reasons += (("disagree", {}),)
     return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found, other)
 
 

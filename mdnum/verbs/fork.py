@@ -61,7 +61,7 @@ def fork(
         split: separation that counts as split, length; default 0.01 of the longest cutoff, of a ball 0.01 of
             the largest start height.
         repeats: further pairs of runs with perturbed starts at most, to tell a delay from chance; default 15.
-            They are run until the verdict is clear.
+            They are run until the verdict is clear, and again with starts displaced by a hundredth of that.
         counterfactual: whether to run B's arithmetic under A's decisions, which the verdict rests on.
         back: whether to run A's arithmetic under B's decisions too, for the table of two by two; default
             with the counterfactual.

@@ -165,11 +165,11 @@ def _numbers(made: Fork) -> dict[str, Any]:
         (made.series.get(name, np.zeros(0)).astype(float) for name in ("B", "B|A", "overridden"))
     )  # fmt: skip
     # of the pair and its repeats, and of repeats at the other displacement
-    sizes = (*made.displacements, None, None)
     count, other = (
-        one and {**plain(one), "threshold": verdict.threshold, "needed": one.needed, "displacement": size}
-        for one, size in zip((verdict.count, verdict.other), sizes, strict=False)
+        one and {**plain(one), "threshold": verdict.threshold, "displacement": size}
+        for one, size in zip((verdict.count, verdict.other), (*made.displacements, None, None), strict=False)
     )
+    count = count and {**count, "needed": verdict.count and verdict.count.needed}
     repeated, repeated_other = (
         [{"free": one.free, "imposed": one.imposed} for one in delays] for delays in made.repeats
     )

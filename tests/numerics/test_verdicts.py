@@ -123,8 +123,8 @@ def later(*gains: int) -> list[Delay]:
 #: One of six not later: it is looked at again after eleven, and after sixteen.
 SIX = (60, 60, 60, 60, 40)
 ELEVEN = (*SIX, 40, 60, 60, 60, 60)
-#: Six that are clear either way.
-FAST, SLOW = later(*6 * [60]), later(*6 * [40])
+#: Four that are alike, either way.
+FAST, SLOW = later(*4 * [60]), later(*4 * [40])
 
 
 @pytest.mark.parametrize(
@@ -146,11 +146,15 @@ FAST, SLOW = later(*6 * [60]), later(*6 * [40])
         # what was not seen counts for neither; seen to be later it counts
         (LATE, [Delay(1600, None, 2999, 1640)] * 5, [], REPEATS, "undecided", 5),
         (LATE, [Delay(1600, None, 2999, 1700)] * 5, FAST, REPEATS, "accelerated", 0),
-        # clear at one displacement: the other one is looked at, without the pair, as often as the first
-        (LATE, later(*5 * [60]), [], REPEATS, "undecided", 6),
-        (FREE, later(*5 * [0]), [], REPEATS, "undecided", 6),
-        (LATE, later(*5 * [60]), later(*SIX, 60), REPEATS, "undecided", 5),
-        # a majority is enough there, a tie is not
+        # clear at one displacement: the other one is looked at, without the pair
+        (LATE, later(*5 * [60]), [], REPEATS, "undecided", 4),
+        (FREE, later(*5 * [0]), FAST[:3], REPEATS, "undecided", 1),
+        # where they are not alike, until nine of sixteen are, which settles it
+        (LATE, later(*5 * [60]), later(*SIX[1:]), REPEATS, "undecided", 6),
+        (LATE, later(*5 * [60]), later(*SIX[1:], *6 * [60]), REPEATS, "accelerated", 0),
+        (LATE, later(*5 * [60]), later(*SIX[1:], *3 * [40, 60]), REPEATS, "undecided", 3),
+        (LATE, later(*5 * [60]), later(*SIX[1:], *8 * [40]), REPEATS, "undecided", 0),
+        # a majority is enough, a tie is not
         (LATE, later(*5 * [60]), later(*ELEVEN, 60, *5 * [40]), REPEATS, "accelerated", 0),
         (LATE, later(*5 * [60]), later(*ELEVEN, *6 * [40]), REPEATS, "undecided", 0),
         (LATE, later(*5 * [60]), later(*8 * [60, 40]), REPEATS, "undecided", 0),
@@ -171,7 +175,7 @@ def test_words_that_rest_on_repeats(imposed, repeats, other, most, word, wanted)
     assert verdict.count.not_later == 1 + len(repeats) - verdict.count.later - unseen
     # the other displacement is looked at where the first one is clear, and named where they disagree
     assert (verdict.other is not None) == (verdict.count.delayed is not None)
-    ended = verdict.other is not None and not verdict.other.wanted
+    ended = verdict.other is not None and not verdict.other.wanted_for_majority
     assert ("disagree" in dict(verdict.reasons)) == (ended and word == "undecided")
 
 
@@ -245,8 +249,8 @@ def test_whatever_the_other_displacement_says_no_more_than_a_twentieth_of_coins_
         said = [word(each, always, most) for each in coins]
         assert 0.015 < said.count(made) / len(said) <= ERROR
         assert not any(word(each, never, most) == made for each in coins)
-        # certain at the first, half of the pairs at the other one: half of the words at most are left
-        assert [word(always, each, most) for each in coins].count(made) / len(coins) <= 0.5
+        # certain at the first one, and half of the pairs at the other one: half of the words at most are left
+        assert 0.3 < [word(always, each, most) for each in coins].count(made) / len(coins) <= 0.5
 
 
 @pytest.mark.usefixtures("one_fit")
