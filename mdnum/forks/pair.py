@@ -57,20 +57,17 @@ class Fork:
         tolerance: of the split, length.
         dates: first differing bit, fork and split. decision: at the fork; None without one.
         series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
-            (repeats at the first displacement, then those at the other one; NaN once all have split), from B
-            "A|B" and "B|A from B"; "cross"; "overridden" and
-            "furthest" of B|A; "energy A", ...; of molecular dynamics "nearest A", "bound A", "ambiguous A"
-            and the same of B.
+            (repeats, those at the other displacement last; NaN once all have split), from B "A|B" and
+            "B|A from B"; "cross"; "overridden" and "furthest" of B|A; "energy A", ...; of molecular dynamics
+            "nearest A", "bound A", "ambiguous A" and the same of B.
         flips, flips_total: cross-run flips, the first `FLIPS_KEPT`, and how many there are of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
         growth: of the separations "B" and "B|A".
         splits: first step beyond the tolerance by separation; None where there is none.
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
-        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions; at the first
-            displacement and at the other one.
-        displacements: of the starts of repeats, length: as much as the choice separates the runs at first,
-            and about two decades from it; of those that were run.
+        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions, at the first
+            displacement and at the other one. displacements: of the starts of those that were run, length.
         failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
             where only one of them does, that is the fork at the latest.
         runs: A, B and the counterfactuals by name, of a world that keeps them whole.
@@ -118,8 +115,7 @@ def fork(
         back: whether to run A under B's decisions too; default where B is run under A's.
         repeats: runs of B at most whose start is displaced at random by as much as the choice separates the
             runs at first (an ulp at least), each free and under A's decisions; default 15. They are run where
-            the runs split either way, until the verdict is clear; then as many, from starts displaced two
-            decades less, until it is clear there as well.
+            the runs split either way, until the verdict is clear, and then at a hundredth of it.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
@@ -214,34 +210,28 @@ def _beyond(step: int) -> int:
 def displacements(fork: Fork) -> tuple[float, float]:
     """Displacements of the starts of repeats, length: as the choice separates the runs at first, and less.
 
-    The first one moves the runs somewhat further apart than the choice alone does: they split about one
-    e-folding earlier. At a hundredth of it the rounding errors of a repeat begin to be those of the pair, and
-    at much less every repeat is the pair itself, which proves nothing. A majority that both have does not
-    hang on the displacement. Where a hundredth is less than an ulp, the other one is larger instead.
+    At a hundredth a repeat begins to have the pair's rounding errors; at much less it is the pair itself, which
+    proves nothing. Where a hundredth is less than an ulp, the other one may be larger instead.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
     ulp, largest = fork.twin.b.ulp, _LARGEST * fork.tolerance
     first = max(ulp, min(float(np.nanmax(soon, initial=0.0)), largest))
     less, more = max(ulp, first / _DECADES), max(first, min(first * _DECADES, largest))
-    # of two that are about as far, the smaller one
     return first, less if first / less > 0.5 * more / first else more
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
     """The same with as many repeats as its verdict wants."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
-    programs: dict[int, list[Any]] = {}
     while wanted := found.verdict.wanted:
         place, sizes = int(found.verdict.other is not None), displacements(found)
-        if place not in programs:
-            programs[place] = b.nudged(sizes[place], most + place, seed=place)
         done, ran = len(found.repeats[place]), sum(map(len, found.repeats))
         if progress is not None:
             phase = f"repeats {done + 1} to {done + wanted} of {most + place}, {sizes[place]:.1g} away"
             progress(found.steps, found.steps, {"phase": phase})
         delays = []
-        chosen = programs[place][done : done + wanted]
+        chosen = b.nudged(sizes[place], most + place, seed=place)[done : done + wanted]
         runs = a.repeats(chosen, found.steps, tolerance, _GUARD * tolerance)
         for number, (free, under) in enumerate(runs, ran + 1):
             delays.append(Delay.of(free, under, tolerance))

@@ -307,10 +307,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Further repeats that would have to be run before the next look; 0 for none.
-
-        At the first displacement, and where `other` is given at the other one.
-        """
+        """Further repeats to be run before the next look, those of `other` where there is one; 0 for none."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -350,9 +347,9 @@ def judge(
         reasons += () if dates.split is not None else _outlook(free, tolerance)
         return ForkVerdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
-        late = None if imposed is None else split_of(imposed, tolerance)
-        kept = () if late is None else (("together", {"step": late}),)
-        return ForkVerdict("open", None, late, None, (*_outlook(free, tolerance), *kept))
+        own = None if imposed is None else split_of(imposed, tolerance)
+        kept = () if own is None else (("together", {"step": own}),)
+        return ForkVerdict("open", None, own, None, (*_outlook(free, tolerance), *kept))
     if dates.split < dates.fork:
         had: Reason = ("had_split", {"split": dates.split, "fork": dates.fork})
         return ForkVerdict("bystander", dates.split, None, None, (had,))
@@ -369,16 +366,16 @@ def judge(
     return _counted(((delay, *repeats), tuple(other)), most, rate, gained, (reason,))
 
 
-#: The pair and its repeats, and its repeats at the other displacement.
-_Delays = tuple[tuple[Delay, ...], tuple[Delay, ...]]
-
-
 def _counted(
-    delays: _Delays, most: int, rate: float | None, gained: float, reasons: tuple[Reason, ...]
+    delays: Sequence[tuple[Delay, ...]],
+    most: int,
+    rate: float | None,
+    gained: float,
+    reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
     """The verdict where the runs split either way: how many of the pair and its repeats split later.
 
-    The second count can only take the word back, so that it spends no error.
+    The count at the other displacement can only take the word back, so that it spends no error.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -386,14 +383,13 @@ def _counted(
     if e_foldings is not None:
         reasons += (("worth", {"e_foldings": e_foldings}),)
     found, other = count(delays[0], threshold, 1 + most), None
-    name = "counted_any" if rate is None else "counted"
-    reasons += ((name, {**_said(found), "repeats": found.pairs - 1, "threshold": threshold}),)
+    counted = {**vars(found), "repeats": found.pairs - 1, "threshold": threshold}
+    reasons += (("counted_any" if rate is None else "counted", counted),)
     if found.delayed is not None:
         other = count(delays[1], threshold, 1 + most)
-        reasons += (("other", _said(other)),) if other.pairs else ()
-    for one in (found, other) if other is not None else (found,):
-        if unseen := one.pairs - one.later - one.not_later:
-            reasons += (("unseen", {"pairs": unseen}),)
+        reasons += (("other", dict(vars(other))),) if other.pairs else ()
+    if unseen := sum(one.pairs - one.later - one.not_later for one in (found, other) if one is not None):
+        reasons += (("unseen", {"pairs": unseen}),)
     word: Word = "undecided"
     if other is None and found.needed is not None:
         reasons += (("not_clear", {"need": found.needed[1], "of": found.needed[0]}),)
@@ -406,15 +402,11 @@ def _counted(
     return ForkVerdict(word, pair.free, pair.imposed, e_foldings, reasons, threshold, found, other)
 
 
-def _said(count: Count) -> dict[str, Any]:
-    return {"pairs": count.pairs, "later": count.later, "not_later": count.not_later}
-
-
 def _kept(
     free: int,
     imposed: Float[np.ndarray, "steps"],
     tolerance: float,
-    delays: _Delays,
+    delays: Sequence[tuple[Delay, ...]],
     most: int,
     rate: float | None,
 ) -> ForkVerdict:

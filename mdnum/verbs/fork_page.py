@@ -242,14 +242,12 @@ def _two_by_two(view: View) -> Iterator[Any]:
     if len(lines) < 3 or all(cell["split"] is None for cell in s["table"]):
         return
     for size, name in zip(s.get("displacements") or (), ("repeated", "repeated_other"), strict=False):
-        repeated = s[name]
-        label = TEXTS("start_displaced", displacement=size, unit=unit)
+        label, ran = TEXTS("start_displaced", displacement=size, unit=unit), len(s[name])
         for whose, run in (("its own", "free"), ("A’s", "imposed")):
-            seen = [one[run] for one in repeated if one[run] is not None]
-            missing = len(repeated) - len(seen)
+            seen = [one[run] for one in s[name] if one[run] is not None]
+            unseen = [f"{ran - len(seen)} of {ran} not seen to"] * (len(seen) < ran)
             steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
-            steps += [f"{missing} of {len(repeated)} not seen to"] * (missing > 0)
-            lines[label, whose] = {"A": "; ".join(steps)}
+            lines[label, whose] = {"A": "; ".join(steps + unseen)}
     yield TEXTS("two_by_two")
     rows = [(*key, at.get("A"), at.get("B")) for key, at in lines.items()]
     yield Table(("arithmetic", "decisions", "splits from A at", "from B at"), rows)

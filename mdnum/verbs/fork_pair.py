@@ -164,15 +164,12 @@ def _numbers(made: Fork) -> dict[str, Any]:
         values[np.isfinite(values)] for values in
         (made.series.get(name, np.zeros(0)).astype(float) for name in ("B", "B|A", "overridden"))
     )  # fmt: skip
-    # of the pair and its repeats, and of repeats at the other displacement
     count, other = (
         one and {**plain(one), "threshold": verdict.threshold, "displacement": size}
         for one, size in zip((verdict.count, verdict.other), (*made.displacements, None, None), strict=False)
     )
     count = count and {**count, "needed": verdict.count and verdict.count.needed}
-    repeated, repeated_other = (
-        [{"free": one.free, "imposed": one.imposed} for one in delays] for delays in made.repeats
-    )
+    repeated = [[{"free": one.free, "imposed": one.imposed} for one in delays] for delays in made.repeats]
     free_runs = made.failed.keys() & {"A", "B"}
     return {
         "difference": made.twin.difference, "changes": made.twin.changes, "steps": made.steps,
@@ -191,7 +188,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
              "e_foldings": one.e_foldings}
             for one in made.shares
         ],
-        "repeated": repeated, "repeated_other": repeated_other,
+        "repeated": repeated[0], "repeated_other": repeated[1],
         "imposed_until": len(imposed) - 1 if len(imposed) else None,
         "imposed_largest": imposed.max() if len(imposed) else None,
         "separation_end": free[-1] if len(free) else None,
