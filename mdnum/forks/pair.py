@@ -210,7 +210,7 @@ def _beyond(step: int) -> int:
 def displacements(fork: Fork) -> tuple[float, float]:
     """Displacements of the starts of repeats, length: as the choice separates the runs at first, and less.
 
-    At a hundredth a repeat begins to have the pair's rounding errors; at much less it is the pair itself, which
+    At a hundredth a repeat begins to have the pair's rounding errors; at much less it is the pair itself and
     proves nothing. Where a hundredth is less than an ulp, the other one may be larger instead.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0

@@ -166,7 +166,7 @@ FAST, SLOW = later(*4 * [60]), later(*4 * [40])
 def test_words_that_rest_on_repeats(imposed, repeats, other, most, word, wanted):
     verdict = judge(DATES, FREE, imposed, TOLERANCE, repeats, most, other=other)
     assert (verdict.word, verdict.wanted) == (word, wanted)
-    assert verdict.threshold == pytest.approx(50)
+    assert verdict.threshold == pytest.approx(50) and verdict.count is not None
     steps = {id(LATE): 300, id(LITTLE): 40, id(FREE): 0}[id(imposed)]
     assert verdict.e_foldings == pytest.approx(steps * RATE, rel=1e-6)
     sure = [(one.imposed or one.imposed_until + 1) - one.free for one in repeats if one.free is not None]
