@@ -290,7 +290,11 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
     target = f"{100 * TARGET:.0f} %"
     sentences = (
         f"The target is that each kind of false verdict is the word of fewer than {target} of all starts.",
-        f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}.",
+        *(
+            [f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}."]
+            if shown
+            else []
+        ),
         *([f"It is not shown for {named(short, True)}."] if short else []),
         f"There are {fewer} to {most} starts of a row (the tables say how many); the fewer, the wider the "
         f"bound. How often the word is undecided: {open_ or 'never'}; of the others, never.",
