@@ -10,8 +10,8 @@ A false verdict needs a truth that is known apart from the verdict:
                at either displacement do, none of which the verdict saw: split more than one e-folding later
                without the flips, or not.
     violent    the same with a cutoff at 1.5 sigma (1.4 in the mixture), inside the well.
-    crystal    argon/crystal-108, whose second shell lies at a hard cutoff. The truth: repeats under the
-               other's decisions do not split at all.
+    crystal    argon/crystal-108, whose second shell lies at a hard cutoff: without the flips it does not
+               split. Right: cause.
 
 Every start is kept in a file of its own as soon as it is done (--store), as separations and steps of splits,
 not as a verdict: the study goes on where it was stopped, and its tables are judged from the files by the
@@ -147,7 +147,7 @@ def scan(made: System) -> list[tuple[object, ...]]:
     twin = parse("precision").make(made)
     found = fork(twin, STEPS, back=False, repeats=0)
     fit = found.growth["B"]
-    rows: list[tuple[object, ...]] = [("the pair", -1, 1, found.dates.split or -1)]
+    rows: list[tuple[object, ...]] = [("the pair", "–", 1, found.dates.split or -1)]
     for factor in SCAN:
         programs = twin.b.nudged(factor * displacements(found)[0], SCANNED, seed=7)
         runs = twin.a.repeats(programs, found.steps, found.tolerance, 3 * found.tolerance)
