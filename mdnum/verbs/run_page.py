@@ -74,6 +74,17 @@ class RunView(View):
         return self.summary.get("cutoff") or {}
 
     @property
+    def cutoff_key(self) -> str:
+        """The key of the system file that says where pairs end; empty where the potential does."""
+        given = self.system.get("cutoff") or {}
+        return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
+
+    @cached_property
+    def thermal(self) -> float:
+        """k_B T of the run's mean temperature, energy."""
+        return self.units.k_B * float(np.mean(self.series["temperature"]))
+
+    @property
     def jump(self) -> float:
         """Energy of a pair at the cutoff, 0 where it ends at zero."""
         return float(self.cutoff.get("energy_jump") or 0.0)
@@ -99,6 +110,27 @@ class RunView(View):
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
+
+    @cached_property
+    def time_step(self) -> dict[str, float | None]:
+        """What the energies and the fastest vibration say of the time step; None for what is not known.
+
+        `per_period`: steps in the fastest vibration of the first and the last configuration; `fluctuation`:
+        of the energy that is conserved, the flips' jumps left out, over the kinetic energy's; `drift` of that
+        energy over the run and `drift_error`, its standard error, in k_B T per atom.
+        """
+        period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
+        found = analysis.Conservation.of(self.budget["residual"], self.series["kinetic"])
+        thermal = self.thermal * (self.summary.get("atoms") or 0)
+        drift = error = None
+        if found is not None and thermal > 0:
+            drift, error = found.drift / thermal, found.drift_error / thermal
+        return {
+            "per_period": period / step if period and step else None,
+            "fluctuation": None if found is None else found.fluctuation,
+            "drift": drift,
+            "drift_error": error,
+        }
 
     @property
     def residual(self) -> float:
