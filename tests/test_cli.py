@@ -355,3 +355,21 @@ def test_programs_are_kept_beside_other_caches_and_nobody_elses_are_touched(tmp_
     (tmp_path / "file").touch()
     assert call("systems", "list") == 0 and name not in os.environ
     assert not capsys.readouterr().err
+
+
+def test_a_number_that_is_none_is_named_in_plain_words(capsys: pytest.CaptureFixture[str]):
+    for words, said in (
+        (("run", "argon/crystal-108", "--steps", "ten"), "--steps ten: expected a whole number"),
+        (("flips", "x.xyz", "--cutoff", "far"), "--cutoff far: expected a number"),
+    ):
+        line = refused(capsys, *words)
+        assert said in line and "Input should" not in line
+
+
+def test_prose_is_as_wide_as_people_read_where_it_is_piped(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
+    long = {"code": "LONG", "severity": "info", "title": "a title", "text": "word " * 80, "remedy": "act " * 80}
+    rollout.summary = {"findings": [long]}
+    call("run", "argon/crystal-108")
+    lines = capsys.readouterr().out.splitlines()
+    wrapped = [line for line in lines if line.startswith("  word") or line.startswith("  act")]
+    assert len(wrapped) > 8 and max(map(len, lines)) <= 110 and not any(line.endswith(" ") for line in wrapped)
