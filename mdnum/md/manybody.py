@@ -171,30 +171,27 @@ class Tersoff(ManyBody):
     Where the crossing atom is a bond's only third neighbor the bond order starts as (r_cut - r)^(2n), so
     for n < 1 the force is continuous but infinitely steep there (dilute silicon; not the crystal).
 
-    Attributes:
-        A, B: repulsion and attraction, energy.
-        lambda1, lambda2, lambda3: decay of repulsion, attraction and of the bond order, 1/length.
-        m: exponent of the bond order's distance term, 1 or 3.
-        beta, n: bond order.
-        c, d, h: angle; gamma: factor of the angular function.
-        R, D: middle and half width of the taper, length.
-
     Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table I, in LAMMPS's notation; checked
     against ase.calculators.tersoff and a plain numpy evaluation (tests/oracles_manybody.py).
     """
 
+    # A, B: repulsion and attraction, energy
     A: float = eqx.field(static=True, default=1830.8)
     B: float = eqx.field(static=True, default=471.18)
+    # lambda1, lambda2, lambda3: decay of repulsion, attraction and of the bond order, 1/length
     lambda1: float = eqx.field(static=True, default=2.4799)
     lambda2: float = eqx.field(static=True, default=1.7322)
     lambda3: float = eqx.field(static=True, default=1.7322)
-    m: int = eqx.field(static=True, default=3)
+    m: int = eqx.field(static=True, default=3)  # exponent of the bond order's distance term, 1 or 3
+    # beta, n: bond order
     beta: float = eqx.field(static=True, default=1.0999e-6)
     n: float = eqx.field(static=True, default=0.78734)
+    # c, d, h: angle; gamma: factor of the angular function
     c: float = eqx.field(static=True, default=1.0039e5)
     d: float = eqx.field(static=True, default=16.218)
     h: float = eqx.field(static=True, default=-0.59826)
     gamma: float = eqx.field(static=True, default=1.0)
+    # R, D: middle and half width of the taper, length
     R: float = eqx.field(static=True, default=2.85)
     D: float = eqx.field(static=True, default=0.15)
     name: str = eqx.field(static=True, kw_only=True, default="tersoff")

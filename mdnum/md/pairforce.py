@@ -394,18 +394,12 @@ class PairDynamics(eqx.Module):
 
     For replays (one run handed the decisions of another) and for gradients at fixed decisions. A rollout
     does the same in its compiled epochs, where the decisions are the list's own.
-
-    Attributes:
-        force: the pair force.
-        integrator: between force evaluations.
-        masses: in the order of the tables, shape (atoms,).
-        tables: the list.
     """
 
-    force: PairForce
-    integrator: Integrator
-    masses: Float[Array, "atoms"]
-    tables: Tables
+    force: PairForce  # the pair force
+    integrator: Integrator  # between force evaluations
+    masses: Float[Array, "atoms"]  # in the order of the tables, shape (atoms,)
+    tables: Tables  # the list
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
         """Threshold minus quantity of every slot, positive inside; -inf for padding."""

@@ -50,16 +50,11 @@ class PairPotential(eqx.Module):
 
 
 class LennardJones(PairPotential):
-    """4 epsilon ((sigma/r)^12 - (sigma/r)^6).
-
-    Attributes:
-        sigma: length, shape (types,).
-        epsilon: energy, shape (types,).
-    """
+    """4 epsilon ((sigma/r)^12 - (sigma/r)^6)."""
 
     name = "lennard-jones"
-    sigma: Float[Array, "types"]
-    epsilon: Float[Array, "types"]
+    sigma: Float[Array, "types"]  # length, shape (types,)
+    epsilon: Float[Array, "types"]  # energy, shape (types,)
 
     def evaluate(self, r2):
         inverse = 1 / r2

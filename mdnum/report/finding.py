@@ -14,6 +14,13 @@ Code decides (code, values); a text file beside the verb has the sentences, by c
     [sentences]
     lists = "No pair was lost in {lists:# list}."
 
+    [plots.lengths]                                          # words and scales of a `section.Plot`
+    title = "Steps per list"
+    x_label = "step"
+    y_label = "steps per list"
+    y_scale = "log"
+    caption = "How many steps each list served."
+
 A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3 significant
 digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}` "2 pairs"
 (`{n:# life lives}` with an irregular plural,
@@ -32,6 +39,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mdnum.plain import plain
 from mdnum.report import words
+from mdnum.report.section import Plot, Series
 
 if TYPE_CHECKING:
     from mdnum.store import RunFolder
@@ -137,6 +145,19 @@ class Texts:
     def __call__(self, name: str, /, **values: Any) -> str:
         """A sentence of the table [sentences], its fields filled in."""
         return fill(self.entries["sentences"][name], values)
+
+    def plot(
+        self,
+        name: str,
+        series: Iterable[Series],
+        verticals: Iterable[tuple[float, str]] = (),
+        horizontals: Iterable[tuple[float, str]] = (),
+        **values: Any,
+    ) -> Plot:
+        """The figure of a name in the table [plots], the fields of its words filled in."""
+        told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
+        marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
+        return Plot(name, series=tuple(series), **marks, **told)
 
 
 def _plain(value: Any) -> Any:

@@ -28,40 +28,25 @@ from mdnum.systems.build import Simulation
 
 
 class Back(NamedTuple):
-    """Where a rollout stands on its way back, in the user's order of atoms.
+    """Where a rollout stands on its way back, in the user's order of atoms."""
 
-    Attributes:
-        step: the step whose forces come next; -1 when all are done.
-        x: wrapped positions at that step, shape (3, atoms).
-        v: velocities after its first half kick; in the end, those of the start.
-        images: lattice vectors taken off by wrapping so far, shape (3, atoms).
-        bath: what friction had forgotten by then; None without a thermostat.
-    """
-
-    step: Int[Array, ""]
-    x: Float[Array, "3 atoms"]
-    v: Float[Array, "3 atoms"]
-    images: Int[Array, "3 atoms"]
-    bath: Int[Array, "3 atoms"] | None
+    step: Int[Array, ""]  # the step whose forces come next; -1 when all are done
+    x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
+    v: Float[Array, "3 atoms"]  # velocities after its first half kick; in the end, those of the start
+    images: Int[Array, "3 atoms"]  # lattice vectors taken off by wrapping so far, shape (3, atoms)
+    bath: Int[Array, "3 atoms"] | None  # what friction had forgotten by then; None without a thermostat
 
 
 class Stretched(NamedTuple):
-    """Rows that were filled on the way back, earlier steps first, in the order of a list's atoms.
+    """Rows that were filled on the way back, earlier steps first, in the order of a list's atoms."""
 
-    Attributes:
-        first: step of the first row. rows: how many there are; the record's other rows are void.
-        record: as an epoch's, without kinetic energy, heat and displacement.
-        table: the list.
-        x_before: positions of the step before the first row, shape (3, atoms); at the start, its own.
-        back: where the way back goes on.
-    """
-
-    first: int
-    rows: int
-    record: EpochRecord
-    table: PairTable
+    first: int  # step of the first row
+    rows: int  # how many there are; the record's other rows are void
+    record: EpochRecord  # as an epoch's, without kinetic energy, heat and displacement
+    table: PairTable  # the list
+    # positions of the step before the first row, shape (3, atoms); at the start, its own
     x_before: np.ndarray
-    back: Back
+    back: Back  # where the way back goes on
 
 
 @partial(jax.jit, static_argnames=("structure",))

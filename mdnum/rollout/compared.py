@@ -16,18 +16,12 @@ from mdnum.md.neighbors import PairTable
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """A run seen from the labels and axes of another.
+    """A run seen from the labels and axes of another."""
 
-    Attributes:
-        labels: atom b of this run is atom labels[b] of the other, shape (atoms,).
-        axes: axis a of the other run is axis axes[a] of this one, shape (3,).
-        signs: and with this sign, shape (3,).
-        shift: this run's positions are those of the other, turned, plus this, length, shape (3,).
-    """
-
-    labels: Int[np.ndarray, "atoms"]
-    axes: Int[np.ndarray, "3"]
-    signs: Float[np.ndarray, "3"]
+    labels: Int[np.ndarray, "atoms"]  # atom b of this run is atom labels[b] of the other, shape (atoms,)
+    axes: Int[np.ndarray, "3"]  # axis a of the other run is axis axes[a] of this one, shape (3,)
+    signs: Float[np.ndarray, "3"]  # and with this sign, shape (3,)
+    # this run's positions are those of the other, turned, plus this, length, shape (3,)
     shift: Float[np.ndarray, "3"]
 
     @classmethod
@@ -82,40 +76,27 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair that the two runs decide differently from this step on, or no longer.
+    """A pair that the two runs decide differently from this step on, or no longer."""
 
-    Attributes:
-        step: of the flip.
-        i, j: the pair, labels of the first run, i < j.
-        differs: whether the decisions differ now.
-        run: which run flipped at this step: "A" or "B".
-        entered: whether the pair entered its cutoff there.
-        margin, bound: of that run's decision, in the quantity's space.
-    """
-
-    step: int
+    step: int  # of the flip
+    # i, j: the pair, labels of the first run, i < j
     i: int
     j: int
-    differs: bool
-    run: str
-    entered: bool
+    differs: bool  # whether the decisions differ now
+    run: str  # which run flipped at this step: "A" or "B"
+    entered: bool  # whether the pair entered its cutoff there
+    # margin, bound: of that run's decision, in the quantity's space
     margin: float
     bound: float
 
 
 class PairFlips(NamedTuple):
-    """Flips of one run, in the labels of the first run, a column each.
+    """Flips of one run, in the labels of the first run, a column each."""
 
-    Attributes:
-        step: of the flip.
-        key: i * atoms + j of the pair, i < j.
-        entered: whether it entered its cutoff.
-        margin, bound: of the decision, in the quantity's space.
-    """
-
-    step: Int[np.ndarray, "flips"]
-    key: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
+    step: Int[np.ndarray, "flips"]  # of the flip
+    key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
+    entered: Bool[np.ndarray, "flips"]  # whether it entered its cutoff
+    # margin, bound: of the decision, in the quantity's space
     margin: Float[np.ndarray, "flips"]
     bound: Float[np.ndarray, "flips"]
 
@@ -134,19 +115,12 @@ class PairFlips(NamedTuple):
 
 @dataclass(frozen=True)
 class CrossFlips(Sequence[CrossFlip]):
-    """Cross-run flips in order; objects are made only of those that are looked at: there may be millions.
+    """Cross-run flips in order; objects are made only of those that are looked at: there may be millions."""
 
-    Attributes:
-        flips: of either run.
-        from_b: which of them are the second run's.
-        differs: whether the decisions differ from then on.
-        atoms: number of atoms.
-    """
-
-    flips: PairFlips
-    from_b: Bool[np.ndarray, "flips"]
-    differs: Bool[np.ndarray, "flips"]
-    atoms: int
+    flips: PairFlips  # of either run
+    from_b: Bool[np.ndarray, "flips"]  # which of them are the second run's
+    differs: Bool[np.ndarray, "flips"]  # whether the decisions differ from then on
+    atoms: int  # number of atoms
 
     def __len__(self) -> int:
         return len(self.differs)

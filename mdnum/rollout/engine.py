@@ -46,50 +46,33 @@ FAILURES = ("blow-up", "runaway")
 
 @dataclass(frozen=True)
 class Segment:
-    """What one stretch of steps with one list left behind, on the host.
+    """What one stretch of steps with one list left behind, on the host."""
 
-    Attributes:
-        first: step of the first row.
-        rows: number of rows.
-        record: one row per step (on the device; valid until the next segment but one is asked for).
-        changes: of the record, without most of the room behind them.
-        before: decisions of this list at the step before `first`, shape (words, atoms).
-        table: the list.
-        epoch: number of the list's life.
-        built: step at which the list was built.
-        opens: whether this is the first segment of its epoch.
-        closes: why the epoch ended with it: "displacement", "interval", "end", None, or
-            what went wrong: "blow-up" (the last row is not finite), "runaway" (what follows it is wild).
-        due: the list must not be used for the step after the last row.
-        moved: largest displacement since the list was built, at that step, length.
-        state: where the rollout goes on.
-        home: wrapped positions at which the list was built, shape (3, atoms).
-        start: where the rollout stood before.
-        inside, leap: of `EpochOutcome`: decisions of `before` that are yes, and the longest way of an atom
-            from there to the first row, length.
-        held: decisions at the last row that was made, shape (words, atoms); None with rows.
-        again: the record with rows, made anew where it was made without.
-    """
-
-    first: int
-    rows: int
-    record: EpochRecord
-    changes: Changes | None
+    first: int  # step of the first row
+    rows: int  # number of rows
+    record: EpochRecord  # one row per step (on the device; valid until the next segment but one is asked for)
+    changes: Changes | None  # of the record, without most of the room behind them
+    # decisions of this list at the step before `first`, shape (words, atoms)
     before: UInt8[Array | np.ndarray, "words atoms"] | None
-    table: PairTable
-    epoch: int
-    built: int
-    opens: bool
+    table: PairTable  # the list
+    epoch: int  # number of the list's life
+    built: int  # step at which the list was built
+    opens: bool  # whether this is the first segment of its epoch
+    # why the epoch ended with it: "displacement", "interval", "end", None, or what went wrong: "blow-up" (the
+    # last row is not finite), "runaway" (what follows it is wild)
     closes: str | None
-    due: bool
-    moved: float
-    state: EpochState
-    home: Float[Array, "3 atoms"]
-    start: EpochState
+    due: bool  # the list must not be used for the step after the last row
+    moved: float  # largest displacement since the list was built, at that step, length
+    state: EpochState  # where the rollout goes on
+    home: Float[Array, "3 atoms"]  # wrapped positions at which the list was built, shape (3, atoms)
+    start: EpochState  # where the rollout stood before
+    # inside, leap: of `EpochOutcome`: decisions of `before` that are yes, and the longest way of an atom from
+    # there to the first row, length
     inside: Int[Array, ""]
     leap: Float[Array, ""]
+    # decisions at the last row that was made, shape (words, atoms); None with rows
     held: UInt8[Array, "words atoms"] | None
-    again: Callable[[], EpochRecord]
+    again: Callable[[], EpochRecord]  # the record with rows, made anew where it was made without
 
     @property
     def last(self) -> int:
@@ -120,21 +103,13 @@ class Segment:
 
 @dataclass(frozen=True)
 class Start:
-    """Where an engine begins: the start of a rollout, or a checkpoint of one.
+    """Where an engine begins: the start of a rollout, or a checkpoint of one."""
 
-    Attributes:
-        state: the state to go on from.
-        home: wrapped positions at which the list in use was built, shape (3, atoms).
-        built: step at which it was built.
-        epoch: number of its life.
-        slots: its capacity; 0 lets the density decide.
-    """
-
-    state: EpochState
-    home: Float[Array, "3 atoms"]
-    built: int = 0
-    epoch: int = 0
-    slots: int = 0
+    state: EpochState  # the state to go on from
+    home: Float[Array, "3 atoms"]  # wrapped positions at which the list in use was built, shape (3, atoms)
+    built: int = 0  # step at which it was built
+    epoch: int = 0  # number of its life
+    slots: int = 0  # its capacity; 0 lets the density decide
 
     @property
     def reference(self) -> Float[np.ndarray, "atoms 3"]:

@@ -23,21 +23,16 @@ from mdnum.md.pairforce import Forces
 
 @dataclass(frozen=True)
 class Pin:
-    """What a run is told about one pair.
+    """What a run is told about one pair."""
 
-    Attributes:
-        i, j: the pair, i < j.
-        first, last: steps at which it is told.
-        changes: steps at which what it is told changes, ascending.
-        inside: what it is told before the first of them.
-    """
-
+    # i, j: the pair, i < j
     i: int
     j: int
+    # first, last: steps at which it is told
     first: int
     last: int
-    changes: tuple[int, ...] = ()
-    inside: bool = False
+    changes: tuple[int, ...] = ()  # steps at which what it is told changes, ascending
+    inside: bool = False  # what it is told before the first of them
 
     def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
         """What it is told at given steps."""
@@ -86,110 +81,77 @@ class Pins:
 
 
 class EpochProgram(eqx.Module):
-    """Everything about a rollout that stays the same from epoch to epoch.
+    """Everything about a rollout that stays the same from epoch to epoch."""
 
-    Attributes:
-        force: PairForce or ManyBodyForce: forces and decisions over a list.
-        integrator: between force evaluations.
-        cell: the box, float64.
-        masses: shape (atoms,), in the user's order.
-        half_skin: half the skin, length.
-        every, delay: when the list may be rebuilt (RebuildRule).
-        check: whether a rebuild needs an atom to have moved by half the skin.
-        record: whether decisions leave the loop.
-        rows: whether they do so row by row, with positions; else as changes from one row to the next.
-        most: changes of one row that there is room for, without rows.
-    """
-
-    force: eqx.Module
-    integrator: Integrator
-    cell: Cell
-    masses: Float[Array, "atoms"]
-    half_skin: Float[Array, ""]
+    force: eqx.Module  # PairForce or ManyBodyForce: forces and decisions over a list
+    integrator: Integrator  # between force evaluations
+    cell: Cell  # the box, float64
+    masses: Float[Array, "atoms"]  # shape (atoms,), in the user's order
+    half_skin: Float[Array, ""]  # half the skin, length
+    # every, delay: when the list may be rebuilt (RebuildRule)
     every: int = eqx.field(static=True)
     delay: int = eqx.field(static=True)
-    check: bool = eqx.field(static=True)
-    record: bool = eqx.field(static=True)
+    check: bool = eqx.field(static=True)  # whether a rebuild needs an atom to have moved by half the skin
+    record: bool = eqx.field(static=True)  # whether decisions leave the loop
+    # whether they do so row by row, with positions; else as changes from one row to the next
     rows: bool = eqx.field(static=True, default=True)
-    most: int = eqx.field(static=True, default=0)
+    most: int = eqx.field(static=True, default=0)  # changes of one row that there is room for, without rows
 
 
 class EpochState(NamedTuple):
-    """Where a rollout stands between two force evaluations, in the user's order of atoms.
+    """Where a rollout stands between two force evaluations, in the user's order of atoms."""
 
-    Attributes:
-        step: the step whose forces come next.
-        x: wrapped positions at that step, shape (3, atoms).
-        v: velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms).
-        images: lattice vectors taken off by wrapping so far, shape (3, atoms).
-        x_before: positions of the step before, shape (3, atoms).
-        heat: energy taken up from the thermostat so far.
-        bath: what friction on a lattice has forgotten since it was last put aside, shape (3, atoms).
-    """
-
-    step: Int[Array, ""]
-    x: Float[Array, "3 atoms"]
+    step: Int[Array, ""]  # the step whose forces come next
+    x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
+    # velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms)
     v: Float[Array, "3 atoms"]
-    images: Int[Array, "3 atoms"]
-    x_before: Float[Array, "3 atoms"]
-    heat: Float[Array, ""]
+    images: Int[Array, "3 atoms"]  # lattice vectors taken off by wrapping so far, shape (3, atoms)
+    x_before: Float[Array, "3 atoms"]  # positions of the step before, shape (3, atoms)
+    heat: Float[Array, ""]  # energy taken up from the thermostat so far
+    # what friction on a lattice has forgotten since it was last put aside, shape (3, atoms)
     bath: Int[Array, "3 atoms"] | None = None
 
 
 class EpochRecord(NamedTuple):
-    """One row per step of an epoch, atoms in the order of its tables.
+    """One row per step of an epoch, atoms in the order of its tables."""
 
-    Attributes:
-        x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows.
-        images: shape (rows, 3, atoms), int32, or none.
-        bits: decisions, shape (rows, words, atoms), or none.
-        potential, kinetic, virial, heat: energies, shape (rows,).
-        nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,).
-        inside: how many decisions are yes, without rows; shape (rows,).
-        changes: of decisions from row to row, instead of rows.
-    """
-
+    # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]
     v: Float[Array, "rows 3 atoms"]
-    images: Int[Array, "rows 3 atoms"]
-    bits: UInt8[Array, "rows words atoms"]
+    images: Int[Array, "rows 3 atoms"]  # shape (rows, 3, atoms), int32, or none
+    bits: UInt8[Array, "rows words atoms"]  # decisions, shape (rows, words, atoms), or none
+    # potential, kinetic, virial, heat: energies, shape (rows,)
     potential: Float[Array, "rows"]
     kinetic: Float[Array, "rows"]
     virial: Float[Array, "rows"]
     heat: Float[Array, "rows"]
+    # nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,)
     nearest: Float[Array, "rows"]
     moved: Float[Array, "rows"]
-    inside: Float[Array, "rows"]
-    changes: Changes | None = None
+    inside: Float[Array, "rows"]  # how many decisions are yes, without rows; shape (rows,)
+    changes: Changes | None = None  # of decisions from row to row, instead of rows
 
 
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved", "inside")
 
 
 class EpochOutcome(NamedTuple):
-    """How an epoch's loop ended.
+    """How an epoch's loop ended."""
 
-    Attributes:
-        state: where to go on.
-        flags: four numbers that travel together: how many rows were recorded; whether the list must be
-            rebuilt before the next forces; whether every number so far was finite; and whether an atom has
-            just moved by more than a lattice vector in one step, so that forces there would mean nothing and
-            decisions would no longer be exact.
-        moved: largest displacement since the list was built, at the step that comes next, length.
-        before: decisions of the list at the step before, for the count check and the first flips of a new
-            list; where they were not asked for, those that were held. None without recording.
-        inside: how many of those are yes.
-        leap: how far an atom came at most from the step before to the first row, length.
-        held: decisions at the last row, None with rows.
-    """
-
-    state: EpochState
+    state: EpochState  # where to go on
+    # four numbers that travel together: how many rows were recorded; whether the list must be rebuilt before
+    # the next forces; whether every number so far was finite; and whether an atom has just moved by more than
+    # a lattice vector in one step, so that forces there would mean nothing and decisions would no longer be
+    # exact
     flags: Int[Array, "4"]
+    # largest displacement since the list was built, at the step that comes next, length
     moved: Float[Array, ""]
+    # decisions of the list at the step before, for the count check and the first flips of a new list; where
+    # they were not asked for, those that were held. None without recording.
     before: UInt8[Array, "words atoms"] | None
-    inside: Int[Array, ""]
-    leap: Float[Array, ""]
-    held: UInt8[Array, "words atoms"] | None = None
+    inside: Int[Array, ""]  # how many of those are yes
+    leap: Float[Array, ""]  # how far an atom came at most from the step before to the first row, length
+    held: UInt8[Array, "words atoms"] | None = None  # decisions at the last row, None with rows
 
 
 def empty_record(

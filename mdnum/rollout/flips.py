@@ -130,17 +130,13 @@ def _noted(before, bits, index, x, v) -> Changes:
 
 
 class AmbiguousPairs(NamedTuple):
-    """Pair decisions that another legitimate rounding could have made otherwise, a row each.
+    """Pair decisions that another legitimate rounding could have made otherwise, a row each."""
 
-    Attributes:
-        step: of the decision.
-        i, j: the pair, i < j.
-        margin, bound: of the decision, and on the rounding error of its quantity; |margin| <= bound.
-    """
-
-    step: Int[np.ndarray, "rows"]
+    step: Int[np.ndarray, "rows"]  # of the decision
+    # i, j: the pair, i < j
     i: Int[np.ndarray, "rows"]
     j: Int[np.ndarray, "rows"]
+    # margin, bound: of the decision, and on the rounding error of its quantity; |margin| <= bound
     margin: Float[np.ndarray, "rows"]
     bound: Float[np.ndarray, "rows"]
 

@@ -36,16 +36,11 @@ def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation, where it begins, and how its atoms and axes are those that it is compared in.
+    """A simulation, where it begins, and how its atoms and axes are those that it is compared in."""
 
-    Attributes:
-        simulation: the system as objects.
-        begin: its start; None for the system's own.
-        frame: how its labels and axes are those of the other program; None where they are the same.
-    """
-
-    simulation: Simulation
-    begin: Start | None = None
+    simulation: Simulation  # the system as objects
+    begin: Start | None = None  # its start; None for the system's own
+    # how its labels and axes are those of the other program; None where they are the same
     frame: ReferenceFrame | None = None
 
     @property
@@ -305,19 +300,12 @@ _SHORT = {
 
 @dataclass(frozen=True)
 class Dial:
-    """One number of a system.
+    """One number of a system."""
 
-    Attributes:
-        key: its name, as system files have it where they do.
-        value: what the system says, in the units of its file.
-        turn: the simulation with another value, without compiling anew.
-        positive: whether only values above 0 make sense.
-    """
-
-    key: str
-    value: float
-    turn: Turn
-    positive: bool = True
+    key: str  # its name, as system files have it where they do
+    value: float  # what the system says, in the units of its file
+    turn: Turn  # the simulation with another value, without compiling anew
+    positive: bool = True  # whether only values above 0 make sense
 
 
 def dial(simulation: Simulation, key: str) -> Dial:

@@ -46,19 +46,12 @@ _FRAMES_APART = 25
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run left behind.
+    """What a run left behind."""
 
-    Attributes:
-        folder: the run folder.
-        summary: the content of summary.json.
-        simulation: the system as objects.
-        frames: first and last positions, shape (atoms, 3) each, wrapped, length.
-    """
-
-    folder: Path
-    summary: dict[str, Any]
-    simulation: Simulation
-    frames: tuple[np.ndarray, np.ndarray]
+    folder: Path  # the run folder
+    summary: dict[str, Any]  # the content of summary.json
+    simulation: Simulation  # the system as objects
+    frames: tuple[np.ndarray, np.ndarray]  # first and last positions, shape (atoms, 3) each, wrapped, length
 
 
 @dataclass

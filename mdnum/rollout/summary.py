@@ -253,23 +253,14 @@ _SHARE_OF_A_JUMP = 0.1
 
 @dataclass
 class EnergyBudget:
-    """Checks the ledger against an evaluation that shares no list with the run.
+    """Checks the ledger against an evaluation that shares no list with the run."""
 
-    Attributes:
-        simulation: the system as objects.
-        start: hard energy minus reference energy at step 0, or None before it was seen.
-        jumps: sum of the ledger's energy jumps so far.
-        residual: largest |deviation| found, energy.
-        step: the step it was found at.
-        checks: how many steps were checked.
-    """
-
-    simulation: Simulation
-    start: float | None = None
-    jumps: float = 0.0
-    residual: float = 0.0
-    step: int = 0
-    checks: int = 0
+    simulation: Simulation  # the system as objects
+    start: float | None = None  # hard energy minus reference energy at step 0, or None before it was seen
+    jumps: float = 0.0  # sum of the ledger's energy jumps so far
+    residual: float = 0.0  # largest |deviation| found, energy
+    step: int = 0  # the step it was found at
+    checks: int = 0  # how many steps were checked
 
     _fields = ("start", "jumps", "residual", "step", "checks")
 
@@ -365,24 +356,16 @@ class ListHealth:
 
     A list can only lose a pair once two atoms together have used up the skin. With a safe rebuild rule that
     never happens; where it does, every such step is audited against a fresh search.
-
-    Attributes:
-        simulation: the system as objects.
-        lost: keys of all pairs lost at any step so far.
-        lost_pair_steps: pairs missing, summed over steps.
-        first_lost_step: -1 while nothing was lost.
-        rebuilds: lists built after the first.
-        dangerous: rebuilds at the first step they were allowed at, in LAMMPS's meaning.
-        mismatches: rebuilds at which the new list found pairs that the old one had missed at its last step.
     """
 
-    simulation: Simulation
+    simulation: Simulation  # the system as objects
     current: Epoch | None = None
-    lost: set[int] = field(default_factory=set)
-    lost_pair_steps: int = 0
-    first_lost_step: int = -1
-    rebuilds: int = 0
-    dangerous: int = 0
+    lost: set[int] = field(default_factory=set)  # keys of all pairs lost at any step so far
+    lost_pair_steps: int = 0  # pairs missing, summed over steps
+    first_lost_step: int = -1  # -1 while nothing was lost
+    rebuilds: int = 0  # lists built after the first
+    dangerous: int = 0  # rebuilds at the first step they were allowed at, in LAMMPS's meaning
+    # rebuilds at which the new list found pairs that the old one had missed at its last step
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:

@@ -24,22 +24,16 @@ from mdnum.systems.build import Simulation
 
 @dataclass(frozen=True)
 class Rows:
-    """Some steps of one run, in the labels and the frame of the first run.
+    """Some steps of one run, in the labels and the frame of the first run."""
 
-    Attributes:
-        first: step of the first row.
-        x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64.
-        energy: total energy, shape (rows,).
-        failed: "blow-up", "runaway", or "" .
-        nearest: smallest |margin| of any listed pair, in the quantity's space, shape (rows,); None for a run
-            whose decisions are not its own.
-    """
-
-    first: int
+    first: int  # step of the first row
+    # x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64
     x: Float[np.ndarray, "rows 3 atoms"]
     v: Float[np.ndarray, "rows 3 atoms"]
-    energy: Float[np.ndarray, "rows"]
-    failed: str = ""
+    energy: Float[np.ndarray, "rows"]  # total energy, shape (rows,)
+    failed: str = ""  # "blow-up", "runaway", or ""
+    # smallest |margin| of any listed pair, in the quantity's space, shape (rows,); None for a run whose
+    # decisions are not its own
     nearest: Float[np.ndarray, "rows"] | None = None
 
     def __len__(self) -> int:
@@ -172,14 +166,10 @@ def rows_of(segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
 
 @dataclass(frozen=True)
 class Overridden:
-    """Decisions that a handed run would have made otherwise, at each step.
+    """Decisions that a handed run would have made otherwise, at each step."""
 
-    Attributes:
-        count: how many pairs, shape (rows,).
-        furthest: the largest distance of any of them from its cutoff, length, shape (rows,).
-    """
-
-    count: Int[np.ndarray, "rows"]
+    count: Int[np.ndarray, "rows"]  # how many pairs, shape (rows,)
+    # the largest distance of any of them from its cutoff, length, shape (rows,)
     furthest: Float[np.ndarray, "rows"]
 
     @classmethod

@@ -413,21 +413,16 @@ def _in_whole_numbers(simulation: Simulation) -> Simulation:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Energies and forces of one configuration.
+    """Energies and forces of one configuration."""
 
-    Attributes:
-        energy: total energy.
-        forces: shape (atoms, 3), energy/length.
-        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume, and
-            where it was not asked for.
-        energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
-        find_pairs: finds the pairs inside the (longest) cutoff, i < j, and their distances, once asked for.
-    """
-
-    energy: float
-    forces: Float[np.ndarray, "atoms 3"]
+    energy: float  # total energy
+    forces: Float[np.ndarray, "atoms 3"]  # shape (atoms, 3), energy/length
+    # dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume, and where it was
+    # not asked for
     stress: Float[np.ndarray, "3 3"]
+    # per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials
     energies: Float[np.ndarray, "atoms"]
+    # finds the pairs inside the (longest) cutoff, i < j, and their distances, once asked for
     find_pairs: Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
     @cached_property

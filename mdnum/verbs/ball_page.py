@@ -14,7 +14,7 @@ from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
-from mdnum.report.words import count, many, number
+from mdnum.report.words import count, number
 from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("ball.toml"))
@@ -146,11 +146,7 @@ def _heights(view: BallView) -> Iterator[Plot]:
     at = view.time(contacts["step"][entered])
     # on the floor, where they are decided
     marks = [Series("contact begins", at, np.zeros(len(at)), "points", "bad")] if len(at) else []
-    yield Plot(
-        "heights", "Heights against time", "time (s)", "height (m)", (*lines, *marks),
-        caption=f"Heights of {many(len(balls), 'ball')}; a mark on the floor for each contact that begins.",
-        horizontals=((0.0, "floor"),),
-    )  # fmt: skip
+    yield TEXTS.plot("heights", (*lines, *marks), horizontals=[(0.0, "floor")], balls=len(balls))
 
 
 def _nearest(view: BallView) -> Iterator[Plot]:
@@ -159,13 +155,8 @@ def _nearest(view: BallView) -> Iterator[Plot]:
     if not np.isfinite(margin).any():
         return
     doubtful = (series["ambiguous"] > 0, "a decision within rounding", "bad")
-    yield Plot(
-        "nearest", "Margin of the nearest contact decision", "time (s)", "|height| decided on (m)",
-        (Series("nearest height", series["time"], margin), *_groups(series["time"], margin, doubtful)),
-        y_scale="log",
-        caption="The height nearest to the floor that a step decided on: the nearer, the less it takes to "
-        "decide otherwise.",
-    )  # fmt: skip
+    nearest = Series("nearest height", series["time"], margin)
+    yield TEXTS.plot("nearest", (nearest, *_groups(series["time"], margin, doubtful)))
 
 
 def _solver_plot(view: BallView) -> Iterator[Plot]:
@@ -178,9 +169,8 @@ def _solver_plot(view: BallView) -> Iterator[Plot]:
         ((reason == "none") & (iterations > 0), "impacts", "second"),
     )  # fmt: skip
     what = "impacts" if view.located else "iterations"
-    title = f"{what.capitalize()} per step, by what ended them"
     if shown:
-        yield Plot("iterations", title, "time (s)", f"{what} per step", shown)
+        yield TEXTS.plot("iterations", shown, what=what, head=what.capitalize())
 
 
 def _stops(view: BallView) -> Iterator[Plot]:
@@ -190,14 +180,8 @@ def _stops(view: BallView) -> Iterator[Plot]:
         view.time(rows["step"]), rows["margin"].astype(float), (stopped, "stopped", "first"),
         (~stopped & ~capped, "continued", "second"), (~stopped & capped, "gave up", "bad"),
     )  # fmt: skip
-    if not shown:
-        return
-    yield Plot(
-        "stops", "Margins of stop decisions", "time (s)", "tolerance − residual", shown, y_scale="symlog",
-        caption="Above zero the residual was below its tolerance and the solver stopped, below zero it "
-        "continued. The scale is logarithmic to both sides of zero.",
-        horizontals=((0.0, "tolerance"),),
-    )  # fmt: skip
+    if shown:
+        yield TEXTS.plot("stops", shown, horizontals=[(0.0, "tolerance")])
 
 
 def _flips(view: BallView) -> Iterator[Plot]:
@@ -207,14 +191,8 @@ def _flips(view: BallView) -> Iterator[Plot]:
         view.time(contacts["step"]), ratio, (entered, "contact begins", "first"),
         (~entered, "contact ends", "second"),
     )  # fmt: skip
-    if not shown:
-        return
-    yield Plot(
-        "margins", "Margins of contact flips in units of rounding", "time (s)", "|margin| / rounding bound",
-        shown, y_scale="log", horizontals=((1.0, "below: decided by rounding"),),
-        caption="How far from the floor the height was when a contact began or ended, over the bound on its "
-        "rounding error.",
-    )  # fmt: skip
+    if shown:
+        yield TEXTS.plot("margins", shown, horizontals=[(1.0, "below: decided by rounding")])
 
 
 def _gradient(view: BallView) -> Iterator[Any]:
@@ -224,8 +202,7 @@ def _gradient(view: BallView) -> Iterator[Any]:
         return
     known = exact.get("gradient") or {}
     yield Figure(
-        "gradient", "A panel for each parameter; the line is the closed form's derivative where it is known. "
-        "An open circle: the loss does not depend on the parameter.",
+        "gradient", TEXTS("gradient_caption"),
         "; ".join(f"dloss/d{name} by {one['method']}: {number(one['gradient'].get(name))}"
                   for name in names for one in view.applied),
         lambda figure: _dots(view, figure), 0.5 + (0.55 + 0.25 * len(view.applied)) * len(names),
@@ -309,11 +286,7 @@ def _variants(view: BallView) -> Iterator[Any]:
             lines.append(Series(name, x, y, "line", roles[n % len(roles)], n >= len(roles)))
         forks = [(float(view.time(np.array(one["fork"]))), f"{one['name']} forks")
                  for one in variants if one["fork"] is not None]  # fmt: skip
-        yield Plot(
-            "separation", "Separation of the variants", "time (s)", "largest |difference| of heights (m)",
-            tuple(lines), y_scale="log", verticals=tuple(forks),
-            caption="Largest difference of heights between the run and each variant.",
-        )  # fmt: skip
+        yield TEXTS.plot("separation", lines, verticals=forks)
     slopes = list(variants[0]["gradient"])
 
     def slope(name: str) -> Callable[[Mapping[str, Any]], str]:

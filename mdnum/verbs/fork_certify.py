@@ -11,7 +11,7 @@ import numpy as np
 from mdnum.plain import plain
 from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curves, pairs, table_of
+from mdnum.report.section import Figure, Key, Page, Section, Series, curves, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
@@ -224,11 +224,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
         lambda canvas: _bars(s, canvas), 0.8 + 0.34 * len(rows),
     )  # fmt: skip
     series = _drawn(view.table("policy_separations"), {row["name"]: row["name"] for row in rows})
-    plots = [Plot(
-        "separations", "Separation of real runs from the exact one", "step",
-        f"largest distance from the exact place ({unit})", series, y_scale="log",
-        caption=TEXTS("separations_caption"),
-    )] * bool(series)  # fmt: skip
+    plots = [TEXTS.plot("separations", series, unit=unit)] * bool(series)
     what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), view.took]
     return view.page(f"{view.name}: precisions", TEXTS("certify_about"), keys, [
         Section("Ranking", [ranking, *_gains(s, roles)], terminal=True),
@@ -383,11 +379,7 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     longest = {max(names, key=lambda name: np.count_nonzero(table["variant"] == name)): "; ".join(names)
                for names in s["clusters"][1:]}  # fmt: skip
     series = _drawn(table, longest)
-    plots = [Plot(
-        "separations", "Separation of programs from the reference", "step",
-        f"largest distance from the reference ({length})", series, y_scale="log",
-        caption=TEXTS("programs_caption"),
-    )] * bool(series)  # fmt: skip
+    plots = [TEXTS.plot("programs", series, unit=length)] * bool(series)
     return view.page(f"{view.name}: programs", TEXTS("programs_about"), keys, [
         Section("Programs", [*s["causes"], programs], terminal=True),
         Section("Separation from the reference", plots),

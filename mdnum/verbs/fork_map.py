@@ -111,7 +111,8 @@ def fork_map(
                 "loss": found.loss, "energy": found.energy,
             },
             "boundaries": [{name: edge[name] for name in edge if name not in said} for edge in edges],
-            "intervals": intervals,
+            # a loss that is not finite is a number of the table, and none of the summary
+            "intervals": [vars(one) for one in found.intervals],
         }  # fmt: skip
     return answer.outcome
 
@@ -284,8 +285,7 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
             _with_unit("jump of the loss", s["loss_unit"]): jump,
             f"separation of the final states ({view.units.length})": separation,
         }, "points")  # fmt: skip
-        yield Plot("jumps", "What changes at each boundary", label, "across the boundary", series,
-                   y_scale="log", caption=TEXTS("jumps_caption"))  # fmt: skip
+        yield TEXTS.plot("jumps", series, number=label)
 
 
 def _with_unit(text: str, unit: str) -> str:
@@ -389,11 +389,7 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
         with np.errstate(divide="ignore", over="ignore"):
             limit = positive(s["linear"] / table["furthest"])
         series += (Series("too large for a forecast above", table["step"], limit, role="muted"),)
-        plots.append(Plot(
-            "reach", "Displacement of the start that flips a decision", "step",
-            f"displacement of the start ({length})", series, y_scale="log",
-            horizontals=((float(s["size"]), "asked for"),), caption=TEXTS("reach_caption"),
-        ))  # fmt: skip
+        plots = [TEXTS.plot("reach", series, horizontals=[(float(s["size"]), "asked for")], unit=length)]
     return view.page(f"{view.name}: forecast", TEXTS("forecast_about"), keys, [
         Section("Displacements that flip a decision", plots),
         Section("Decisions", [table_of(s[name], columns, title) for name, title in titles.items() if s[name]],

@@ -124,10 +124,9 @@ def _separation(view: View) -> Iterator[Plot]:
         line = np.exp(fit["intercept"] + fit["rate"] * at)
         series.append(Series("growth, fitted", at, line, role="ink", dashed=True))
     what = "largest difference of heights" if "balls" in s else "largest distance of an atom from itself"
-    yield Plot(
-        "separation", "Separation of the two runs", f"step (of {plain(s['timestep'])} {view.units.time})",
-        f"{what} ({view.units.length})", tuple(series), y_scale="log", verticals=verticals,
-        horizontals=((float(s["tolerance"]), "split tolerance"),),
+    yield TEXTS.plot(
+        "separation", series, verticals, [(float(s["tolerance"]), "split tolerance")], what=what,
+        timestep=s["timestep"], time=view.units.time, length=view.units.length,
         caption=TEXTS("separation_caption" if _has(table, "imposed") else "separation_caption_free"),
     )  # fmt: skip
 
@@ -183,11 +182,8 @@ def _around(view: View) -> Iterator[Any]:
             if touching.any():
                 label = f"{name} in contact"
                 series.append(Series(label, step[touching], height[touching], mark="points", role=role))
-        yield Plot(
-            "around", f"Ball {table['ball'][0]} around the fork", "step", "height (m)", tuple(series),
-            verticals=((float(d["step"]), "fork"),), horizontals=((0.0, "floor"),),
-            caption=TEXTS("around_caption"),
-        )  # fmt: skip
+        ball = int(table["ball"][0])
+        yield TEXTS.plot("around", series, [(float(d["step"]), "fork")], [(0.0, "floor")], ball=ball)
     elif len(atoms := view.table("neighborhood")["atom"]) > 1:
         pair = f"{atoms[0]}–{atoms[1]}"
         alt = f"{many(len(atoms) - 2, 'atom')} around the pair {pair} in A and in B, projected."
@@ -338,10 +334,7 @@ def _certain(view: View) -> Iterator[Any]:
             Series("nearest pair of A to its cutoff", table["step"], nearest, mark="points", role="muted"),
             Series("twice the separation of A and B", table["step"], moved, role="first"),
         )
-        yield Plot(
-            "protection", "Nearest decision and separation", "step", f"length ({view.units.length})", series,
-            y_scale="log", verticals=verticals, caption=TEXTS("protection_caption"),
-        )  # fmt: skip
+        yield TEXTS.plot("protection", series, verticals, unit=view.units.length)
 
 
 def _growth(view: View) -> Iterator[Any]:
@@ -370,26 +363,19 @@ def _after(view: View) -> Iterator[Plot]:
     """What differs at each step: decisions, those that were overridden, energies."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
-    named = [
-        ("cross", "Decisions that the two runs make differently", "decisions that differ"),
-        ("overridden", "Decisions overridden in the run under A’s decisions", "decisions overridden"),
-        ("furthest", "Distance of overridden pairs from their cutoff", f"furthest from it ({length})"),
-    ]
-    for name, title, label in named[: 2 if "balls" in s else 3]:
+    named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]
+    named += [("furthest", f"furthest from it ({length})")] * ("balls" not in s)
+    for name, label in named:
         if _has(table, name):
             values, far = positive(table[name]), name == "furthest"
-            log = far or np.nanmax(values) > 30
-            yield Plot(
-                name, title, "step", label, (Series(label, step, values, mark="points"),),
-                y_scale="log" if log else "linear", verticals=dates, caption=TEXTS(f"{name}_caption"),
-                horizontals=((float(s["tolerance"]), "split tolerance"),) * far,
-            )  # fmt: skip
+            scale = "log" if far or np.nanmax(values) > 30 else "linear"
+            limit = [(float(s["tolerance"]), "split tolerance")] * far
+            series = [Series(label, step, values, mark="points")]
+            yield TEXTS.plot(name, series, dates, limit, label=label, scale=scale)
     off = {"B, free": table["energy_b"], "B under A’s decisions": table["energy_imposed"]}
     lines = curves(step, {label: np.abs(energy - table["energy_a"]) for label, energy in off.items()})
     if lines:
-        yield Plot("energy", "Difference of total energies", "step",
-                   f"|energy − energy of A| ({view.units.energy})", lines, y_scale="log", verticals=dates,
-                   caption=TEXTS("energy_caption"))  # fmt: skip
+        yield TEXTS.plot("energy", lines, dates, unit=view.units.energy)
 
 
 def _flips(view: View) -> Iterator[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import ROLES, Code, Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
+from mdnum.report.section import ROLES, Code, Key, Page, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import MINUS, count, heading, many, number, percent, power
 
 if TYPE_CHECKING:
@@ -244,11 +244,8 @@ def _horizons(view: View) -> Iterator[Any]:
     # of no steps at all there is no derivative
     series = curves(horizon[1:], {name: values[1:] for name, values in lines.items()})
     if series:
-        label = f"|parameter × derivative| ({unit})" if unit else "|parameter × derivative|"
-        yield Plot(
-            "growth", f"The gradient of {summary['loss']['word']} against the horizon", "horizon (steps)",
-            label, series, y_scale="log", caption=TEXTS("caption_growth"), verticals=verticals,
-        )  # fmt: skip
+        in_unit = f" ({unit})" if unit else ""
+        yield TEXTS.plot("growth", series, verticals, loss=summary["loss"]["word"], in_unit=in_unit)
     if np.any(size > 0):
         series = [Series("by all positions and velocities", horizon, size)]
         rate = growth["rate"]
@@ -258,11 +255,7 @@ def _horizons(view: View) -> Iterator[Any]:
             shown = np.where(fitted >= size[size > 0].min(), fitted, np.nan)
             text = f"a factor e in {number(1 / rate)} steps"
             series.append(Series(text, horizon, shown, role="bad", dashed=True))
-        yield Plot(
-            "state", "The gradient by the state against the horizon", "horizon (steps)",
-            f"norm ({unit or '1'}/{view.units.length})", tuple(series), y_scale="log",
-            caption=TEXTS("caption_state"), verticals=verticals,
-        )  # fmt: skip
+        yield TEXTS.plot("state", series, verticals, unit=f"{unit or '1'}/{view.units.length}")
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
@@ -304,11 +297,7 @@ def _trust(view: View) -> Iterator[Any]:
         if f"{key}.{one['name']}" in table
     )  # fmt: skip
     if series:
-        yield Plot(
-            "trust", "What other roundings, time steps and starts make of the gradient", "horizon (steps)",
-            "relative difference", series, y_scale="log", caption=TEXTS("caption_trust"),
-            verticals=tuple(_limits(view)), horizontals=((trust["tolerance"], "tolerance"),),
-        )  # fmt: skip
+        yield TEXTS.plot("trust", series, _limits(view), [(trust["tolerance"], "tolerance")])
 
 
 def _flips(view: View) -> Iterator[Any]:
@@ -337,17 +326,10 @@ def _flips(view: View) -> Iterator[Any]:
     if added:
         order = np.argsort(table["step"], kind="stable")
         running = {name: np.cumsum(values[order]) for name, values in added.items()}
-        yield Plot(
-            "running", "What the flips up to a step add", "step", "sum of contributions / |derivative|",
-            curves(table["step"][order], running, log=False), caption=TEXTS("caption_running"),
-            horizontals=((0.0, ""),),
-        )  # fmt: skip
+        series = curves(table["step"][order], running, log=False)
+        yield TEXTS.plot("running", series, horizontals=[(0.0, "")])
         ranked = {name: np.sort(np.abs(values))[::-1] for name, values in added.items()}
-        yield Plot(
-            "ranked", "Contributions of single flips, the largest first", "rank",
-            "|contribution| / |derivative|", curves(np.arange(1, len(order) + 1), ranked), x_scale="log",
-            y_scale="log", caption=TEXTS("caption_ranked"),
-        )  # fmt: skip
+        yield TEXTS.plot("ranked", curves(np.arange(1, len(order) + 1), ranked))
     yield TEXTS("by_weight", shown=min(found["flips"], TABLE_ROWS), flips=found["flips"])
     yield _browse({name: values[:TABLE_ROWS] for name, values in table.items()})
 
@@ -383,11 +365,7 @@ def _spectrum(view: View) -> Iterator[Any]:
     yield TEXTS("spectrum", factor=factor, exponent=found["exponents_time"][0], unit=unit, **found)
     curve = np.array(found["curve"], float)
     lines = {f"direction {k + 1}": curve[:, k] for k in range(curve.shape[1])}
-    yield Plot(
-        "spectrum", "How far the directions that stretch most have stretched", "step",
-        "logarithm of the stretch", curves(np.array(found["horizon"]), lines, log=False),
-        caption=TEXTS("caption_spectrum"),
-    )  # fmt: skip
+    yield TEXTS.plot("spectrum", curves(np.array(found["horizon"]), lines, log=False))
     rows = zip(found["log_singular"], found["exponents_time"], found["residual"], strict=True)
     columns = ("", "logarithm of the singular value", f"exponent per {unit}", "residual")
     yield Table(columns, [[k, *row] for k, row in enumerate(rows, 1)])
@@ -422,10 +400,7 @@ def _scaling(view: View) -> Iterator[Any]:
     if any(lost.values()):
         values = (table["overflow"] + table["underflow"]).astype(float)
         series += (Series(f"lost in {found['format']}", table["horizon"], values, role="bad"),)
-    yield Plot(
-        "scaling", f"Numbers of the reverse pass, compared with {found['format']}", "horizon (steps)",
-        "magnitude; count", series, y_scale="log", caption=TEXTS("caption_scaling"),
-    )  # fmt: skip
+    yield TEXTS.plot("scaling", series, format=found["format"])
 
 
 def _left_out(view: View) -> Iterator[Any]:

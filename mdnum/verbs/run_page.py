@@ -336,14 +336,9 @@ def _margins(run: RunView) -> Iterator[Any]:
     even = expected * np.diff(10.0**edges)
     shown = (even >= 0.5) & (even <= 2 * counts.max())
     centers = 10.0 ** ((edges[1:] + edges[:-1]) / 2)
-    yield Plot(
-        "margins", "Margins of flips in units of rounding", "|margin| / rounding bound",
-        "flips per quarter decade", (
-            Series("flips", 10.0**edges, positive(np.append(counts, counts[-1])), "steps"),
-            Series("spread evenly", centers[shown], even[shown], role="muted", dashed=True),
-        ), x_scale="log", y_scale="log", verticals=((1.0, "below: decided by rounding"),),
-        caption=TEXTS("margins_caption"),
-    )  # fmt: skip
+    seen = Series("flips", 10.0**edges, positive(np.append(counts, counts[-1])), "steps")
+    evenly = Series("spread evenly", centers[shown], even[shown], role="muted", dashed=True)
+    yield TEXTS.plot("margins", (seen, evenly), verticals=[(1.0, "below: decided by rounding")])
     closest, median = float(ratio.min()), float(np.median(ratio))
     yield TEXTS("margins", closest=closest, median=median, expected=expected)
 
@@ -361,11 +356,7 @@ def _chatter(run: RunView) -> Iterator[Any]:
             # per step of width: bins of a few steps would otherwise look fuller than they are
             values = np.histogram(steps, edges, weights=lengths)[0] / np.diff(edges)
             lines[f"stays {name}"] = np.append(values, values[-1])
-        yield Plot(
-            "residence", "Steps between two flips of a pair", "steps between two flips of a pair",
-            "stays per step of length", curves(edges, lines, "steps"), x_scale="log", y_scale="log",
-            caption=TEXTS("residence_caption"),
-        )  # fmt: skip
+        yield TEXTS.plot("residence", curves(edges, lines, "steps"))
     undone = stays.undone_within(CHATTER_STEPS)
     yield TEXTS(
         "chatter", undone=undone, share=undone / run.flips.total, within=CHATTER_STEPS,
@@ -388,15 +379,10 @@ def _lists(run: RunView) -> Iterator[Any]:
     # of no skin nothing can be used up
     skin = np.where(np.isfinite(epochs["skin_consumed"]), epochs["skin_consumed"], np.nan).astype(float)
     bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
-    for name, values, label in (
-        ("lists", skin, "skin consumed"), ("lengths", epochs["length"].astype(float), "steps per list"),
-    ):  # fmt: skip
+    for name, values in (("lists", skin), ("lengths", epochs["length"].astype(float))):
         marked = Series("dangerous, or pairs lost", step[bad], values[bad], "points", "bad")
-        yield Plot(
-            name, f"{label.capitalize()}, by neighbor list", "step at which the list was built", label,
-            (Series("lists", step, values, "points"), *[marked] * bool(bad.any())),
-            horizontals=((1.0, "skin used up"),) * (name == "lists"), caption=TEXTS(f"{name}_caption"),
-        )  # fmt: skip
+        series = (Series("lists", step, values, "points"), *[marked] * bool(bad.any()))
+        yield TEXTS.plot(name, series, horizontals=[(1.0, "skin used up")] * (name == "lists"))
     # the last list was cut off by the end of the run: its length says nothing
     whole = epochs["reason"] != "end"
     lengths = epochs["length"][whole] if whole.any() else epochs["length"]

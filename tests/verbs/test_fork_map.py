@@ -132,6 +132,15 @@ def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
     assert judged(folder, summary, low=0.9, high=1.1, failed_runs=0).tone == "good"
 
 
+def test_a_map_of_runs_that_all_blow_up_is_written(tmp_path):
+    """Its one interval has no loss at either end, which a table holds as no number."""
+    found = mdnum.fork_map("argon/crystal-108", "sigma", 3.4, 3.41, steps=40, cells=2, out=tmp_path / "map")
+    assert found.summary["failed_runs"] == found.summary["evaluations"] > 0
+    assert found.verdict.findings[0].code == "RUNS_FAILED"
+    pieces = RunFolder.open(tmp_path / "map").read("intervals")
+    assert np.isnan(pieces["loss_low"]).all() and np.isnan(pieces["loss_high"]).all()
+
+
 @pytest.mark.slow
 def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     path = meeting().write(tmp_path / "system")

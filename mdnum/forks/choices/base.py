@@ -32,20 +32,15 @@ class Choice:
     outside gives its own a `family`, decorates it with `choice(None)` and names it by an entry point of the
     group "mdnum.choices". Its fields but `both` are what is written after "=", with ":" between them, and
     `both`, where there is one, is what is written after "@". The first line of its docstring describes it.
-
-    Attributes:
-        family: the word before "=".
-        worlds: "md" and "ball", or one of them.
-        screened: words of the choices that are screened when all are asked for, of each world where they are
-            not the same; the family's own where there are none.
-        shown: whether arguments are a part of the name where they are the defaults.
-        must_hold: whether it cannot change a bit of the trajectory by design, so that a fork is a finding.
     """
 
-    family: ClassVar[str] = ""
-    worlds: ClassVar[tuple[str, ...]] = ("md", "ball")
+    family: ClassVar[str] = ""  # the word before "="
+    worlds: ClassVar[tuple[str, ...]] = ("md", "ball")  # "md" and "ball", or one of them
+    # words of the choices that are screened when all are asked for, of each world where they are not the
+    # same; the family's own where there are none
     screened: ClassVar[str | Mapping[str, str]] = ""
-    shown: ClassVar[bool] = False
+    shown: ClassVar[bool] = False  # whether arguments are a part of the name where they are the defaults
+    # whether it cannot change a bit of the trajectory by design, so that a fork is a finding
     must_hold: bool = False
 
     @classmethod

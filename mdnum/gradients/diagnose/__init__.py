@@ -80,18 +80,12 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All methods that apply, at one horizon.
+    """All methods that apply, at one horizon."""
 
-    Attributes:
-        horizon: steps.
-        reference: name of the method that the others are compared with.
-        opinions: one for each method asked for.
-        comparisons: of every method that gave a gradient with the reference, by parameter.
-    """
-
-    horizon: int
-    reference: str
-    opinions: tuple[Opinion, ...]
+    horizon: int  # steps
+    reference: str  # name of the method that the others are compared with
+    opinions: tuple[Opinion, ...]  # one for each method asked for
+    # of every method that gave a gradient with the reference, by parameter
     comparisons: tuple[GradientDifference, ...]
 
     def gradient(self, method: str) -> Gradient | None:

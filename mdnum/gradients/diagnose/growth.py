@@ -52,28 +52,23 @@ _RANGE = 30.0
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """How the gradient grows with the horizon, from one reverse pass.
+    """How the gradient grows with the horizon, from one reverse pass."""
 
-    Attributes:
-        table: a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`,
-            `step`, `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size`
-            (norm of both, with velocities measured by `clock`), `speed` (rms of the atoms), and
-            `gradient.<name>`: the derivative by each parameter, were it changed over the last `horizon` steps
-            alone (its norm by the start); the last row is the gradient of the whole run.
-        clock: internal time that turns velocities into lengths. timestep, time: in units of the file.
-        rate, error: growth of log(size) per step and its standard error. time: for a factor of e.
-        gain: largest size over the first that is not 0; 1 where all are.
-        word: one of WORDS.
-    """
-
+    # a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`, `step`,
+    # `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size` (norm of both,
+    # with velocities measured by `clock`), `speed` (rms of the atoms), and `gradient.<name>`: the derivative
+    # by each parameter, were it changed over the last `horizon` steps alone (its norm by the start); the last
+    # row is the gradient of the whole run
     table: dict[str, np.ndarray]
-    clock: float
+    clock: float  # internal time that turns velocities into lengths
+    # timestep, time: in units of the file
     timestep: float
+    # rate, error: growth of log(size) per step and its standard error
     rate: float
     error: float
-    time: float
-    gain: float
-    word: str
+    time: float  # for a factor of e
+    gain: float  # largest size over the first that is not 0; 1 where all are
+    word: str  # one of WORDS
 
 
 class GrowthWatch:

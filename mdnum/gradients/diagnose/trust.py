@@ -222,33 +222,22 @@ class Limit:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far a gradient can be trusted.
+    """How far a gradient can be trusted."""
 
-    Attributes:
-        verdict: "trusted" where every limit was examined and none was met, "limited" where one was met, else
-            "undecided".
-        horizon: the shortest of the limits that were examined, steps. limited_by: which it is; else empty.
-        limits: all of them. unknown: what was not examined and is needed.
-        tolerance: relative difference above which two precisions, or two time steps, disagree.
-        table: by `horizon`, for each parameter the relative difference of two precisions (`relative.`), of
-            the time step and its half (`step.`), and standard error over the mean (`error.`), where examined.
-        half: the gradient at half the time step, by parameter.
-        digits: digits that half the time step and another rounding leave, by parameter.
-        turns: pairs that turned around near their cutoff, where that was examined. columns: the numbers
-            whose terms these have.
-    """
-
+    # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
-    horizon: int
-    limited_by: str
-    limits: tuple[Limit, ...]
-    unknown: tuple[str, ...]
-    tolerance: float
+    horizon: int  # the shortest of the limits that were examined, steps
+    limited_by: str  # which it is; else empty
+    limits: tuple[Limit, ...]  # all of them
+    unknown: tuple[str, ...]  # what was not examined and is needed
+    tolerance: float  # relative difference above which two precisions, or two time steps, disagree
+    # by `horizon`, for each parameter the relative difference of two precisions (`relative.`), of the time
+    # step and its half (`step.`), and standard error over the mean (`error.`), where examined
     table: dict[str, np.ndarray]
-    half: dict[str, Float[np.ndarray, "entries"]]
-    digits: dict[str, int]
-    turns: Turns | None
-    columns: tuple[str, ...]
+    half: dict[str, Float[np.ndarray, "entries"]]  # the gradient at half the time step, by parameter
+    digits: dict[str, int]  # digits that half the time step and another rounding leave, by parameter
+    turns: Turns | None  # pairs that turned around near their cutoff, where that was examined
+    columns: tuple[str, ...]  # the numbers whose terms these have
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
