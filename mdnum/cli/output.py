@@ -248,11 +248,17 @@ def console(width: int = _PIPE_WIDTH) -> Console:
 
 
 def print_prose(text: str, indent: int = 2, style: str = "") -> None:
-    """A paragraph, in lines that can be read."""
-    from rich.padding import Padding
+    """A paragraph, in lines that can be read; a word that is longer than a line stays whole."""
+    from textwrap import fill
+
     from rich.text import Text
 
-    console(_PROSE_WIDTH).print(Padding(Text(text, style=style), (0, 0, 0, indent), expand=False))
+    out, space = console(_PROSE_WIDTH), " " * indent
+    lines = fill(
+        text, out.width, initial_indent=space, subsequent_indent=space, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+    out.print(Text(lines, style=style), soft_wrap=True)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -300,7 +306,7 @@ def print_findings(findings: Iterable[Finding]) -> None:
     for finding in findings:
         line = Text(finding.severity, style=_STYLE.get(finding.severity, ""))
         line.append(f": {finding.title}", style="bold")
-        console(_PROSE_WIDTH).print(line)
+        console().print(line)
         for text in filter(None, (finding.text, finding.remedy)):
             print_prose(text)
 
