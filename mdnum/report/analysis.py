@@ -228,23 +228,30 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
 class Conservation:
     """How well a run keeps what it should conserve, over its second half."""
 
-    fluctuation: float  # standard deviation of the conserved energy over that of the kinetic energy
+    fluctuation: float  # standard deviation of the conserved energy over that of what moves
     drift: float  # of the conserved energy over the whole run, energy
     drift_error: float  # its standard error
 
     @classmethod
     def of(
-        cls, conserved: Float[np.ndarray, "rows"], kinetic: Float[np.ndarray, "rows"]
+        cls,
+        conserved: Float[np.ndarray, "rows"],
+        kinetic: Float[np.ndarray, "rows"],
+        least: float,
     ) -> Conservation | None:
-        """From one value of each a step; None of too few, or where the kinetic energy does not change.
+        """From one value of each a step; None of too few, or where nothing moves.
 
         A line is taken off before the fluctuation is: a drift is another matter. The first half is left out,
         since a run that starts from a lattice turns half of its kinetic energy into potential energy.
+
+        Args:
+            conserved: what should not change. kinetic: the kinetic energy.
+            least: what moves counts as at least so much; atoms that fly freely keep their kinetic energy.
         """
         rows = len(conserved)
         if rows < _LEAST_ROWS or not np.isfinite(conserved).all():
             return None
-        half, moving = conserved[rows // 2 :], float(np.std(kinetic[rows // 2 :]))
+        half, moving = conserved[rows // 2 :], max(least, float(np.std(kinetic[rows // 2 :])))
         if not moving > 0:
             return None
         at = np.arange(len(half))

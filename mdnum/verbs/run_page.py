@@ -120,8 +120,11 @@ class RunView(View):
         energy over the run and `drift_error`, its standard error, in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
-        found = analysis.Conservation.of(self.budget["residual"], self.series["kinetic"])
-        thermal = self.thermal * (self.summary.get("atoms") or 0)
+        atoms = self.summary.get("atoms") or 0
+        thermal = self.thermal * atoms
+        # atoms in harmonic wells have 0.87 sqrt(N) k_B T (those that fly freely have none in an isolated run)
+        least = thermal / (2 * np.sqrt(atoms)) if atoms else 0.0
+        found = analysis.Conservation.of(self.budget["residual"], self.series["kinetic"], least)
         drift = error = None
         if found is not None and thermal > 0:
             drift, error = found.drift / thermal, found.drift_error / thermal
