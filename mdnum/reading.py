@@ -13,6 +13,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,9 +67,13 @@ _PATIENCE = 10_000
 class FrameError(InputError):
     """A frame holds what cannot be right; it has this number in its file, from 0."""
 
-    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
+    def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
         self.frame = frame
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # to be sent from one process to another
+        return partial(type(self), frame=self.frame, remedy=self.remedy, where=self.where), (self.message,)
 
 
 class EarlierFramesError(FrameError):

@@ -159,6 +159,15 @@ class Texts:
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
 
+    def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
+        """Names and texts of a table, their fields filled in; without those that show a value of None."""
+        found = []
+        for name, text in self.entries[table].items():
+            fields = [field for _, field, _, _ in string.Formatter().parse(f"{name} {text}") if field]
+            if all(values[field] is not None for field in fields):
+                found.append((fill(name, values), fill(text, values)))
+        return found
+
 
 def _plain(value: Any) -> Any:
     # infinite numbers are written as such in a sentence

@@ -38,25 +38,15 @@ from mdnum.trajectories.trajectory import SAMPLE
 
 @dataclass(frozen=True)
 class RuleResult:
-    """What one membership rule gave.
-
-    Attributes:
-        rule: the rule.
-        flips: a row per decision that differs from the frame before.
-        pairs: pairs inside, per frame.
-        near: pairs whose margin is within the bound, per frame: the file cannot tell them.
-        min_margin: smallest |margin|, per frame, length.
-        initial: the pairs inside at the first frame.
-        last: and at the last.
-    """
+    """What one membership rule gave."""
 
     rule: Rule
-    flips: FlipTable
-    pairs: Int[np.ndarray, "frames"]
-    near: Int[np.ndarray, "frames"]
-    min_margin: Float[np.ndarray, "frames"]
-    initial: Members
-    last: Members
+    flips: FlipTable  # a row per decision that differs from the frame before
+    pairs: Int[np.ndarray, "frames"]  # inside, per frame
+    near: Int[np.ndarray, "frames"]  # pairs whose margin is within the bound: the file cannot tell them
+    min_margin: Float[np.ndarray, "frames"]  # smallest |margin|, per frame, length
+    initial: Members  # the pairs inside at the first frame
+    last: Members  # and at the last
 
     @property
     def ambiguous(self) -> float:
@@ -87,15 +77,6 @@ class _ProcessPart:
     def end(self, last: Members) -> None:
         """After its last frame; one table is sent to the parent faster than many."""
         self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
-
-
-@dataclass(frozen=True)
-class _Failure:
-    """Why a part ended before its last frame: whether reading failed, or what was read was wrong."""
-
-    frame: int
-    message: str
-    read: bool
 
 
 @dataclass
@@ -181,17 +162,14 @@ class NeighborFlips(AnalysisBase):
         seen = atoms_of((self._first, self._second))
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
-            raise InputError(
-                f"bound = {bound!r}; expected a length of 0 or more, Å",
-                remedy="Leave it out for what the resolution of the file gives",
-            )
+            message = f"bound = {bound!r}; expected a length of 0 or more, Å"
+            raise InputError(message, remedy="Leave it out for what the resolution of the file gives")
         self._bound = bound
         self._resolution: Resolution | None = None
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
         self._library: LibraryFrames | None = None
-        self._done = 0
         self._to_the_end = False
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
@@ -204,16 +182,9 @@ class NeighborFlips(AnalysisBase):
             FrameError: likewise, a frame that holds what cannot be right.
         """
         super().run(*args, **kwargs)
-        failure = self.results.failure
-        if failure is not None:
-            kind = UnreadableFrame if failure.read else FrameError
-            where = getattr(self._trajectory, "filename", None)
-            raise kind(
-                failure.message,
-                frame=failure.frame,
-                where=str(where) if where is not None else "the trajectory",
-                remedy=f"The results of the {len(self.frames):,} frames before it are kept",
-            )
+        if (failure := self.results.failure) is not None:
+            remedy = f"The results of the {len(self.frames):,} frames before it are kept"
+            raise type(failure)(failure.message, frame=failure.frame, where=self._where, remedy=remedy)
         return self
 
     def _configure_backend(self, backend: Any, *args: Any, **kwargs: Any) -> Any:
@@ -240,10 +211,8 @@ class NeighborFlips(AnalysisBase):
         back = np.flatnonzero(np.diff(self._numbers) <= 0)
         if back.size:
             after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
-            raise InputError(
-                f"the frames go backward or stand still: frame {after} after frame {before}",
-                remedy="Give them in ascending order: flips follow time",
-            )
+            message = f"the frames go backward or stand still: frame {after} after frame {before}"
+            raise InputError(message, remedy="Give them in ascending order: flips follow time")
         sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
             try:
@@ -282,17 +251,13 @@ class NeighborFlips(AnalysisBase):
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
-        self._done = 0
         # what it knows of earlier frames is of another part, or of another run
         self._check.collective = Collective()
-        self.results, failure = Results(failures=[None]), None
+        self.results = Results(failures=[None])
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
-            failure = _Failure(error.frame, error.message, isinstance(error, UnreadableFrame))
-        if failure is not None:
-            self.results.failures, done = [failure], max(self._done, 0)
-            self.frames, self.times = self.frames[:done], self.times[:done]
+            self.results.failures = [error.with_traceback(None)]
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.end(tracker.members())
         # what a process sends back is what it found, not what it needed for that; an open file cannot be sent
@@ -309,11 +274,9 @@ class NeighborFlips(AnalysisBase):
         self.results.bounds, self.results.digests = [[]], [[]]
         if self._at:
             # the frame before the first of this part
-            self._done = -1
             self._examined(self.library.timestep(int(self._numbers[self._at - 1])))
             for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
                 part.first = tracker.members()
-            self._done = 0
 
     def _single_frame(self) -> None:
         bound, found = self._examined(self._ts)
@@ -324,20 +287,14 @@ class NeighborFlips(AnalysisBase):
             part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
         self.results.digests[0].append(self._digest)
-        self._done += 1
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
-        try:
-            # a margin among the nearest is the difference of two distances
-            return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
-        except InputError as error:
-            raise FrameError(
-                f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
-            ) from error
+        # a margin among the nearest is the difference of two distances
+        return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
 
     def _bound_of(self, frame: Frame) -> float:
         """How far a distance in the frame that was just read can be off, length."""
@@ -361,9 +318,8 @@ class NeighborFlips(AnalysisBase):
         kept = failed[0] + 1 if failed else len(failures)
         done = sum(len(one) for one in results.bounds[:kept])
         self.frames, self.times = self.frames[:done], self.times[:done]
-        found = [
-            _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
-        ]
+        parts = results.parts[:kept]
+        found = [_joined(rule, [part[k] for part in parts]) for k, rule in enumerate(self.rules)]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
         repeats = RepeatedFrames()
         for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):
@@ -377,11 +333,16 @@ class NeighborFlips(AnalysisBase):
             for name, value in vars(found[0]).items():
                 results[name] = value
 
-    def _behind_the_last(self) -> _Failure | None:
+    @property
+    def _where(self) -> str:
+        return str(getattr(self._trajectory, "filename", None) or "the trajectory")
+
+    def _behind_the_last(self) -> FrameError | None:
         """A frame behind the last one that the library has, which it leaves out."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
-        count = int(self._trajectory.n_frames)
-        return None if rest is None else _Failure(count, f"frame {count} cannot be read ({rest})", True)
+        count, where = int(self._trajectory.n_frames), self._where
+        said = f"frame {count} cannot be read ({rest})"
+        return None if rest is None else UnreadableFrame(said, frame=count, where=where)
 
 
 def _changed(before: Frame, after: Frame) -> float:
@@ -406,10 +367,8 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
-            raise InputError(
-                f"two processes found other pairs at the frame between them (number {done - 1} of all)",
-                remedy="The file was changed while it was read; run again",
-            )
+            message = f"two processes found other pairs at the frame between them (number {done - 1} of all)"
+            raise InputError(message, remedy="The file was changed while it was read; run again")
         for table in part.flips:
             # a part after the first has counted the frame before its own too
             table.frame[:] += done - (done > 0)
@@ -471,7 +430,5 @@ def _cutoff(value: Any) -> Rule:
             return SpeciesCutoffs({pair: length(one) for pair, one in value.items()})
         return CutoffRule(length(value))
     except (TypeError, ValueError):
-        raise InputError(
-            f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species",
-            remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them',
-        ) from None
+        message = f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species"
+        raise InputError(message, remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them') from None

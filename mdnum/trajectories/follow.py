@@ -89,10 +89,6 @@ def _usable(
             if not found.frames or isinstance(error, EarlierFramesError):
                 raise
             found.stopped = error
-            if not hasattr(error, "frame"):
-                # a rule that refuses a frame does not know its number
-                message = f"frame {found.frames} of those examined: {error.message}"
-                found.stopped = InputError(message, remedy=error.remedy, where=error.where)
             return
         yield frames, stepped
     if not found.frames:
@@ -156,8 +152,8 @@ class Pass:
     frames: int = 0  # examined
     stopped: InputError | None = None  # what was wrong with the frame after the last one
     flights: list[FreeFlight] = field(default_factory=list)  # from one to the next of the first frames
-    # (number of the frame, atom, how far) of what no atom does between two frames
-    leaps: list[tuple[int, int, float]] = field(default_factory=list)
+    # number of the frame, atom and distance of what no atom does between two frames
+    leaps: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def odd(self) -> dict[str, Any] | None:
@@ -200,7 +196,7 @@ def follow(
             ):
                 found.flights.append(flight)
             if (far := leap(last, frame, atoms)) is not None:
-                found.leaps.append((frame.index, *far))
+                found.leaps.append({"frame": frame.index, "atom": far[0], "distance": far[1]})
         last = frame
         for number, (one, new) in enumerate(zip(found.rules, stepped, strict=True)):
             _hand_on(sink, number, one, new, frame, found.frames, (trajectory.atoms, groups))
@@ -530,9 +526,8 @@ def _sets_at(
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Rates at which the separation grows before the sets differ, and from then on."""
-    limit = 0.1 * (
-        one.rule.radius if isinstance(one.rule, CutoffRule) else float(table["furthest"].max(initial=0.0))
-    )
+    cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
+    limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]
     # up to its bound a separation may be made of rounding
     length = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
@@ -540,8 +535,6 @@ def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -
     seed = int(np.flatnonzero(length > 0)[0]) if length.any() else 0
     # what differs in the first frame began to before the file did
     began = float(time[0] if seed else 2 * time[0] - time[-1]), float(time[seed])
-    parts = {}
-    for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
-        law = growth(time[part], length[part], limit, began)
-        parts[name] = None if law is None else vars(law)
-    return parts
+    parts = {"before": slice(None, cut + 1), "after": slice(cut, None)}
+    laws = {name: growth(time[part], length[part], limit, began) for name, part in parts.items()}
+    return {name: law and vars(law) for name, law in laws.items()}

@@ -125,11 +125,10 @@ class FrameCheck:
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels
-        failed = "The simulation or the writing of it failed from the first frame on"
-        if frame.index:
-            failed = (
-                f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
-            )
+        failed = (
+            f"there; stop before that frame (@:{frame.index})" if frame.index else "from the first frame on"
+        )
+        failed = f"The simulation or the writing of it failed {failed}"
 
         def place(atom: int) -> str:
             return f"atom {atom} is at ({', '.join(f'{value:g}' for value in frame.positions[atom])})"
@@ -150,10 +149,8 @@ class FrameCheck:
                 self.retyped = self.retyped or (frame.index, int(others[0]))
         if (frame.box.pbc != pbc).any():
             what = f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}"
-            yield (
-                what,
-                "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
-            )
+            remedy = "Leave out the frames that differ with @START:STOP: distances in the two do not compare"
+            yield what, remedy
         x = frame.positions if atoms is None else frame.positions[atoms]
         for axis in frame.box.broken:
             vector = frame.box.matrix[axis].tolist()

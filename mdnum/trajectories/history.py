@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -78,10 +77,8 @@ class History:
         rows[1:] = np.cumsum(np.bincount(pairs[flip], minlength=len(heads))) if count else 0
         source = order[flip] - starts
         i, j, rank = (column[heads] for column in columns)
-        frame, entered, ambiguous = (
-            np.asarray(flips[name])[source] for name in ("frame", "entered", "ambiguous")
-        )
-        return cls(i, j, rank, inside, rows, frame, entered, ambiguous, frames)
+        told = {name: np.asarray(flips[name])[source] for name in ("frame", "entered", "ambiguous")}
+        return cls(i, j, rank, inside, rows, frames=frames, **told)
 
     def __len__(self) -> int:
         return len(self.i)
@@ -142,34 +139,21 @@ def contacts(history: History) -> Contacts:
     Raises:
         ValueError: flips of a pair do not enter and leave in turn: one is missing.
     """
-    room = int(np.count_nonzero(history.inside)) + int(np.count_nonzero(history.entered))
-    of, begin, end = np.empty((3, room), np.int64)
-    if not _stays(
-        history.inside, history.rows, history.frame, history.entered, history.frames, of, begin, end
-    ):
+    pair, inside, entered = history.pair, history.inside, history.entered
+    odd = (np.arange(len(pair)) - history.rows[pair]) % 2 == 1
+    if (entered == inside[pair] ^ odd).any():
         raise ValueError("flips are missing: a pair enters while inside, or leaves while outside")
+    # a stay begins where a pair enters or at the first frame, and ends where it leaves or behind the last
+    first, last = np.flatnonzero(inside), np.flatnonzero(inside ^ (history.flips % 2 == 1))
+    of, leaver = np.concatenate([first, pair[entered]]), np.concatenate([pair[~entered], last])
+    begin = np.concatenate([np.zeros(len(first), np.int64), history.frame[entered]])
+    end = np.concatenate([history.frame[~entered], np.full(len(last), history.frames)])
+    order = np.argsort(of, kind="stable")
+    of, begin, end = of[order], begin[order], end[np.argsort(leaver, kind="stable")]
     # flips are of frames after the first
-    ids, began = (history.i[of], history.j[of], history.rank[of]), begin > 0
-    return Contacts(*ids, begin, end, began, end < history.frames)
-
-
-@numba.njit(cache=True, nogil=True)
-def _stays(inside, rows, frame, entered, frames, of, begin, end):
-    """Write the pair, begin and end of each stay; whether every pair enters and leaves in turn."""
-    count = 0
-    for pair in range(inside.shape[0]):
-        here, since = inside[pair], 0
-        for at in range(rows[pair], rows[pair + 1]):
-            if entered[at] == here:
-                return False
-            if here:
-                of[count], begin[count], end[count] = pair, since, frame[at]
-                count += 1
-            here, since = not here, frame[at]
-        if here:
-            of[count], begin[count], end[count] = pair, since, frames
-            count += 1
-    return True
+    return Contacts(
+        history.i[of], history.j[of], history.rank[of], begin, end, begin > 0, end < history.frames
+    )
 
 
 def mended(stays: Contacts, gap: int) -> Contacts:
@@ -201,36 +185,21 @@ class Strides(Sums):
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
         """Counts them: of the flips of a pair between two frames that are kept, an odd one is left."""
-        counts = [
-            _thinned(history.rows, history.frame, history.ambiguous, history.frames, n) for n in strides
-        ]
-        kept, total, doubtful = np.array(counts, np.int64).reshape(-1, 3).T
-        return cls(np.array(strides, np.int64), kept, total, doubtful)
+        found = []
+        for stride in strides:
+            rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)
+            # the pair, and the next frame that is kept
+            pair, end = history.pair[rows], -(-history.frame[rows] // stride)
+            begin = np.flatnonzero(np.append(True, (np.diff(pair) != 0) | (np.diff(end) != 0))[: len(rows)])
+            out = np.diff(np.append(begin, len(rows))) // 2 * 2
+            unsure = np.add.reduceat(history.ambiguous[rows].astype(np.int64), begin)
+            found.append((len(rows) - out.sum(), len(rows), np.minimum(out, unsure).sum()))
+        return cls(np.array(strides, np.int64), *np.array(found, np.int64).reshape(-1, 3).T)
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
         """Share of the flips that are left at each stride; nan where there were none."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
-
-
-@numba.njit(cache=True, nogil=True)
-def _thinned(rows, frame, ambiguous, frames, stride):
-    """(flips left at a stride, all flips as far as it reaches, doubtful ones among those left out)."""
-    reach = (frames - 1) // stride * stride
-    total, out, doubtful = 0, 0, 0
-    for pair in range(rows.shape[0] - 1):
-        at = rows[pair]
-        while at < rows[pair + 1] and frame[at] <= reach:
-            # up to the next frame that is kept
-            end, first, unsure = -(-frame[at] // stride) * stride, at, 0
-            while at < rows[pair + 1] and frame[at] <= end:
-                unsure += ambiguous[at]
-                at += 1
-            left_out = (at - first) // 2 * 2
-            total += at - first
-            out += left_out
-            doubtful += min(left_out, unsure)
-    return total - out, total, doubtful
 
 
 def doublings(frames: int) -> list[int]:

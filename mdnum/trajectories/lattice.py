@@ -16,7 +16,6 @@ box repeats; then every atom of the bin is compared with all of them.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -78,22 +77,16 @@ def lattice_of(box: Box) -> ReducedLattice:
 
     pbc = np.asarray(box.pbc, bool)
     matrix = np.where(pbc[:, None], np.asarray(box.matrix, np.float64), 0.0)
-    for axis in np.flatnonzero(pbc):
-        if not np.isfinite(matrix[axis]).all() or not matrix[axis].any():
-            raise InputError(
-                f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}",
-                remedy="Give the frame a box, or say that this direction does not repeat",
-                where="box",
-            )
+    for axis in box.broken:
+        message = f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}"
+        remedy = "Give the frame a box, or say that this direction does not repeat"
+        raise InputError(message, remedy=remedy, where="box")
     combination, vectors = np.eye(3, dtype=np.int64), matrix
     if pbc.any():
         scaled = matrix[pbc] / np.linalg.norm(matrix[pbc], axis=1)[:, None]
         if not np.sqrt(max(np.linalg.det(scaled @ scaled.T), 0.0)) > _FLAT:
-            raise InputError(
-                f"the vectors of the box lie in one plane: {matrix[pbc].tolist()}",
-                remedy="Give the frame the box it was run in",
-                where="box",
-            )
+            message = f"the vectors of the box lie in one plane: {matrix[pbc].tolist()}"
+            raise InputError(message, remedy="Give the frame the box it was run in", where="box")
         if np.count_nonzero(matrix) > pbc.sum():
             # a box with right angles is reduced, and stays in its order
             # in the layout of the one above: of another, numba would compile every search a second time
@@ -121,18 +114,15 @@ def shortest(
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
     """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
-    span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)
-            for w, p in zip(lattice.widths, lattice.periodic, strict=True)]  # fmt: skip
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
-    found = []
-    for s in itertools.product(*span):
-        if s > (0, 0, 0):
-            d = s[0] * lattice.vectors[0] + s[1] * lattice.vectors[1] + s[2] * lattice.vectors[2]
-            square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-            if square <= radius * radius:
-                found.append(float(square))
-    return np.sort(np.array(found, np.float64))
+    vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
+    spans = np.meshgrid(*(np.arange(-n, n + 1) for n in most), indexing="ij")
+    # of each two opposite vectors the later one
+    x, y, z = (span.reshape(-1, 1)[span.size // 2 + 1 :] for span in spans)
+    d = x * vectors[0] + y * vectors[1] + z * vectors[2]
+    squares = d[:, 0] * d[:, 0] + d[:, 1] * d[:, 1] + d[:, 2] * d[:, 2]
+    return np.sort(squares[squares <= radius * radius])
 
 
 # inlined: a call that takes arrays costs more than what is done here
@@ -338,11 +328,8 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     bins, away, step = grid_for(lattice, reach + placed.rounding, atoms, extent)
     wrapped, home, bin_of = wrap(positions, lattice, bins, step)
     if (away // bins * lattice.periodic).max() >= MOST_IMAGES - 1:
-        raise InputError(
-            f"a box of widths {np.round(lattice.widths, 6).tolist()} for pairs within {reach:g}",
-            remedy="Check the unit of the cutoff, and the box",
-            where="cutoff",
-        )
+        message = f"a box of widths {np.round(lattice.widths, 6).tolist()} for pairs within {reach:g}"
+        raise InputError(message, remedy="Check the unit of the cutoff, and the box", where="cutoff")
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)
     centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)
@@ -489,8 +476,8 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 
 @numba.njit(cache=True, nogil=True)
-def meet(atoms, limits, first_bin, end_bin, found):
-    """Record the pairs of the centers in bins first_bin to end_bin - 1; returns how many of each kind.
+def meet(atoms, limits, found):
+    """Record the pairs of all centers; returns how many of each kind.
 
     Pairs of one set are met once: from a bin, half of the bins around are examined. Otherwise everything
     around each center is; two atoms that are on both sides are met twice and count once.
@@ -506,7 +493,7 @@ def meet(atoms, limits, first_bin, end_bin, found):
     near, squares, flags = np.empty((3, atoms.atoms)), np.empty(atoms.atoms), np.empty(atoms.atoms, np.uint8)
     atom, run = np.empty(atoms.atoms, np.int32), np.empty(atoms.atoms, np.int32)
     chosen, codes = np.empty(atoms.atoms, np.uint32), np.zeros(atoms.runs, np.int32)
-    for here in range(first_bin, end_bin):
+    for here in range(len(start) - 1):
         if center_start[here] == center_start[here + 1]:
             continue
         b0, b1, b2 = here // (bins[1] * bins[2]), here // bins[2] % bins[1], here % bins[2]
@@ -522,12 +509,8 @@ def meet(atoms, limits, first_bin, end_bin, found):
                     begin, more = start[low_bin], start[high_bin + 1] - start[low_bin]
                     if more == 0:
                         continue
-                    codes[runs] = (
-                        ((n0 * periodic[0] + 512) << 20)
-                        + ((n1 * periodic[1] + 512) << 10)
-                        + n2 * periodic[2]
-                        + 512
-                    )
+                    high_bits = ((n0 * periodic[0] + 512) << 20) + ((n1 * periodic[1] + 512) << 10)
+                    codes[runs] = high_bits + n2 * periodic[2] + 512
                     s0 = n0 * vectors[0, 0] + n1 * vectors[1, 0] + n2 * vectors[2, 0]
                     s1 = n0 * vectors[0, 1] + n1 * vectors[1, 1] + n2 * vectors[2, 1]
                     s2 = n0 * vectors[0, 2] + n1 * vectors[1, 2] + n2 * vectors[2, 2]
@@ -552,8 +535,8 @@ def meet(atoms, limits, first_bin, end_bin, found):
                 sj = species[j] if several else 0
                 if squares[k] > high[si, sj] or i == j or (twice and atoms.both[j] and j < i):
                     continue
-                if squares[k] < low[si, sj] and kind != DIRECTED:
-                    if kind == INSIDE and written < found.i.shape[0]:
+                if squares[k] < low[si, sj] and kind == INSIDE:
+                    if written < found.i.shape[0]:
                         found.i[written], found.j[written] = i, j
                     written += 1
                 else:

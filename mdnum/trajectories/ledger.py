@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from mdnum.bits import digit_order
-from mdnum.trajectories.search import Changed
 
 
 class Columns:
@@ -34,20 +31,15 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """The pairs inside at one frame, sorted by (i, j, rank), each once.
+    """The pairs inside at one frame, sorted by (i, j, rank), each once."""
 
-    Attributes:
-        i: first atom, an index into the file's atoms. Where a rule is symmetric, i <= j.
-        j: second atom; i == j for an atom and an image of itself.
-        rank: 0 for the nearest image of j, 1 for the next, and so on. A name for images that wrapping an
-            atom back into its box does not change.
-        distance: length.
-    """
-
-    i: Int[np.ndarray, "pairs"]
-    j: Int[np.ndarray, "pairs"]
+    i: Int[
+        np.ndarray, "pairs"
+    ]  # first atom, an index into the file's atoms; i <= j where a rule is symmetric
+    j: Int[np.ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
+    # 0 for the nearest image of j, 1 for the next, and so on, which wrapping an atom does not change
     rank: Int[np.ndarray, "pairs"]
-    distance: Float[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]  # length
 
     @classmethod
     def none(cls) -> Members:
@@ -58,88 +50,24 @@ class Members(Columns):
 
 @dataclass(frozen=True)
 class FlipTable(Columns):
-    """A row per decision that differs from the frame before, sorted by (frame, i, j, rank).
+    """A row per decision that differs from the frame before, sorted by (frame, i, j, rank)."""
 
-    Attributes:
-        frame: position among the frames looked at (not the number in the file); never 0.
-        i: first atom, as in `Members`.
-        j: second atom.
-        rank: image, as in `Members`.
-        entered: whether the pair is inside at `frame`.
-        distance: at `frame`, length.
-        before: distance at the frame before, length; nan where it is not known.
-        margin: signed distance to the threshold at `frame`, positive inside, length.
-        margin_before: the same at the frame before; nan where it is not known.
-        bound: how far a margin can be off through the file's resolution and rounding, length.
-        ambiguous: one of the two margins is within the bound: the file cannot tell that the flip happened.
-    """
-
-    frame: Int[np.ndarray, "flips"]
-    i: Int[np.ndarray, "flips"]
+    frame: Int[
+        np.ndarray, "flips"
+    ]  # position among the frames looked at, not the number in the file; never 0
+    i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
     j: Int[np.ndarray, "flips"]
     rank: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    distance: Float[np.ndarray, "flips"]
-    before: Float[np.ndarray, "flips"]
-    margin: Float[np.ndarray, "flips"]
-    margin_before: Float[np.ndarray, "flips"]
-    bound: Float[np.ndarray, "flips"]
-    ambiguous: Bool[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]  # whether the pair is inside at `frame`
+    distance: Float[np.ndarray, "flips"]  # at `frame`, length
+    before: Float[np.ndarray, "flips"]  # distance at the frame before, length; nan where it is not known
+    margin: Float[np.ndarray, "flips"]  # signed distance to the threshold at `frame`, positive inside, length
+    margin_before: Float[np.ndarray, "flips"]  # at the frame before; nan where it is not known
+    bound: Float[np.ndarray, "flips"]  # how far a margin can be off by resolution and rounding, length
+    ambiguous: Bool[np.ndarray, "flips"]  # one of the margins is within the bound: the file does not tell
 
     @classmethod
     def none(cls) -> FlipTable:
         """No row."""
         whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
         return cls(whole, whole, whole, whole, yes, real, real, real, real, real, yes)
-
-
-class Thresholds(NamedTuple):
-    """What distances are compared with at two frames."""
-
-    directed: bool  # whether they are those of an atom; else those of a pair of species
-    species: Int[np.ndarray, "atoms"]  # of each atom that takes part
-    radii: Float[np.ndarray, "species species"]  # by species, length
-    last_in: Float[np.ndarray, "limits"]  # of each atom, now, length; see `search.Chosen`
-    first_out: Float[np.ndarray, "limits"]
-    old_last_in: Float[np.ndarray, "old_limits"]  # of each atom, at the frame before, length
-    old_first_out: Float[np.ndarray, "old_limits"]
-
-
-class LedgerRows:
-    """Makes the rows of frame after frame; labels are the numbers in the file of the atoms that take part."""
-
-    def __init__(self, labels: Int[np.ndarray, "participants"], atoms: int):
-        self.labels, self.atoms = labels, atoms
-        # kept from frame to frame: pages that are new to a process can cost more than what is done in them
-        self._keys = np.empty((4, 0), np.int64)
-
-    def flips(
-        self,
-        frame: int,
-        changed: Changed,
-        distances: tuple[Float[np.ndarray, "flips"], Float[np.ndarray, "flips"]],
-        thresholds: Thresholds,
-        bound: float,
-    ) -> FlipTable:
-        """The rows of one frame from indices among the atoms that take part, and distances now and before."""
-        count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
-        if self._keys.shape[1] < count:
-            self._keys = np.empty((4, count + count // 8), np.int64)
-        i, j = self.labels[changed.i], self.labels[changed.j]
-        if not thresholds.directed:
-            i, j = np.minimum(i, j), np.maximum(i, j)
-        self._keys[0, :count] = (i * self.atoms + j) * ranks + changed.rank
-        order = digit_order(self._keys, count, self.atoms**2 * ranks)
-        distance, before = (one[order] for one in distances)
-        a, b, entered = changed.i[order], changed.j[order], changed.entered[order]
-        if thresholds.directed:
-            limit = np.where(entered, thresholds.last_in[a], thresholds.first_out[a])
-            old_limit = np.where(entered, thresholds.old_first_out[a], thresholds.old_last_in[a])
-        else:
-            limit = old_limit = thresholds.radii[thresholds.species[a], thresholds.species[b]]
-        margin, margin_before = limit - distance, old_limit - before
-        ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
-        return FlipTable(
-            np.full(count, frame), i[order], j[order], changed.rank[order], entered, distance, before,
-            margin, margin_before, np.full(count, bound), ambiguous,
-        )  # fmt: skip

@@ -8,8 +8,7 @@ a run that was killed leaves, is no file at all to them: it is read here (amberm
 
 from __future__ import annotations
 
-import bz2
-import gzip
+import math
 import struct
 import sys
 import warnings
@@ -49,7 +48,6 @@ _LINES = {"XYZ": "xyzfile", "TXYZ": "xyzfile", "ARC": "xyzfile", "TRJ": "trjfile
 _BEGINS = {"XYZ": "_offsets", "PDB": "_start_offsets", "ENT": "_start_offsets"}
 # enough of a file's end for some lines
 _LAST_BYTES = 20_000
-_COMPRESSED: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 _PART = 1 << 22
 
 
@@ -103,14 +101,9 @@ class LibraryFrames:
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
         """A frame from a timestep, copied; errors as of `timestep`."""
         with self._reading(number):
-            return Frame(
-                index=number,
-                time=float(number) if untimed else float(ts.time),
-                positions=np.array(ts.positions, np.float64),
-                box=self._box(ts, number),
-                velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
-                labels=self.labels(number),
-            )
+            time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
+            velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
+            return Frame(number, time, x, self._box(ts, number), velocities, self.labels(number))
 
     def _box(self, ts: Any, number: int) -> Box:
         if isinstance(self._guard, TrrFile) and not self._guard.has_box(number):
@@ -149,28 +142,26 @@ class MDAnalysisTrajectory(Trajectory):
     def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
         with reading(path):
-            self._universe, said = self._universe_of(format)
+            self.universe, said = self._universe_of(format)
             if topology is None:
-                self.table = AtomTable.of(self._universe.atoms)
-            self.table.give_elements(self._universe)
-            trajectory = self._universe.trajectory
+                self.table = AtomTable.of(self.universe.atoms)
+            self.table.give_elements(self.universe)
+            trajectory = self.universe.trajectory
             self.format, self._count = formats_of(trajectory)[0], int(trajectory.n_frames)
             self.length = _length_of(trajectory)
-            self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-            self._time_factor = _time_factor(trajectory)
+            # a frame may have its time without a step between frames
+            untimed = "time" not in trajectory.ts.data and any("no dt information" in one for one in said)
+            self.time = "frame" if untimed else "ps"
+            self._time_factor, self.swapped = _time_factors(trajectory)
             self._boxes = Boxes(trajectory)
             self.notes = (NARROWED, *self.table.notes, *self._boxes.notes)
 
-    @property
-    def universe(self) -> Any:
-        return self._universe
-
     def other_box(self, number: int) -> tuple[str, Box] | None:
         with reading(self.path, number):
-            return self._boxes.other(self._universe.trajectory[number], number)
+            return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
-        """A Universe of the trajectory, and the warnings that opening it gave."""
+        """A Universe of the trajectory, and the warnings that opening it and its time step gave."""
         import MDAnalysis
 
         path = self.path
@@ -185,15 +176,22 @@ class MDAnalysisTrajectory(Trajectory):
                 other = atoms_in(path, atoms, format)
                 check_claim(path, other or 0)
                 self._belongs(atoms, atoms if other is None else other)
-                _loaded(universe, path, format)
+                try:
+                    universe.load_new(str(path), format=format)
+                except ValueError as error:
+                    # an H5MD file may say nothing of its units
+                    if "convert_units" not in str(error):
+                        raise
+                    universe.load_new(str(path), format=format, convert_units=False)
             # a topology without coordinates has no trajectory at all
             if not len(getattr(universe, "trajectory", ())):
                 raise self._empty()
+            _ = universe.trajectory.dt
         return universe, [str(one.message) for one in caught]
 
     @contextmanager
     def _reader(self) -> Iterator[Callable[[int], Frame]]:
-        trajectory, at = self._universe.trajectory, None
+        trajectory, at = self.universe.trajectory, None
         with reading(self.path):
             frames = LibraryFrames(trajectory)
 
@@ -208,7 +206,7 @@ class MDAnalysisTrajectory(Trajectory):
         yield get
 
     def _behind(self) -> str | None:
-        return left_over(self._universe.trajectory)
+        return left_over(self.universe.trajectory)
 
     def _frame(self, number: int, raw: Frame) -> Frame:
         return raw
@@ -244,16 +242,6 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
     return of
 
 
-def _loaded(universe: Any, path: Path, format: str | None) -> None:
-    try:
-        universe.load_new(str(path), format=format)
-    except ValueError as error:
-        # an H5MD file may say nothing of its units
-        if "convert_units" not in str(error):
-            raise
-        universe.load_new(str(path), format=format, convert_units=False)
-
-
 def _length_of(trajectory: Any) -> str:
     """Unit of length in words; "" where the file has one of its own (GSD)."""
     unit = trajectory.units.get("length")
@@ -263,27 +251,17 @@ def _length_of(trajectory: Any) -> str:
     return "Å" if str(unit) in ("A", "Angstrom", "angstrom") else str(unit)
 
 
-def _time_factor(trajectory: Any) -> float:
-    """Times in a DCD file over MDAnalysis's, which takes the step in this machine's byte order."""
-    if "DCD" not in formats_of(trajectory):
-        return 1.0
+def _time_factors(trajectory: Any) -> tuple[float, float]:
+    """Times in a DCD file over MDAnalysis's, which has the step in this machine's byte order; `swapped`."""
+    read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
+    if not read:
+        return 1.0, math.nan
     with Path(trajectory.filename).open("rb") as file:
         head = file.read(88)
-    order = "<" if head[:1] == b"T" else ">"
     # without a version, it is X-PLOR's
-    (step,) = struct.unpack_from(order + ("f" if any(head[84:]) else "d"), head, 44)
-    read = trajectory._file.header["delta"]
-    return step / read if step and read else 1.0
-
-
-def _has_no_times(trajectory: Any, said: list[str]) -> bool:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        _ = trajectory.dt
-    # a frame may have its time without a step between frames
-    return "time" not in trajectory.ts.data and any(
-        "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
-    )
+    kind, orders = "f" if any(head[84:]) else "d", "<>" if head[:1] == b"T" else "><"
+    step, other = (struct.unpack_from(order + kind, head, 44)[0] for order in orders)
+    return (step / read, other / step) if step else (1.0, math.nan)
 
 
 # ---- behind the last frame
@@ -356,14 +334,14 @@ def _behind_text(file: Any) -> str | None:
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
     """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
-    if path.suffix not in _COMPRESSED:
-        size = path.stat().st_size
-        with path.open("rb") as raw:
-            raw.seek(max(size - _LAST_BYTES, 0))
-            return raw.read(), size
-    last, size = b"", 0
-    with _COMPRESSED[path.suffix](path, "rb") as packed:
-        while part := packed.read(_PART):
+    from MDAnalysis.lib.util import anyopen
+
+    packed = path.suffix in (".gz", ".bz2")
+    last, size = b"", 0 if packed else max(path.stat().st_size - _LAST_BYTES, 0)
+    opened_file: Any = anyopen(str(path), "rb")
+    with opened_file as file:
+        file.seek(size)
+        while part := file.read(_PART):
             last, size = (last + part)[-_LAST_BYTES:], size + len(part)
     return last, size
 
@@ -395,16 +373,15 @@ class NetcdfFile(netcdf_file):
         return int(vars(self)["_recsize"])
 
     @property
-    def records(self) -> int | None:
-        """How many there should be; None where the writer did not get to say."""
-        count = int(vars(self)["_recs"])
-        return None if count < 0 else count
+    def told(self) -> int:
+        """How many its head tells of; -1 where the writer did not get to say."""
+        return int(vars(self)["_recs"])
 
     @property
     def whole(self) -> int:
         """How many there are from beginning to end."""
         room = max(self._behind, 0) // self.record
-        return room if self.records is None else min(room, self.records)
+        return room if self.told < 0 else min(room, self.told)
 
     # what scipy reads
     _recs = whole
@@ -417,11 +394,6 @@ class NetcdfFile(netcdf_file):
     @property
     def _behind(self) -> int:
         return Path(self.filename).stat().st_size - self._begin
-
-    @property
-    def cut(self) -> bool:
-        """Whether the file ends before its head says."""
-        return self.records is not None and self.whole < self.records
 
 
 def netcdf_of(path: str | Path) -> NetcdfFile | None:
@@ -468,7 +440,7 @@ class NetcdfTrajectory(Trajectory):
 
     @property
     def _ends(self) -> str:
-        return f"the file ends in it, and its head tells of {self._file.records or 0:,} frames"
+        return f"the file ends in it, and its head tells of {max(self._file.told, 0):,} frames"
 
     def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
         box, velocities = Box(), raw.get("velocities")

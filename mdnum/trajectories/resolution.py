@@ -251,10 +251,7 @@ class GridEffect:
 
     missed: float  # share of the flips that happened between two frames and are not in the file at that frame
     invented: float  # share of the flips in the file that did not happen at that frame
-    ratio: float  # flips in the file over flips that happened
     move: float  # root mean square displacement of an atom between two frames, along an axis, length
-    lag: int  # frames between the two that it was read from
-    frames: int  # frames it was estimated from
 
 
 def grid_effect(
@@ -279,7 +276,7 @@ def grid_effect(
         draws: pairs drawn, or triples.
 
     Returns:
-        None where the frames cannot tell: fewer than two, nothing moves, or every coordinate is 0.
+        None where the frames cannot tell: fewer than two, nothing moves, every coordinate is 0, or no radius.
 
     Error: the atoms of a pair are taken to move independently and straight on, and pairs to be spread
         evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
@@ -287,14 +284,14 @@ def grid_effect(
         the 4 nearest to 0.02 and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Atoms bonded
         to one another move together, and less against each other than this takes them to.
     """
-    if len(sample) < 2 or not len(sample[0].positions):
+    if len(sample) < 2 or not len(sample[0].positions) or not radius > 0:
         return None
     steps = _steps(resolution, sample[0])
     size = float(np.abs(steps).max())
     if size == 0:
         # one atom at the origin: nothing says how it is rounded
         return None
-    moves, lag = _moves(sample, size)
+    moves = _moves(sample, size)
     everyone = np.arange(len(moves))
     one, other = moves[everyone if first is None else first], None
     other = one if second is None and first is not None else moves[everyone if second is None else second]
@@ -314,14 +311,8 @@ def grid_effect(
     both = int((happened & seen & (now == seen_now)).sum())
     if not happened.any():
         return None
-    return GridEffect(
-        missed=1.0 - both / int(happened.sum()),
-        invented=1.0 - both / int(seen.sum()) if seen.any() else 0.0,
-        ratio=int(seen.sum()) / int(happened.sum()),
-        move=float(np.sqrt((moves**2).mean())),
-        lag=lag,
-        frames=len(sample),
-    )
+    invented = 1.0 - both / int(seen.sum()) if seen.any() else 0.0
+    return GridEffect(1.0 - both / int(happened.sum()), invented, float(np.sqrt((moves**2).mean())))
 
 
 def _drawn(
@@ -342,13 +333,9 @@ def _drawn(
     # anywhere on the grid
     places = [random.uniform(0.0, 1.0, (draws, 3)) @ steps]
     for sign in (-1.0, 1.0) if ranked else (1.0,):
-        places.append(places[0] + (radius + sign * more)[:, None] * _directions(random, draws))
+        way = random.normal(size=(draws, 3))
+        places.append(places[0] + ((radius + sign * more) / np.linalg.norm(way, axis=1))[:, None] * way)
     return tuple(places), tuple(place + move for place, move in zip(places, moved, strict=True))
-
-
-def _directions(random: np.random.Generator, draws: int) -> Float[np.ndarray, "draws 3"]:
-    found = random.normal(size=(draws, 3))
-    return found / np.linalg.norm(found, axis=1)[:, None]
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
@@ -358,27 +345,24 @@ def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
     return resolution.usual_step(frame) * np.eye(3)
 
 
-def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "atoms 3"], int]:
-    """Displacements of every atom in one frame, without what rounding did to them, and the lag they are from.
+def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
+    """Displacements of every atom in one frame, without what rounding did to them.
 
     Over so many frames that a displacement is well above a step of the grid; what rounding adds to their
     variance is taken off again.
     """
-    moves, lag, total = np.zeros_like(sample[0].positions), 0, np.zeros_like(sample[0].positions)
+    moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0
     for before, after in pairwise(sample):
         total = total + shortest(after.positions - before.positions, after.box)[0]
-        lag += 1
-        moves = total - total.mean(axis=0)
+        moves, lag = total - total.mean(axis=0), lag + 1
         if np.sqrt((moves**2).mean()) >= _CLEAR * size:
             break
     variance = float((moves**2).mean())
     true = unrounded(variance, size)
     if true < _MOSTLY * variance:
         # most atoms seem to stand still and some to hop: what they do in truth has lost its shape
-        moves = np.random.default_rng(0).normal(scale=np.sqrt(true), size=moves.shape)
-        return moves / max(lag, 1), lag
-    keep = np.sqrt(true / variance) if variance else 0.0
-    return moves * (keep / max(lag, 1)), lag
+        return np.random.default_rng(0).normal(scale=np.sqrt(true), size=moves.shape) / lag
+    return moves * ((np.sqrt(true / variance) if variance else 0.0) / lag)
 
 
 def unrounded(variance: float, size: float) -> float:

@@ -26,20 +26,14 @@ NEVER = -1.0
 
 def _radius(value: float, where: str) -> None:
     if not (math.isfinite(value) and value > 0):
-        raise InputError(
-            f"a radius of {value!r}; expected a positive length",
-            remedy="Give it in the length unit of the trajectory",
-            where=where,
-        )
+        message = f"a radius of {value!r}; expected a positive length"
+        raise InputError(message, remedy="Give it in the length unit of the trajectory", where=where)
 
 
 def _count(value: int, where: str) -> None:
     if isinstance(value, bool) or int(value) != value or value < 1:
-        raise InputError(
-            f"{value!r} neighbors; expected a whole number from 1",
-            remedy="Give the number of neighbors to keep",
-            where=where,
-        )
+        message = f"{value!r} neighbors; expected a whole number from 1"
+        raise InputError(message, remedy="Give the number of neighbors to keep", where=where)
 
 
 class _Membership:
@@ -47,16 +41,13 @@ class _Membership:
 
     directed = False
     needs_species = False
-
-    @property
-    def name(self) -> str:
-        """In words."""
-        raise NotImplementedError
+    name: str  # in words
+    radius: float
 
     @property
     def reach(self) -> float:
         """Distance beyond which nothing is a neighbor, length."""
-        raise NotImplementedError
+        return self.radius
 
     @property
     def shortest(self) -> float:
@@ -87,10 +78,6 @@ class CutoffRule(_Membership):
     def name(self) -> str:
         return f"r < {self.radius:g}"
 
-    @property
-    def reach(self) -> float:
-        return self.radius
-
 
 @dataclass(frozen=True)
 class SpeciesCutoffs(_Membership):
@@ -102,20 +89,16 @@ class SpeciesCutoffs(_Membership):
 
     def __post_init__(self):
         if not self.radii:
-            raise InputError(
-                "no pair of species",
-                remedy='Give at least one, ("O", "H"): 2.5 say',
-                where="SpeciesCutoffs.radii",
-            )
+            message = "no pair of species"
+            remedy = 'Give at least one, ("O", "H"): 2.5 say'
+            raise InputError(message, remedy=remedy, where="SpeciesCutoffs.radii")
         for pair, value in self.radii.items():
             _radius(value, f"SpeciesCutoffs.radii[{pair}]")
             other = self.radii.get((pair[1], pair[0]), value)
             if other != value:
-                raise InputError(
-                    f"{pair[0]}-{pair[1]} has two radii, {value:g} and {other:g}",
-                    remedy="Give it once: the rule is the same in both directions",
-                    where="SpeciesCutoffs.radii",
-                )
+                message = f"{pair[0]}-{pair[1]} has two radii, {value:g} and {other:g}"
+                remedy = "Give it once: the rule is the same in both directions"
+                raise InputError(message, remedy=remedy, where="SpeciesCutoffs.radii")
 
     @property
     def name(self) -> str:
@@ -142,11 +125,9 @@ class SpeciesCutoffs(_Membership):
         radii = np.full((len(names), len(names)), NEVER)
         for (a, b), value in self.radii.items():
             if missing := [one for one in (a, b) if one not in place]:
-                raise InputError(
-                    f"no atom is of species {missing[0]!r}; there are {', '.join(list(place)[:20])}",
-                    remedy="Write species as the trajectory names them",
-                    where=f"SpeciesCutoffs.radii[{(a, b)}]",
-                )
+                message = f"no atom is of species {missing[0]!r}; there are {', '.join(list(place)[:20])}"
+                remedy = "Write species as the trajectory names them"
+                raise InputError(message, remedy=remedy, where=f"SpeciesCutoffs.radii[{(a, b)}]")
             radii[place[a], place[b]] = radii[place[b], place[a]] = value
         return index.reshape(-1).astype(np.int64), radii
 
@@ -203,10 +184,6 @@ class Capped(_Membership):
     @property
     def name(self) -> str:
         return f"r < {self.radius:g}, at most {self.most} neighbors"
-
-    @property
-    def reach(self) -> float:
-        return self.radius
 
 
 Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped

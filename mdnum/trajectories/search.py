@@ -101,7 +101,7 @@ def search(
     doubtful = max(open_room or int(1.1 * expected * share), 1024)
     while True:
         found = Candidates.room(sure, doubtful)
-        count, left = meet(atoms, SearchLimits.of(radii, kind, band), 0, len(atoms.start) - 1, found)
+        count, left = meet(atoms, SearchLimits.of(radii, kind, band), found)
         # what is open may come to be inside
         if left <= doubtful and (kind != INSIDE or count + left <= sure):
             break
@@ -329,11 +329,16 @@ class Changed(NamedTuple):
     rank: Int[np.ndarray, "flips"]
     entered: np.ndarray
 
+    @classmethod
+    def room(cls, pairs: int) -> Changed:
+        """Room for so many."""
+        return cls._make(np.empty(pairs, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
+
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
     """Every decision that differs, pair by pair and image by image; room is made for so many at first."""
     while True:
-        made = Changed._make(np.empty(room, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
+        made = Changed.room(room)
         total = _compared(before, now, made)
         if total <= room:
             return Changed._make(column[:total] for column in made)

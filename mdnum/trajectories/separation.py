@@ -40,15 +40,10 @@ class Separation:
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all atoms alike, taken off before, length
 
 
-def displacements(start: Frame, end: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "atoms 3"]:
-    """From one frame to another, up to lattice vectors of the second's box that both have."""
-    return _displaced(start, end, 0.0, atoms)[0]
-
-
-def _displaced(
-    start: Frame, end: Frame, shift: Float[np.ndarray, "3"] | float, atoms: AtomIndices
+def displacements(
+    start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """(displacements less a shift, whole lattice vectors taken off)."""
+    """(from one frame to another less a shift, whole lattice vectors of the second's box taken off)."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
@@ -74,7 +69,7 @@ def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
     """The separation of two frames, less a shift; only of these atoms, where they are given."""
-    moved, whole = _displaced(one, other, 0.0 if shift is None else shift, atoms)
+    moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
     return Separation(
@@ -82,17 +77,17 @@ def separation(
         float(np.sqrt(square.mean())),
         at if atoms is None else int(atoms[at]),
         int(np.abs(whole).max()),
-        (0.0, 0.0, 0.0) if shift is None else (float(shift[0]), float(shift[1]), float(shift[2])),
+        (0.0, 0.0, 0.0) if shift is None else tuple(shift.tolist()),
     )
 
 
 def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
     """The displacement that most atoms have in common, up to lattice vectors, length."""
-    shift = displacements(one, other, atoms)[0]
+    shift = displacements(one, other, atoms)[0][0]
     for _ in range(2):
         # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
         # median they do not
-        shift = shift + np.median(_displaced(one, other, shift, atoms)[0], axis=0)
+        shift = shift + np.median(displacements(one, other, atoms, shift)[0], axis=0)
     return shift
 
 
@@ -144,7 +139,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
-    u, v, moved = start.velocities, end.velocities, displacements(start, end)
+    u, v, moved = start.velocities, end.velocities, displacements(start, end)[0]
     mean = (u + v) / 2 * (end.time - start.time)
     if len(u) > 3:
         # a file may have been centered since

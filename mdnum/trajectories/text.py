@@ -75,15 +75,9 @@ class AseFrames(Trajectory):
             order = self._by_id(number, atoms.arrays["id"])
             atoms, labels = atoms[order], labels[order]
             velocities = None if velocities is None else velocities[order]
-        return Frame(
-            index=number,
-            time=float(atoms.info["time"]) if timed else float(number),
-            positions=np.array(atoms.positions, np.float64),
-            box=Box(np.array(atoms.cell.array, np.float64), np.array(atoms.pbc, bool)),
-            velocities=velocities,
-            labels=labels,
-            identified=identified,
-        )
+        box = Box(np.array(atoms.cell.array, np.float64), np.array(atoms.pbc, bool))
+        time, x = float(atoms.info["time"]) if timed else float(number), np.array(atoms.positions, np.float64)
+        return Frame(number, time, x, box, velocities, labels, identified)
 
 
 def _ids(atoms: Any) -> np.ndarray | None:
@@ -101,10 +95,9 @@ class AseTrajectory(AseFrames):
         try:
             get_ioformat(format)
         except UnknownFileTypeError:
-            raise self._refused(
-                f"--format {format!r} is known to neither MDAnalysis nor ASE",
-                "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ...",
-            ) from None
+            seen = f"--format {format!r} is known to neither MDAnalysis nor ASE"
+            remedy = "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ..."
+            raise self._refused(seen, remedy) from None
         if format == "traj":
             with reading(path, by="ASE"), TrajectoryReader(str(path)) as reader:
                 self._count = len(reader)
@@ -136,11 +129,9 @@ def format_of(path: Path) -> str:
         with reading(path, by="ASE"):
             return filetype(str(path))
     except UnknownFileTypeError as error:
-        raise InputError(
-            "neither MDAnalysis nor ASE knows this format",
-            remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
-            where=str(path),
-        ) from error
+        message = "neither MDAnalysis nor ASE knows this format"
+        remedy = "Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it"
+        raise InputError(message, remedy=remedy, where=str(path)) from error
 
 
 def _units(path: Path) -> Units:
@@ -345,11 +336,8 @@ class LammpsDump(TextTrajectory):
 
         names = next((names for names in _COLUMNS if set(names) <= set(columns)), None)
         if names is None:
-            raise self._odd(
-                number,
-                f"has no positions among its columns ({' '.join(columns)})",
-                "Dump x y z, xu yu zu or xs ys zs",
-            )
+            seen = f"has no positions among its columns ({' '.join(columns)})"
+            raise self._odd(number, seen, "Dump x y z, xu yu zu or xs ys zs")
         positions = numbers(names)
         if names[0].startswith("xs"):
             positions = box.origin + positions @ box.matrix
@@ -363,10 +351,8 @@ class LammpsDump(TextTrajectory):
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
         if "id" not in columns:
-            raise self._refused(
-                "the dump has no ids, and LAMMPS changes the order of atoms as they move",
-                "Dump the column id",
-            )
+            message = "the dump has no ids, and LAMMPS changes the order of atoms as they move"
+            raise self._refused(message, "Dump the column id")
         return self._by_id(number, rows[:, columns.index("id")].astype(np.int64))
 
     def _block(self, lines: Any) -> list[str] | None:

@@ -48,26 +48,6 @@ class Tiled(NamedTuple):
     rows: UInt16[np.ndarray, "tiles"]  # bits of the rows that hold a pair inside
     inside: UInt16[np.ndarray, "tiles 16"]  # bits of the pairs inside, by row
 
-    @classmethod
-    def room(cls, tiles: int) -> Tiled:
-        """Room for so many, nothing inside."""
-        first, second = np.empty((2, tiles), np.int32)
-        rows, inside = np.zeros(tiles, np.uint16), np.zeros((tiles, CLUSTER), np.uint16)
-        return cls(first, second, np.empty(tiles, np.uint8), rows, inside)
-
-
-class Flips(NamedTuple):
-    """Room for pairs that came to differ."""
-
-    i: Int[np.ndarray, "room"]
-    j: Int[np.ndarray, "room"]
-    entered: np.ndarray
-
-    @classmethod
-    def room(cls, pairs: int) -> Flips:
-        """Room for so many."""
-        return cls(*(np.empty(pairs, kind) for kind in (np.int64, np.int64, np.bool_)))
-
 
 class _Numbers(NamedTuple):
     """What a frame's exact numbers are computed from."""
@@ -103,7 +83,7 @@ class Tiles:
     clear: float  # every pair within this of its radius is in a tile, length
     columns: Float32[np.ndarray, "clusters 3 16"]  # followed coordinates less the center, at the last frame
     boxes: Float32[np.ndarray, "clusters 6"]  # around each cluster then
-    flips: Flips
+    flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
         """Follow the atoms to a frame; whether every pair within clear of its radius is in a tile there."""
@@ -111,7 +91,8 @@ class Tiles:
             return False
         change = now.lattice.vectors - before.lattice.vectors
         most, second, _ = self._follow(before, now, change)
-        drift = _drift(now.lattice.vectors - self.vectors)
+        # a component of a sum of lattice vectors, each at most once, can have come so far
+        drift = float(np.abs(now.lattice.vectors - self.vectors).sum(axis=0).max())
         return (
             clear + 2.0 * self.doubt(now, radius) <= self.clear
             and _one_image(before, now, radius, most + second + float(np.abs(change).sum()))
@@ -130,10 +111,8 @@ class Tiles:
 
     def doubt(self, now: Placed, radius: float) -> float:
         """How far a distance near the radius can be off through float32, length."""
-        largest, vectors = (
-            float(np.abs(self.boxes).max(initial=0.0)),
-            float(np.abs(now.lattice.vectors).sum()),
-        )
+        largest = float(np.abs(self.boxes).max(initial=0.0))
+        vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
         return 2.0 * _UNIT * (3.0 * largest + 2.0 * vectors + 4.0 * radius) + 8.0 * now.rounding
 
@@ -174,15 +153,15 @@ class Tiles:
                     close, smallest = close + near, min(smallest, least)
                     if at == len(tiled.first):
                         break
-                    larger = Flips.room(2 * len(self.flips.i))
+                    larger = Changed.room(2 * len(self.flips.i))
                     for old, new in zip(self.flips, larger, strict=True):
                         new[:count] = old[:count]
                     self.flips = larger
             if not record or smallest <= seen or seen >= max(bound, horizon):
                 break
             seen = max(bound, min(horizon, 16.0 * seen))
-        i, j, entered = (column[:count].copy() for column in self.flips)
-        return Changed(i, j, np.zeros(count, np.int64), entered), int(close), float(smallest)
+        self.flips.rank[:count] = 0
+        return Changed(*(column[:count].copy() for column in self.flips)), int(close), float(smallest)
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
@@ -190,11 +169,6 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
-
-
-def _drift(change: Float[np.ndarray, "3 3"]) -> float:
-    """How far a component of a sum of lattice vectors, each at most once, can have come, length."""
-    return float(np.abs(change).sum(axis=0).max())
 
 
 def tiles_of(
@@ -221,14 +195,14 @@ def tiles_of(
     columns, boxes = _aligned(clusters), np.empty((2, clusters, 6), np.float32)
     made = Tiles(
         order, [], home, center, lattice.vectors, boxes[0], clear, columns, boxes[0],
-        Flips.room(4096) if spare is None else spare.flips,
+        Changed.room(4096) if spare is None else spare.flips,
     )  # fmt: skip
     made._follow(before, before, np.zeros((3, 3)))
     old_columns, old_home = columns.copy(), made.home.copy()
     made.boxes = boxes[1]
     change = now.lattice.vectors - lattice.vectors
     most, second, typical = made._follow(before, now, change)
-    drift = _drift(change)
+    drift = float(np.abs(change).sum(axis=0).max())
     free = now.lattice.narrowest - radius - clear - 2.0 * (most + drift)
     one_image = _one_image(before, now, radius, most + second + float(np.abs(change).sum()))
     if typical > FURTHEST * radius or not one_image or free < 0:
@@ -287,9 +261,9 @@ def _tiled(
         if count <= room:
             break
         room = count
-    tiled = Tiled.room(count)
-    tiled.first[:], tiled.second[:], tiled.vector[:] = made[:, :count]
-    return tiled
+    first, second, vector = made[:, :count]
+    rows, inside = np.zeros(count, np.uint16), np.zeros((count, CLUSTER), np.uint16)
+    return Tiled(first.copy(), second.copy(), vector.astype(np.uint8), rows, inside)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -346,11 +320,8 @@ def _nodes(boxes, runs):
     Of a node with n clusters the first half begins one node further, the second twice as many nodes as the
     first half has clusters.
     """
-    nodes, spans, stack = (
-        np.empty((2 * runs[-1], 6), np.float32),
-        np.empty((2 * runs[-1], 2), np.int64),
-        [(0, 0, 0)],
-    )
+    nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
+    stack = [(0, 0, 0)]
     for run in range(runs.shape[0] - 1):
         stack.append((2 * runs[run], runs[run], runs[run + 1]))
         while len(stack) > 1:
@@ -589,22 +560,15 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         alone, held = i == j and code == np.uintp(_NONE), np.uintp(0)
         while left != np.uintp(0):
             row = lowest_bit(left)
-            left &= left - np.uintp(1)
+            atom, left = order[np.uintp(CLUSTER) * i + row], left & (left - np.uintp(1))
             bits = _lanes(scratch_at + np.uintp(4) * row, j_at, low, high)
             if alone:
                 bits &= ((np.uintp(0xFFFE) << row) & np.uintp(0xFFFF)) * np.uintp(0x10001)
             now = bits & np.uintp(0xFFFF)
             doubtful = now ^ (bits >> np.uintp(16))
             if doubtful != np.uintp(0):
-                now, near, least = _settled(
-                    now,
-                    doubtful,
-                    order[np.uintp(CLUSTER) * i + row],
-                    np.uintp(CLUSTER) * j,
-                    code,
-                    numbers,
-                    limits,
-                )
+                slot = np.uintp(CLUSTER) * j
+                now, near, least = _settled(now, doubtful, atom, slot, code, numbers, limits)
                 close += near
                 smallest = min(smallest, least)
             held |= np.uintp(now != np.uintp(0)) << row
@@ -615,7 +579,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
                     lane = lowest_bit(changed)
                     changed &= changed - np.uintp(1)
                     place = np.uintp(count)
-                    flips.i[place] = order[np.uintp(CLUSTER) * i + row]
+                    flips.i[place] = atom
                     flips.j[place] = order[np.uintp(CLUSTER) * j + lane]
                     flips.entered[place] = (now >> lane) & np.uintp(1)
                     count += 1

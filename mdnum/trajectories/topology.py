@@ -87,15 +87,12 @@ class AtomTable:
             from MDAnalysis.guesser.tables import SYMB2Z
 
             # "OW1" -> "O", "CL" -> "Cl", "CA" -> "C"
-            guess = {
-                one: str(DefaultGuesser(None).guess_atom_element(one)).capitalize() for one in set(names)
-            }
-            found = {one: element if element in SYMB2Z else "" for one, element in guess.items()}
+            guess = DefaultGuesser(None).guess_atom_element
+            found = {one: str(guess(one)).capitalize() for one in set(names)}
+            found = {one: element if element in SYMB2Z else "" for one, element in found.items()}
             rows = zip(elements, names, types if known[1] else names, strict=True)
-            elements, guessed = (
-                np.array([e or found[n] or t for e, n, t in rows], object),
-                any(found.values()),
-            )
+            elements = np.array([e or found[n] or t for e, n, t in rows], object)
+            guessed = any(found.values())
         elif not all(elements):
             elements = types
         return cls(

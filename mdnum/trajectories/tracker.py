@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.bits import digit_order
 from mdnum.errors import InputError
+from mdnum.reading import FrameError
 from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
 from mdnum.trajectories.lattice import (
     INSIDE,
@@ -19,7 +21,7 @@ from mdnum.trajectories.lattice import (
     lattice_of,
     own_images,
 )
-from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
+from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.search import (
     Changed,
@@ -93,11 +95,9 @@ class Tracker:
         self.rule, self.bound = rule, float(bound)
         self._first, self._second = _indices(first, "first"), _indices(second, "second")
         if rule.needs_species and species is None:
-            raise InputError(
-                f"{rule.name} needs to know which species the atoms are of",
-                remedy="Give a topology that names elements or types, or use one cutoff for all",
-                where="species",
-            )
+            message = f"{rule.name} needs to know which species the atoms are of"
+            remedy = "Give a topology that names elements or types, or use one cutoff for all"
+            raise InputError(message, remedy=remedy, where="species")
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
         # how many were decided from the coordinates as stored last time, to make room for as many
@@ -105,8 +105,10 @@ class Tracker:
         self._list: Tiles | None = None
         # one that has served, whose memory the next can use
         self._spare: Tiles | None = None
+        # room for sorting, kept: pages that are new to a process can cost more than what is done in them
+        self._keys = np.empty((4, 0), np.int64)
         self._who: Participants
-        self._box: Box | None = None
+        self._box = b""
         self._last: Moment | None = None
         self.frames = self.pairs = self.near = 0
         self.min_margin = np.inf
@@ -118,11 +120,18 @@ class Tracker:
             frame: the next one; its own index does not matter.
             bound: of this frame and from here on, length; None for the one before.
         Raises:
-            InputError: a position that is not finite; a direction that repeats without a vector; another
-                number of atoms than before.
+            FrameError: a position that is not finite; a direction that repeats without a vector; another
+                number of atoms than before; more pairs than fit into memory.
         """
         if bound is not None:
             self.bound = float(bound)
+        try:
+            return self._stepped(frame)
+        except InputError as error:
+            message = f"frame {frame.index}: {error.message}"
+            raise FrameError(message, frame=frame.index, remedy=error.remedy, where=error.where) from error
+
+    def _stepped(self, frame: Frame) -> FlipTable:
         before, now = self._last, self._moment(frame)
         flips = None if before is None or self.rule.directed else self._from_list(before, now)
         if flips is None:
@@ -170,48 +179,37 @@ class Tracker:
 
     def _moment(self, frame: Frame) -> Moment:
         """A frame that can be decided on."""
-        where, atoms = f"frame {frame.index}", len(frame.positions)
+        atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
             self._who = _participants(self.rule, self._first, self._second, self._species, atoms)
             if not self.rule.directed:
                 self._who = _by_place(self._who, frame)
-            self._ledger = LedgerRows(self._who.labels, atoms)
         if atoms != self._atoms:
-            raise InputError(
-                f"{atoms} atoms, {self._atoms} in the frames before",
-                remedy="Split the trajectory where the number of atoms changes",
-                where=where,
-            )
+            message = f"{atoms} atoms, {self._atoms} in the frames before"
+            raise InputError(message, remedy="Split the trajectory where the number of atoms changes")
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
-            raise InputError(
-                f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}",
-                remedy="Stop before this frame (a slice of the file), and find out why the run broke",
-                where=where,
-            )
+            message = f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}"
+            remedy = "Stop before this frame (a slice of the file), and find out why the run broke"
+            raise InputError(message, remedy=remedy)
         lattice, radius = self._lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
-            raise InputError(
-                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them",
-                remedy="Check the unit, and that the file's coordinates are not broken",
-                where=where,
+            message = (
+                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them"
             )
+            raise InputError(message, remedy="Check the unit, and that the file's coordinates are not broken")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _lattice_of(self, box: Box) -> ReducedLattice:
-        last = self._box
-        same = (
-            last is not None and np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
-        )
-        if not same:
-            # a copy: readers reuse their arrays
-            self._box = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
-            self._lattice = lattice_of(self._box)
+        # copies: readers reuse their arrays
+        copied = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
+        if (known := copied.matrix.tobytes() + copied.pbc.tobytes()) != self._box:
+            self._box, self._lattice = known, lattice_of(copied)
         return self._lattice
 
     def _decided(self, now: Moment) -> Moment:
@@ -283,14 +281,29 @@ class Tracker:
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
         """The flips as columns, from indices among the atoms that take part."""
-        directed, who = self.rule.directed, self._who
+        directed, who, count = self.rule.directed, self._who, len(changed.i)
+        i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
+        if not directed:
+            i, j = np.minimum(i, j), np.maximum(i, j)
+        if self._keys.shape[1] < count:
+            self._keys = np.empty((4, count + count // 8), np.int64)
+        self._keys[0, :count] = (i * self._atoms + j) * images + changed.rank
+        order = digit_order(self._keys, count, self._atoms**2 * images)
         ids = (changed.i, changed.j, changed.rank, directed)
-        thresholds = Thresholds(
-            directed, who.species, who.radii, now.last_in, now.first_out, before.last_in, before.first_out
-        )
+        distance, distance_before = (image_distances(one, *ids)[order] for one in (now, before))
+        a, b, rank, entered = (column[order] for column in changed)
+        if directed:
+            limit = np.where(entered, now.last_in[a], now.first_out[a])
+            limit_before = np.where(entered, before.first_out[a], before.last_in[a])
+        else:
+            limit = limit_before = who.radii[who.species[a], who.species[b]]
+        margin, margin_before = limit - distance, limit_before - distance_before
         bound = self.bound + max(before.rounding, now.rounding)
-        distances = image_distances(now, *ids), image_distances(before, *ids)
-        return self._ledger.flips(self.frames, changed, distances, thresholds, bound)
+        ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
+        return FlipTable(
+            np.full(count, self.frames), i[order], j[order], rank, entered, distance, distance_before,
+            margin, margin_before, np.full(count, bound), ambiguous,
+        )  # fmt: skip
 
 
 def _participants(
@@ -305,17 +318,11 @@ def _participants(
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
         if len(chosen) and chosen.max() >= atoms:
-            raise InputError(
-                f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)",
-                remedy="Select atoms of this trajectory",
-                where=name,
-            )
+            message = f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)"
+            raise InputError(message, remedy="Select atoms of this trajectory", where=name)
     if species is not None and len(species) != atoms:
-        raise InputError(
-            f"{len(species)} species for frames of {atoms} atoms",
-            remedy="Use the topology that belongs to the trajectory",
-            where="species",
-        )
+        message = f"{len(species)} species for frames of {atoms} atoms"
+        raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")
     centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
     centers[first], others[second] = True, True
     labels = np.flatnonzero(centers | others)
@@ -355,9 +362,7 @@ def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarra
     if made.size == 0:
         return np.zeros(0, np.int64)
     if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
-        raise InputError(
-            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
-            remedy="Give the indices of the atoms in the trajectory, from 0",
-            where=where,
-        )
+        message = f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}"
+        remedy = "Give the indices of the atoms in the trajectory, from 0"
+        raise InputError(message, remedy=remedy, where=where)
     return np.unique(made.astype(np.int64))

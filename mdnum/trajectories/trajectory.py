@@ -9,6 +9,7 @@ float32 (`Trajectory.bits`).
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 import zlib
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,9 @@ class Trajectory(ABC):
     drop_repeats = False
     repeats: RepeatedFrames
     check: FrameCheck
+    universe: Any = None  # the MDAnalysis Universe behind it, where there is one
+    # the time step with its bytes in the other order, over that one, where the file has one
+    swapped: float = math.nan
 
     def __init__(self, path: Path, topology: str | Path | None, slice: slice):
         self.path, self.slice = path, slice
@@ -94,10 +98,9 @@ class Trajectory(ABC):
     def _belongs(self, topology: int, atoms: int) -> None:
         """Refuses a topology with another number of atoms."""
         if self.topology is not None and topology != atoms:
-            raise self._refused(
-                f"the topology {self.topology.name} has {topology:,} atoms and the trajectory {atoms:,}",
-                "Give the topology that the trajectory was written with, or a selection of it",
-            )
+            seen = f"the topology {self.topology.name} has {topology:,} atoms and the trajectory {atoms:,}"
+            remedy = "Give the topology that the trajectory was written with, or a selection of it"
+            raise self._refused(seen, remedy)
 
     def _refused(self, message: str, remedy: str = CHECK) -> InputError:
         return InputError(message, remedy=remedy, where=str(self.path))
@@ -117,11 +120,6 @@ class Trajectory(ABC):
         return None
 
     @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.path.name
-
-    @property
     def in_file(self) -> int | None:
         """Frames in the file; None where they are not known without reading it."""
         if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
@@ -138,11 +136,6 @@ class Trajectory(ABC):
         """Frames that `frames` gives; None where they are not known without reading the file."""
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
-    @property
-    def universe(self) -> Any:
-        """The MDAnalysis Universe behind it, or None: another reader has none."""
-        return None
-
     def frames(self) -> Iterator[Frame]:
         """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
 
@@ -158,11 +151,9 @@ class Trajectory(ABC):
                         return
                     frame = self._frame(number, raw)
                 if len(frame.positions) != self.atoms:
-                    raise self._odd(
-                        number,
-                        f"has {len(frame.positions):,} atoms and the first {self.atoms:,}",
-                        "Leave out the frames with another number of atoms: a flip needs the pair before",
-                    )
+                    seen = f"has {len(frame.positions):,} atoms and the first {self.atoms:,}"
+                    remedy = "Leave out the frames with another number of atoms: a flip needs the pair before"
+                    raise self._odd(number, seen, remedy)
                 yield frame
         end = self.in_file or 0
         if number is None or not (self.slice.stop is None or self.slice.stop > end):
@@ -179,8 +170,7 @@ class Trajectory(ABC):
         """
         sample = []
         try:
-            for frame in islice(self.frames(), SAMPLE):
-                sample.append(frame)
+            sample.extend(islice(self.frames(), SAMPLE))
         except InputError:
             if not sample:
                 raise
@@ -217,11 +207,8 @@ class Trajectory(ABC):
         if not np.array_equal(known, ids[order]):
             lost = np.setdiff1d(known, ids)
             seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise self._odd(
-                number,
-                f"{seen} of the first frame: {len(ids):,} atoms, and {len(known):,} there",
-                "Dump one group of atoms that stays the same",
-            )
+            seen += f" of the first frame: {len(ids):,} atoms, and {len(known):,} there"
+            raise self._odd(number, seen, "Dump one group of atoms that stays the same")
         return order
 
     @contextmanager
@@ -300,23 +287,22 @@ def open_trajectory(
         RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
-        raise InputError(
-            "this folder holds results, and no trajectory",
-            remedy="Give the trajectory itself; a run keeps one with --save-every 1 (or another number)",
-            where=str(file),
-        )
+        message = "this folder holds results, and no trajectory"
+        remedy = "Give the trajectory itself; a run keeps one with --save-every 1 (or another number)"
+        raise InputError(message, remedy=remedy, where=str(file))
     if file.is_dir() and file.suffix != ".bundle":
         raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
-    for one in (file, None if topology is None else Path(topology).expanduser()):
-        if one is not None and not one.exists():
+    for one in (file, *([] if topology is None else [Path(topology).expanduser()])):
+        if not one.exists():
             raise InputError("no such file", remedy="Check the path", where=str(one))
-        if one is not None and one.is_file() and not one.stat().st_size:
+        if one.is_dir():
+            continue
+        if not one.is_file():
+            # a reader would wait for what comes, or read without end
+            raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
+        if not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
-        if one is not None and not one.is_dir():
-            if not one.is_file():
-                # a reader would wait for what comes, or read without end
-                raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
-            check_claim(one)
+        check_claim(one)
     opened = _reader_of(file, format)(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
@@ -342,7 +328,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     known: set[str] = set(MDAnalysis._READERS)
     if format is not None and word in own:
         return own[word]
-    if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) is not None and head.cut:
+    if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) and head.whole < head.told:
         return mdanalysis_source.NetcdfTrajectory
     if format is not None and word.upper() in known:
         return library
@@ -395,33 +381,25 @@ def parse_slice(words: str, where: str = "") -> slice:
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:
-        raise InputError(
-            f"{words!r} names no frames",
-            remedy="Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame",
-            where=where or None,
-        )
+        message = f"{words!r} names no frames"
+        remedy = "Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame"
+        raise InputError(message, remedy=remedy, where=where or None)
     colon = match[2]
     start, stop, step = (None if match[k] is None else int(match[k]) for k in (1, 3, 5))
     if colon is None:
         return slice(None) if start is None else slice(start, start + 1 or None)
     if step is not None and step < 1:
-        raise InputError(
-            f"the frames {words!r} go backward or nowhere",
-            remedy="Write a stride of 1 or more: flips follow time",
-            where=where or None,
-        )
+        message = f"the frames {words!r} go backward or nowhere"
+        remedy = "Write a stride of 1 or more: flips follow time"
+        raise InputError(message, remedy=remedy, where=where or None)
     return slice(start, stop, step or 1)
 
 
-def chosen(frames: slice, count: int | None) -> Iterator[int]:
-    """The numbers of the frames, upward; without an end where neither the slice nor a count has one."""
-    if count is not None:
-        yield from range(*frames.indices(count))
-        return
-    number, stop, step = frames.start or 0, frames.stop, frames.step or 1
-    while stop is None or number < stop:
-        yield number
-        number += step
+def chosen(frames: slice, total: int | None) -> Iterator[int]:
+    """The numbers of the frames, upward; without an end where neither the slice nor a total has one."""
+    if total is not None:
+        return iter(range(*frames.indices(total)))
+    return islice(count(), frames.start, frames.stop, frames.step)
 
 
 # ---- atoms by words, in MDAnalysis's selection language, whoever reads the file

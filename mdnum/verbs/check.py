@@ -73,9 +73,8 @@ def structure_findings(system: System) -> Iterator[Finding]:
             velocities = velocities - masses @ velocities / masses.sum()
         twice = float((masses[:, None] * velocities**2).sum())
         temperature = twice / (3 * len(masses) * system.units.k_B)
-        yield from temperature_findings(
-            temperature, dynamics.temperature, len(masses), system.units.temperature
-        )
+        unit = system.units.temperature
+        yield from temperature_findings(temperature, dynamics.temperature, len(masses), unit)
     elif structure.velocities == "file" and (names := structures.ignored(structure, system.folder)):
         yield TEXTS.finding("VELOCITIES_IGNORED", names=listed([f"“{name}”" for name in names]))
 
@@ -89,10 +88,8 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):
         return
     values = {"start": start, "requested": requested, "unit": unit}
-    more = ["factor"] if start > 0 else []
-    yield RUN_TEXTS.finding(
-        "OTHER_TEMPERATURE", *more, factor=(1 / ratio) ** 0.5 if start > 0 else 0.0, **values
-    )
+    more, factor = (["factor"], (1 / ratio) ** 0.5) if start > 0 else ([], 0.0)
+    yield RUN_TEXTS.finding("OTHER_TEMPERATURE", *more, factor=factor, **values)
 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -93,7 +92,7 @@ def flips(
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.lost import FrameMotion
-    from mdnum.trajectories.resolution import infer
+    from mdnum.trajectories.resolution import grid_effect, infer
     from mdnum.trajectories.trajectory import open_trajectory
 
     if window < 1:
@@ -126,10 +125,9 @@ def flips(
         motion = FrameMotion.of(sample, resolution, *groups, timed=timed)
         told = [
             _rule_told(folder, number, one, found, frames, steps, opened, groups, window, motion, log)
-            | {"grid": _grid(sample, resolution, one, groups)}
+            | {"grid": grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)}
             for number, one in enumerate(found.rules)
         ]
-        leaps = found.leaps
         answer.result, answer.summary = found, {
             **about(opened, "flips", between),
             "box": sample[0].box.plain(),
@@ -139,9 +137,7 @@ def flips(
             "resolution": resolution,
             "rules": told,
             "flight": found.odd,
-            "leaps": None if not leaps else {
-                "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
-            },
+            "leaps": {"frames": len(found.leaps), **found.leaps[0]} if found.leaps else None,
             "alternative_box": _with_other_box(opened, sample[0], found, groups),
             "repeats": opened.repeats.plain(),
             "retyped": opened.check.retyped,
@@ -224,11 +220,9 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
         pass
     if not isinstance(radius, int | float):
         unit = f" in {trajectory.length}" if trajectory.length else ""
-        raise InputError(
-            "no rule says which pairs count",
-            remedy=f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K',
-            where=str(trajectory.path),
-        )
+        message = "no rule says which pairs count"
+        remedy = f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K'
+        raise InputError(message, remedy=remedy, where=str(trajectory.path))
     return rules([float(radius)])
 
 
@@ -287,12 +281,12 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
     interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else math.nan
     backward = int(np.count_nonzero(steps <= 0))
     seconds = abs(interval) * _SECONDS.get(trajectory.time, math.nan)
-    absurd = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST)
+    absurd, swapped = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST), interval * trajectory.swapped
     return {
         # frames are counted where their times do not go forward
         "timed": timed and not backward and not absurd,
         "absurd": absurd,
-        "swapped": _swapped(trajectory, interval) if absurd else None,
+        "swapped": swapped if absurd and _SHORTEST < swapped * _SECONDS["ps"] < _LONGEST else None,
         "has_times": timed and not (len(steps) and (steps == 0).all()),
         "first_time": float(times[0]),
         "last_time": float(times[-1]),
@@ -300,18 +294,6 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
         "even": bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True,
         "backward": backward,
     }
-
-
-def _swapped(trajectory: Trajectory, interval: float) -> float | None:
-    """The time between frames if the step in a DCD's head has its bytes in the other order; None for none."""
-    with trajectory.path.open("rb") as file:
-        head = file.read(48)
-    if trajectory.format != "DCD" or head[4:8] != b"CORD":
-        return None
-    orders = "<>" if head[:4] == struct.pack("<i", 84) else "><"
-    (step,), (other,) = (struct.unpack(f"{order}f", head[44:48]) for order in orders)
-    found = interval * other / step
-    return found if _SHORTEST < found * _SECONDS["ps"] < _LONGEST else None
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
@@ -380,10 +362,8 @@ def _rule_told(
     append("neighbors", {"neighbors": seen, "counted": one.neighbors.seen[seen]})
     append("lifetimes", total.curves(rows["pairs"], steps["interval"]))
     busiest = vars(total.busiest)
-    words = {
-        name: _atom_words(trajectory.table, busiest[of]) for name, of in (("first", "i"), ("second", "j"))
-    }
-    append("busiest", {**busiest, **words})
+    first, second = (_atom_words(trajectory.table, busiest[of]) for of in "ij")
+    append("busiest", {**busiest, "first": first, "second": second})
     if total.residues is not None and labels.residues is not None:
         between, within = total.residues.between, total.residues.within
         busy = np.flatnonzero(between + within)
@@ -391,18 +371,13 @@ def _rule_told(
         names = [labels.residues.names[at] for at in busy]
         append("residues", {"residue": names, "between": between[busy], "within": within[busy]})
     entered, left = int(rows["entered"].sum()), int(rows["left"].sum())
-    count, margins = len(rows["pairs"]), rows["min_margin"]
+    inside, margins, count = rows["pairs"], rows["min_margin"], found.frames
     told = {
         "rule": one.rule.name,
         "directed": one.rule.directed,
-        "pairs_first": int(rows["pairs"][0]),
-        "pairs_last": int(rows["pairs"][-1]),
-        "pairs_mean": float(rows["pairs"].mean()),
-        "pairs_least": int(rows["pairs"].min()),
-        "pairs_most": int(rows["pairs"].max()),
-        "entered": entered,
-        "left": left,
-        "flips": entered + left,
+        "pairs_first": int(inside[0]), "pairs_last": int(inside[-1]), "pairs_mean": float(inside.mean()),
+        "pairs_least": int(inside.min()), "pairs_most": int(inside.max()),
+        "entered": entered, "left": left, "flips": entered + left,
         "flips_per_frame": (entered + left) / (count - 1) if count > 1 else None,
         "ambiguous": int(rows["ambiguous"].sum()),
         "near_mean": float(rows["near"].mean()),
@@ -463,13 +438,6 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
     if (a in first and b in second) or not (b in first and a in second):
         return row
     return row | {"first": b, "second": a}
-
-
-def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups) -> Any:
-    """What writing positions with so few digits did to the flips, estimated; None where it cannot be."""
-    from mdnum.trajectories.resolution import grid_effect
-
-    return grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked) if one.reach > 0 else None
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:

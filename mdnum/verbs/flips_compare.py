@@ -45,10 +45,8 @@ def compare(
         InputError: they are not of the same atoms.
     """
     if a.atoms != b.atoms:
-        raise InputError(
-            f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
-            remedy="Compare trajectories of the same atoms",
-        )
+        message = f"{a.path.name} has {a.atoms:,} atoms and {b.path.name} {b.atoms:,}"
+        raise InputError(message, remedy="Compare trajectories of the same atoms")
     groups = selected(a, between)
     samples = [one.sample() for one in (a, b)]
     resolutions = [infer(some, one.bits, one.format) for some, one in zip(samples, (a, b), strict=True)]
@@ -82,28 +80,25 @@ def compare(
             }
             for one in sets
         ]  # fmt: skip
-        answer.result, answer.summary = (
-            found,
-            {
-                **about(a, "flips-compare", between),
-                "other": name_of(b),
-                "other_file": str(b.path),
-                "other_format": b.format,
-                "same_species": _alike(a, b),
-                "rules": told,
-                "in_file": [one.count for one in (a, b)],
-                "times": [a.time, b.time],
-                "timed": a.time != "frame",
-                "interval": 1.0,
-                "resolution": resolutions[0],
-                "other_resolution": resolutions[1],
-                **{name: value for name, value in vars(found).items() if name not in ("stopped", "other")},
-                "repeats": [one.repeats.plain() for one in (a, b)],
-                # steps, units and numbers of frames are not compared with one another
-                "times_differ": found.times_differ if a.time == b.time else 0,
-                **ending(found.stopped, interrupted),
-            },
-        )
+        answer.result, answer.summary = found, {
+            **about(a, "flips-compare", between),
+            "other": name_of(b),
+            "other_file": str(b.path),
+            "other_format": b.format,
+            "same_species": _alike(a, b),
+            "rules": told,
+            "in_file": [one.count for one in (a, b)],
+            "times": [a.time, b.time],
+            "timed": a.time != "frame",
+            "interval": 1.0,
+            "resolution": resolutions[0],
+            "other_resolution": resolutions[1],
+            **{name: value for name, value in vars(found).items() if name not in ("stopped", "other")},
+            "repeats": [one.repeats.plain() for one in (a, b)],
+            # steps, units and numbers of frames are not compared with one another
+            "times_differ": found.times_differ if a.time == b.time else 0,
+            **ending(found.stopped, interrupted),
+        }  # fmt: skip
     return answer.outcome
 
 
@@ -413,46 +408,35 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
             yield table_of(one["first_pairs"], columns, title)
 
 
-def _axis(
-    view: ComparisonView, table: Mapping[str, np.ndarray]
-) -> tuple[str, np.ndarray, tuple[tuple[float, str], ...]]:
-    """(label, values, marks) of an axis along the frames."""
-    timed = view.summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
+def _plot(
+    view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
+) -> Plot:
+    """A figure along the frames, of values with a role; those that others are compared with are dashed."""
+    table, summary = view.table("apart"), view.summary
+    timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]
-    beyond, first = view.summary["beyond"], view.summary["rules"][0]["first"]
+    beyond, first = summary["beyond"], summary["rules"][0]["first"]
     marks = [(float(x[beyond]), "positions differ")] if beyond else []
     marks += [(float(x[first["frame"]]), "sets differ")] if first is not None else []
-    return f"time ({view.summary['time']})" if timed else "frame", x, tuple(marks)
+    series = [Series(label, x, y, role=role, dashed=role == "muted") for label, (y, role) in lines.items()]
+    along = f"time ({summary['time']})" if timed else "frame"
+    return TEXTS.plot(name, series, marks, along=along, unit=unit)
 
 
 def _separation(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterator[Plot]:
-    if len(table["frame"]) < 2 or not table["furthest"].any():
-        return
-    label, x, marks = _axis(view, table)
-    series = (
-        Series("furthest atom", x, table["furthest"]),
-        Series("root mean square", x, table["typical"], role="second"),
-        Series("explained by resolution", x, table["bound"], role="muted", dashed=True),
-    )
-    y = f"separation ({view.unit})" if view.unit else "separation"
-    yield Plot(
-        "separation", "Separation of the two", label, y, series, y_scale="log", verticals=marks,
-        caption=TEXTS("caption_separation"),
-    )  # fmt: skip
+    if len(table["frame"]) > 1 and table["furthest"].any():
+        lines = {
+            "furthest atom": (table["furthest"], "first"), "root mean square": (table["typical"], "second"),
+            "explained by resolution": (table["bound"], "muted"),
+        }  # fmt: skip
+        yield _plot(view, "separation", lines, f" ({view.unit})" if view.unit else "")
 
 
 def _differing(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
-    only = (table["only_a"] + table["only_b"]).astype(float)
+    only, inside = (table["only_a"] + table["only_b"]).astype(float), table["pairs_a"].astype(float)
     if len(only) > 1 and only.any():
-        label, x, marks = _axis(view, table)
-        series = (
-            Series("inside in one only", x, only, role="bad"),
-            Series("inside in A", x, table["pairs_a"].astype(float), role="muted", dashed=True),
-        )
-        yield Plot(
-            "differing", "Pairs that differ", label, "pairs", series, y_scale="log", verticals=marks,
-            caption=TEXTS("caption_differing"),
-        )  # fmt: skip
+        lines = {"inside in one only": (only, "bad"), "inside in A": (inside, "muted")}
+        yield _plot(view, "differing", lines)
     rows = view.table("differing")
     if not len(rows["i"]):
         return

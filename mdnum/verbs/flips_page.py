@@ -67,8 +67,7 @@ def _evidence(view: FlipsView) -> Iterator[str]:
     yield resolution(view.summary["resolution"], view.unit)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
         if view.summary["frames"] > 1 and not len(_disagreeing(view, place)):
-            numbers = {name: one[name] for name in ("flips", "entered", "left")}
-            yield TEXTS("algebra", rule=view.rule(one), **numbers)
+            yield TEXTS("algebra", **{**one, "rule": view.rule(one)})
         life = one["lifetime"]
         if life["followed"] and life["leaves"]:
             values = {"median": view.life(one), "mean": view.life(one, "mean_by_rate")}
@@ -185,11 +184,8 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
     if (flight := summary["flight"]) is not None:
         factor, lower = flight["factor"], flight["at_least"]
-        known = (
-            []
-            if lower
-            else [word for word, one in TEXTS.entries["odd_units"].items() if abs(factor / one - 1) < 0.05]
-        )
+        units = () if lower else TEXTS.entries["odd_units"].items()
+        known = [word for word, one in units if abs(factor / one - 1) < 0.05]
         code = "at_least" if lower else "large" if factor > 1 else "small"
         values = {"factor": factor, "inverse": 1 / factor, "units": " or ".join(known)}
         yield TEXTS.finding("VELOCITIES_ODD", code, *["known"] * bool(known), **values)
@@ -281,13 +277,13 @@ def _rules(view: FlipsView) -> Table:
 def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
     plots: dict[str, list[Plot]] = {}
     for title, plot in _plots(view, place, one) if place < _DRAWN else ():
-        plots.setdefault(title, []).append(replace(plot, name=f"rule{place}-{plot.name}"))
+        plots.setdefault(title, []).append(plot)
 
     def section(title: str, *parts: Any, level: Any = 3) -> Section:
         return Section(_title(title, view, one), [*parts, *plots.get(title, [])], level=level)
 
-    yield section("Pairs and flips", pairs(list(_numbers(view, one))), level=2)
-    yield section("How long contacts last", pairs(list(_lifetimes(view, one))))
+    yield section("Pairs and flips", pairs(_numbers(view, one)), level=2)
+    yield section("How long contacts last", pairs(_lifetimes(view, one)))
     lost = list(_lost(view, one))
     yield section("Between the frames", *([pairs(lost)] if lost else []))
     tables = [_classes(view, "species", one["by_species"])]
@@ -302,47 +298,31 @@ def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
         yield section("Neighbors")
 
 
-def _numbers(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
-    around, chatter = one["neighbors"], one["chatter"]
-    yield "Pairs inside at the first frame", count(one["pairs_first"])
-    yield "Pairs inside at the last", count(one["pairs_last"])
-    span = f"{count(one['pairs_least'])} to {count(one['pairs_most'])}"
-    yield "Pairs inside at any frame", f"{span}, {average(one['pairs_mean'])} on average"
-    yield "Flips", f"{count(one['flips'])}: {count(one['entered'])} entered, {count(one['left'])} left"
-    yield "Flips from frame to frame", number(one["flips_per_frame"], 4)
-    yield "Pairs that flip", count(one["pairs_flipped"])
-    yield "Undecidable flips", count(one["ambiguous"])
-    yield "Undecidable pairs at an average frame", number(one["near_mean"])
-    if one["min_margin"] is not None:
-        yield "Closest decision", f"{view.length(one['min_margin'])} from its threshold"
-    span = f"{count(around['fewest'])} to {count(around['most'])}"
-    yield "Neighbors of an atom", f"{span}, {average(around['mean'])} on average"
-    back = f"{many(chatter['undone'], 'flip')} ({percent(chatter['share'])})"
-    yield f"Reversed within {many(chatter['window'], 'frame')}", back
+def _numbers(view: FlipsView, one: Rule) -> list[tuple[str, str]]:
+    closest, around = one["min_margin"], one["neighbors"]
+    values = {
+        **one, **around, **one["chatter"], "per_frame": number(one["flips_per_frame"], 4),
+        "neighbors": average(around["mean"]), "mean": average(one["pairs_mean"]),
+        "closest": None if closest is None else view.length(closest),
+    }  # fmt: skip
+    return TEXTS.rows("numbers", **values)
 
 
-def _lifetimes(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
-    seen, life, loose = one["contacts"], one["lifetime"], one["intermittent"]
-    yield "Contacts seen whole", count(seen["seen"])
-    yield "Going on after the last frame (censored on the right)", count(seen["goes_on"])
-    yield "There at the first frame (censored on the left)", count(seen["older"])
-    yield "Throughout", count(seen["throughout"])
-    if not life["followed"]:
-        return
-    yield "Median life", view.life(one)
-    if life["quarter_gone"] is not None:
-        ends = [view.life(one, name) for name in ("quarter_gone", "three_quarters_gone")]
-        yield "Quartiles", " and ".join(ends)
-    if life["mean"] is not None:
-        yield "Mean life (product-limit)", view.life(one, "mean")
-    if life["leaves"]:
-        error = view.duration(life["mean_by_rate_error"], 2)
-        mean = f"{view.life(one, 'mean_by_rate')} ± {error}, if leaves are independent"
-        yield "Mean life (by rate)", mean
-    gaps = f"gaps up to {many(one['chatter']['window'], 'frame')} overlooked"
-    yield f"Median life, {gaps}", view.life(one, of="intermittent")
-    if loose["leaves"]:
-        yield f"Mean life by rate, {gaps}", view.life(one, "mean_by_rate", "intermittent")
+def _lifetimes(view: FlipsView, one: Rule) -> list[tuple[str, str]]:
+    life, begun = one["lifetime"], one["lifetime"]["followed"]
+
+    def shown(known: Any, name: str = "median", of: str = "lifetime") -> str | None:
+        return view.life(one, name, of) if begun and known else None
+
+    return TEXTS.rows(
+        "lifetimes", **one["contacts"], window=one["chatter"]["window"],
+        median=shown(True), mean=shown(life["mean"] is not None, "mean"),
+        quarter=shown(life["quarter_gone"] is not None, "quarter_gone"),
+        three_quarters=view.life(one, "three_quarters_gone"),
+        by_rate=shown(life["leaves"], "mean_by_rate"), error=view.duration(life["mean_by_rate_error"], 2),
+        loose=shown(True, of="intermittent"),
+        loose_by_rate=shown(one["intermittent"]["leaves"], "mean_by_rate", "intermittent"),
+    )  # fmt: skip
 
 
 def _lost(view: FlipsView, one: Rule) -> Iterator[tuple[str, str]]:
@@ -403,14 +383,18 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         whole = view.table(table)
         return {name: values[whole["rule"] == place] for name, values in whole.items()}
 
-    def plot(name: str, title: str, x: str, y: str, series: Iterable[Series], **more: Any) -> Plot:
-        return Plot(name, title, x, y, tuple(series), caption=TEXTS(f"caption_{name}"), **more)
+    def plot(section: str, name: str, series: Iterable[Series], **values: Any) -> tuple[str, Plot]:
+        return section, replace(TEXTS.plot(name, series, **values), name=f"rule{place}-{name}")
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
     label, x = view.axis(frames)
     if moving:
-        inside = [Series("pairs inside", x, frames["pairs"].astype(float))]
-        yield "Pairs and flips", plot("pairs", "Pairs inside", label, "pairs inside", inside)
+        yield plot(
+            "Pairs and flips",
+            "pairs",
+            [Series("pairs inside", x, frames["pairs"].astype(float))],
+            along=label,
+        )
     if one["flips"]:
         columns = [x[1:], *(frames[name][1:].astype(float) for name in ("entered", "left", "ambiguous"))]
         width = -(-len(columns[0]) // _DENSE)
@@ -418,8 +402,8 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         at, entered, left, unsure = (values[:whole].reshape(-1, width).mean(1) for values in columns)
         series = [Series("entered", at, entered), Series("left", at, left, role="second")]
         series += [Series("undecidable", at, unsure, role="bad")] * bool(unsure.any())
-        y = f"flips per frame{f', mean over {width}' if width > 1 else ''}"
-        yield "Pairs and flips", plot("flips", "Flips from frame to frame", label, y, series)
+        mean = f", mean over {width}" if width > 1 else ""
+        yield plot("Pairs and flips", "flips", series, along=label, mean=mean)
     if view.summary["frames"] > 2:
         table = rows("lifetimes")
         lags = table["frames"] * (view.summary["interval"] if view.timed else 1.0)
@@ -436,32 +420,24 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         ]
         if series:
             x_label = f"time ({view.summary['time']})" if view.timed else "frames"
-            title = "How long contacts last"
-            yield title, plot("lifetimes", title, x_label, "share", series, x_scale="log")
+            yield plot("How long contacts last", "lifetimes", series, along=x_label)
     stride = one["stride"]
     of = np.array(stride["of"], float)
     if len(of) > 2 and of.all():
         left = [Series("", np.array(stride["stride"]), np.array(stride["flips"]) / of, mark="line+points")]
-        title = "Flips that are left when frames are left out"
-        drawn = plot("stride", title, "every nth frame", "share of the flips", left, x_scale="log")
-        yield "Between the frames", drawn
+        yield plot("Between the frames", "stride", left)
     if one["chatter"]["undone"]:
-        after = np.arange(1, one["chatter"]["window"] + 1)
-        back = {"left again": one["chatter"]["inside"], "entered again": one["chatter"]["outside"]}
-        lines = {label: np.array(counts[1:], float) for label, counts in back.items()}
-        series = curves(after, lines, "line+points", log=False)
-        title = "Flips that the same pair reverses"
-        yield "Between the frames", plot("chatter", title, "after so many frames", "flips", series)
+        after, counts = np.arange(1, one["chatter"]["window"] + 1), one["chatter"]
+        back = {"left again": counts["inside"], "entered again": counts["outside"]}
+        lines = {label: np.array(values[1:], float) for label, values in back.items()}
+        yield plot("Between the frames", "chatter", curves(after, lines, "line+points", log=False))
     if moving and np.any(frames["fewest"] != frames["most"]):
         around = {"mean": "neighbors", "most": "most", "fewest": "fewest"}
         lines = {label: frames[name].astype(float) for label, name in around.items()}
-        series = curves(x, lines, log=False)
-        yield "Neighbors", plot("neighbors", "Neighbors of an atom", label, "neighbors", series)
+        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label)
     table = rows("neighbors")
     if len(table["neighbors"]) > 1:
         numbers = np.arange(table["neighbors"].min(), table["neighbors"].max() + 1)
         share = np.zeros(len(numbers))
         share[table["neighbors"] - numbers[0]] = table["counted"] / table["counted"].sum()
-        series, title = [Series("", numbers, share, mark="line+points")], "Atoms by their number of neighbors"
-        drawn = plot("distribution", title, "neighbors", "share of atoms and frames", series)
-        yield "Neighbors", drawn
+        yield plot("Neighbors", "distribution", [Series("", numbers, share, mark="line+points")])

@@ -31,9 +31,8 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     """Indices of the atoms on either side."""
     from mdnum.trajectories.trajectory import select
 
-    return (
-        (None, None) if between is None else (select(trajectory, between[0]), select(trajectory, between[1]))
-    )
+    first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
+    return first, second
 
 
 def stem(trajectory: Trajectory) -> str:
@@ -45,7 +44,7 @@ def stem(trajectory: Trajectory) -> str:
 def name_of(trajectory: Trajectory) -> str:
     """What a file is called on a page; a run's trajectory by its folder, because all have one name."""
     own = trajectory.path.name == "trajectory.traj"
-    name = trajectory.path.resolve().parent.name if own else trajectory.name
+    name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
 
 
@@ -56,11 +55,7 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
         "question": question,
         "system": name_of(trajectory),
         "file": str(trajectory.path),
-        "format": trajectory.format,
-        "reader": trajectory.reader,
-        "atoms": trajectory.atoms,
-        "length": trajectory.length,
-        "time": trajectory.time,
+        **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
         "slice": trajectory.slice_words,
         "between": between,
         "notes": trajectory.notes,
@@ -245,8 +240,5 @@ def resolution(kept: Mapping[str, Any], length: str) -> str:
         code = "narrowed"
     unit = "of the box" if kept["kind"] == "fractions" else length
     text = TEXTS(f"resolution_{code}", step=kept["step"], digits=kept["digits"], unit=unit)
-    return (
-        text
-        if kept["moved"] or not kept["told"] or not kept["step"]
-        else f"{text} {TEXTS('resolution_still')}"
-    )
+    still = kept["told"] and kept["step"] and not kept["moved"]
+    return f"{text} {TEXTS('resolution_still')}" if still else text

@@ -81,7 +81,7 @@ def test_a_run_of_mdnum_gives_its_own_ledger_row_for_row(crystal: Path, tmp_path
     assert result.summary["timed"] and result.summary["interval"] == pytest.approx(0.004)
     # the velocities that the run stored cross the cutoff as often as its own steps saw
     assert abs(one["flux"]["lost"]) < 4 * one["flux"]["error"] / one["flux"]["rate"]
-    assert one["flux"]["moved"] == pytest.approx(1, abs=0.01)
+    assert one["stride"]["motion"]["moved"] == pytest.approx(1, abs=0.01)
     assert result.summary["resolution"]["kind"] == "float64" and result.summary["status"] == "complete"
 
 
