@@ -199,6 +199,9 @@ def _keys(run: RunView) -> Iterator[Key]:
     yield Key("Budget residual", number(run.residual, 2), run.units.energy + budget)
     drift, per = summary.get("energy_drift"), f"{run.units.energy}/atom/{run.units.time}"
     yield Key("Energy drift", number(drift, 2, signed=True), per)
+    steps, moved = run.time_step["per_period"], run.time_step["fluctuation"]
+    share = "" if moved is None else f"; energy noise {percent(moved)} of the kinetic"
+    yield Key("Fastest vibration", number(steps, 3), "steps" + share)
     error = run.ase.get("energy_rel")
     compared = "not compared" if error is None else "relative energy difference"
     compared += " of a sample" if "sampled" in run.ase else ""
