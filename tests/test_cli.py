@@ -110,7 +110,7 @@ def test_time_that_is_up_before_a_verdict_is_neither_fine_nor_a_finding(
     # somebody who pressed control-C knows that it was not finished
     rollout.summary = {**SUMMARY, "status": status, "interrupted": True}
     assert call("run", "argon/crystal-108") == 130
-    assert call("--help") == 0 and "time (--time) was up" in " ".join(capsys.readouterr().out.split())
+    assert call("--help") == 0 and "--time" in capsys.readouterr().out
 
 
 def test_resume_needs_only_the_folder(rollout: Recorder):

@@ -120,7 +120,7 @@ def test_a_demonstration_for_people(demo: dict[str, Demo], capsys: pytest.Captur
     lines = printed(capsys)
     for line in ("Why?", "large first 0.0009760856628", "ok it holds 1.5 1.5", "1 1.0000001"):
         assert line in lines
-    assert "and 18 more, which report.html shows" in lines
+    assert any("18 more" in line for line in lines)
     assert lines[-1] == "wrote page/report.html"
     page = Path("page/report.html").read_text(encoding="utf-8")
     assert "&lt;b&gt;" in page and "In molecular dynamics: The same." in page

@@ -93,7 +93,9 @@ def test_what_is_not_run_by_default_is_listed_with_how_to_ask(monkeypatch):
     assert "finite-differences" not in {one.name for one in chosen}
     rows = {one["what"]: one for one in left}
     late = rows["finite-differences"]
-    assert late["why"] == "about 22 more runs of 50 steps" and late["how"] == "--methods finite-differences"
+    assert (
+        " 22 " in late["why"] and " 50 steps" in late["why"] and late["how"] == "--methods finite-differences"
+    )
     # what is not available is listed too, and not how to ask for it
     assert "thermostat" in rows["reweighting"]["why"] and not rows["reweighting"]["how"]
     assert [one.name for one in grad.plan(problem, names, ("symmetric",))[0]] == ["symmetric"]
@@ -254,8 +256,8 @@ def test_the_page_holds_what_the_folder_holds(tmp_path):
     outcome = write(tmp_path / "run", report=True, trust=TRUST)
     page = (outcome.folder / "report.html").read_text(encoding="utf-8")
     names = sorted(path.stem for path in (outcome.folder / "figures").iterdir())
-    assert names == ["growth", "ranked", "running", "state"] and "argon/synthetic: gradient of msd" in page
-    assert outcome.summary["headline"].startswith("After 500 steps, d msd / d epsilon = 4.0 σ²/ε")
+    assert names == ["growth", "ranked", "running", "state"] and "argon/synthetic" in page
+    assert all(part in outcome.summary["headline"] for part in ("500 steps", "d msd / d epsilon = 4.0 σ²/ε"))
     keys = {key.label: (key.value, key.note) for key in outcome.page.keys}
     # the digits that half the time step leaves, and no more
     assert keys[f"by {EPSILON}"] == ("4.0", "σ²/ε") and keys[f"by {RADIUS}"][0] == "2"

@@ -134,6 +134,48 @@ def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept, finished):
     assert content(resumed) == content(whole)
 
 
+@pytest.mark.parametrize("when", ["before it is written", "before it is renamed", "after it is renamed"])
+def test_a_run_killed_at_any_write_of_a_checkpoint_resumes_from_the_old_or_the_new_one(
+    tmp_path, monkeypatch, when
+):
+    folder = RunFolder.create(tmp_path / "killed")
+    write_run(folder, 0, 20)
+    folder.append("series", series_rows(20, 30))
+    name, replace, renamed = folder.path / "checkpoint.npz", os.replace, []
+
+    def killed(source, target):
+        if target != name:
+            return replace(source, target)
+        renamed.append(target)
+        if when == "after it is renamed":
+            replace(source, target)
+        raise KeyboardInterrupt
+
+    def never(path):
+        if path == name:
+            raise KeyboardInterrupt
+        return replacing(path)
+
+    with monkeypatch.context() as patch:
+        replacing = frames.replacing
+        if when == "before it is written":
+            patch.setattr(frames, "replacing", never)
+        else:
+            patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.checkpoint(state_at(30), force=True)
+    assert bool(renamed) == (when != "before it is written")
+    folder.close()
+    resumed = RunFolder.open(folder.path)
+    step = 30 if when == "after it is renamed" else 20
+    assert resumed.resume()["step"] == step and len(resumed.read("series")["step"]) == step
+    # whatever is neither is damaged
+    resumed.close()
+    name.write_bytes(name.read_bytes()[:-1] + b"x")
+    with pytest.raises(FolderError, match=r"checkpoint\.npz"):
+        RunFolder.open(folder.path).resume()
+
+
 def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
     folder = RunFolder.create(tmp_path / "blown-up")
     write_run(folder, 0, 100)

@@ -75,15 +75,14 @@ class Meter:
         Raises:
             TimeUp: the deadline has passed, or the calls are used up, and what is in progress may be left.
         """
-        if self._limited:
-            self._check()
+        if self._limited and (up := self.up):
+            raise up
         self.calls += 1
 
-    def _check(self) -> None:
-        if self.deadline.passed:
-            raise TimeUp
-        if self.calls >= self.most:
-            raise CallsUp
+    @property
+    def up(self) -> type[TimeUp] | None:
+        """Why no more may be asked, if so."""
+        return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
@@ -98,7 +97,8 @@ class Meter:
     @contextmanager
     def limited(self) -> Iterator[None]:
         """One way of many is asked here: no call is made past a limit, which raises `TimeUp`."""
-        self._check()
+        if up := self.up:
+            raise up
         self._limited += 1
         try:
             yield
@@ -296,7 +296,7 @@ class Ways:
                     failed(item, error)
             self.asked += 1
         if required and not self.asked:
-            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
+            raise subject.meter.up or TimeUp
         return dict(sorted(found.items()))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import CalculatorError, Meter, TimeUp
-from mdnum.audit.structures import FARTHEST, Pair, nearest_distance, pairs
+from mdnum.audit.structures import FARTHEST, Pair, modified, nearest_distance, pairs
 from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
 from mdnum.deadline import Deadline, interrupting
 from mdnum.errors import InputError
@@ -341,8 +341,7 @@ def _tabulated(scale: float) -> str:
 
 def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, repeat: int = 2) -> Atoms:
     """The crystal with its lattice scaled, repeated and displaced a little."""
-    cell = cell.copy()
-    cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
+    cell = modified(cell, cell=cell.cell.array * scale, scaled=True)
     atoms, nearest = cell.repeat(repeat), _least_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
     return _labeled(
@@ -405,5 +404,4 @@ def _least_energy(
 def _small(cell: Atoms, scale: float) -> Atoms:
     """A few atoms of a crystal whose lattice is scaled."""
     small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
-    small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
-    return small
+    return modified(small, cell=small.cell.array * scale, scaled=True)

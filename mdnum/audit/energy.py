@@ -19,6 +19,7 @@ from ase.neighborlist import neighbor_list
 from jaxtyping import Float
 
 from mdnum.audit.curve import Curve
+from mdnum.audit.structures import exchanged
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
 
@@ -303,25 +304,10 @@ def _within(
         middle = 0.5 * (low + high)
         near = [one.threshold for one in crossed if abs(one.share - middle) < 1e-3]
         if not any(one.order == 0 for one in near):
-            ties = _exchanged(*(run.at(run.way(step, share)) for share in (low, high)))
+            ties = exchanged(*(run.at(run.way(step, share)) for share in (low, high)))
             radius = near[0].radius if near else None
             found.append(HiddenJump(step, middle, _unexplained(curve, low, high), ties, radius))
     return found
-
-
-def _exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """(atom, k) whose k-th and next neighbors are others after than before, by nearest images."""
-    orders = []
-    for atoms in (before, after):
-        distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
-        np.fill_diagonal(distances, -1.0)
-        orders.append(np.argsort(distances, axis=1, kind="stable"))
-    found = []
-    for center, (one, other) in enumerate(zip(*orders, strict=True)):
-        # two that change places differ at two ranks, of which the first is k
-        ranks = np.flatnonzero(one != other)
-        found += [(center, int(k)) for k in ranks if k + 1 < len(one) and one[k] == other[k + 1]]
-    return tuple(found)
 
 
 @dataclass(frozen=True)

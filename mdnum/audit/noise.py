@@ -242,6 +242,12 @@ def order_change(
     return energy, NoiseFloor(float(sizes[0]), float(sizes[worst]), freedom=_ORDER_POINTS)
 
 
+def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
+    """Noise along a line, and what other orders of the atoms add to it."""
+    noise = along_a_line(subject, atoms, rng)
+    return noise.louder(order_change(subject, atoms, noise, rng)[1])
+
+
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
@@ -286,7 +292,7 @@ def under_jitter(
 
 
 def settled(
-    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = 1, brief: bool = False
+    subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
     """The structure with its atoms moved a little, away from any threshold, and the noise there.
 
@@ -296,7 +302,7 @@ def settled(
 
     Args:
         at_least: atoms; a smaller cell is repeated, where it repeats.
-        brief: take the first draw, and do not look for steps.
+        brief: take the first draw, and do not look at other orders.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
@@ -323,8 +329,8 @@ def settled(
         with contextlib.suppress(CalculatorError):
             noise = noise.louder(along_a_line(subject, many, rng))
     # what goes in steps may not move at all on so short a line
+    noise = noise.louder(rounding(subject, there))
     if not brief:
-        noise = noise.louder(rounding(subject, there))
         # another order of the same sum is rounded otherwise, which no line shows
         subject.known["order"] = order_change(subject, there, noise, rng)
         noise = noise.louder(subject.known["order"][1])

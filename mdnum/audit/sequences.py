@@ -9,7 +9,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit.noise import displaced
-from mdnum.audit.structures import Pair
+from mdnum.audit.structures import Pair, modified
 
 #: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
 #: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
@@ -55,20 +55,13 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
         yield "the atoms came in another order", atoms[rng.permutation(len(atoms))]
         yield "they came in the first order", atoms
     if atoms.pbc.any():
-        cluster = atoms.copy()
-        cluster.pbc = False
-        yield "pbc was switched off", cluster
-        molecule = cluster.copy()
-        molecule.set_cell(np.zeros((3, 3)))
-        yield "the cell was taken away", molecule
-        slab = atoms.copy()
-        slab.pbc = atoms.pbc & (np.arange(3) != np.flatnonzero(atoms.pbc)[-1])
-        yield "all axes but one repeated", slab
+        yield "pbc was switched off", modified(atoms, pbc=False)
+        yield "the cell was taken away", modified(atoms, pbc=False, cell=np.zeros((3, 3)))
+        slab = atoms.pbc & (np.arange(3) != np.flatnonzero(atoms.pbc)[-1])
+        yield "all axes but one repeated", modified(atoms, pbc=slab)
         yield "all of them did", atoms
     if len(set(atoms.numbers)) > 1:
-        swapped = atoms.copy()
-        swapped.numbers = np.roll(atoms.numbers, 1)
-        yield "the species changed places", swapped
+        yield "the species changed places", modified(atoms, numbers=np.roll(atoms.numbers, 1))
         yield "they changed back", atoms
 
 
@@ -105,19 +98,15 @@ def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
     """The cell changes with the atoms, and without them."""
     if not atoms.pbc.any():
         return
-
-    def strained(matrix: np.ndarray, scaled: bool = True) -> Atoms:
-        there = atoms.copy()
-        there.set_cell(atoms.cell.array @ matrix, scale_atoms=scaled)
-        return there
-
+    cell = atoms.cell.array
     for scaled, words in ((True, "cell and atoms"), (False, "the cell alone")):
         yield "the structure", atoms
         for number in range(1, 5):
-            yield f"{words} shrank by 1.5 %, {number} times", strained(0.985**number * np.eye(3), scaled)
+            there = modified(atoms, cell=0.985**number * cell, scaled=scaled)
+            yield f"{words} shrank by 1.5 %, {number} times", there
     yield "the structure", atoms
-    sheared = strained(np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]))
-    yield "cell and atoms were sheared by 5 %", sheared
+    shear = np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]])
+    yield "cell and atoms were sheared by 5 %", modified(atoms, cell=cell @ shear, scaled=True)
     yield "the structure", atoms
 
 
@@ -137,10 +126,7 @@ def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Ato
 
 
 def _scaled(atoms: Atoms, factor: float) -> Atoms:
-    there = atoms.copy()
-    there.set_cell(factor * atoms.cell.array)
-    there.positions *= factor
-    return there
+    return modified(atoms, cell=factor * atoms.cell.array, positions=factor * atoms.positions)
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
@@ -166,9 +152,7 @@ def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceSt
         # are 0.05 Å beyond the cutoff at first
         shrinking = []
         for moved in (0.0, 0.03, 0.06, 0.09, 0.12, 0.16):
-            there = pair.at(2.0 * radius - 0.05)
-            there.set_cell([3.0 * radius - moved] * 3)
-            there.pbc = True
+            there = modified(pair.at(2.0 * radius - 0.05), cell=[3.0 * radius - moved] * 3, pbc=True)
             what = f"the cell shrank by {moved:.2g} Å" if moved else apart
             shrinking.append(SequenceStep(what, there, compared=moved > 0.05))
         yield "a cell that shrinks around two atoms", shrinking

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from ase import Atoms
@@ -141,6 +141,31 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
     why = f"the {most} most frequent pairs were walked"
     skipped += [(f"pair {one}-{other}", why) for one, other in wanted[most:]]
     return found or _molecules(subject), skipped
+
+
+def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
+    """A copy with other attributes; another cell takes the atoms along where they are scaled."""
+    there = atoms.copy()
+    if "cell" in values:
+        there.set_cell(values.pop("cell"), scale_atoms=scaled)
+    for name, value in values.items():
+        setattr(there, name, value)
+    return there
+
+
+def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
+    """(atom, k) whose k-th and next neighbors are others after than before, by nearest images."""
+    orders = []
+    for atoms in (before, after):
+        distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
+        np.fill_diagonal(distances, -1.0)
+        orders.append(np.argsort(distances, axis=1, kind="stable"))
+    found = []
+    for center, (one, other) in enumerate(zip(*orders, strict=True)):
+        # two that change places differ at two ranks, of which the first is k
+        ranks = np.flatnonzero(one != other)
+        found += [(center, int(k)) for k in ranks if k + 1 < len(one) and one[k] == other[k + 1]]
+    return tuple(found)
 
 
 def nearest_distance(atoms: Atoms) -> float:

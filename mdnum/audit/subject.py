@@ -75,11 +75,6 @@ class Repeats:
             self.new.differ += 1
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
-    @property
-    def asks_again(self) -> bool:
-        """Whether one more answer that sticks out is to be asked for again: few are, and one is enough."""
-        return self.chance.times < _MOST_AGAIN and not self.chance.differ
-
     def findings(self, kT: float) -> list[Observed]:
         """That one question has two answers, where that has come up and is no rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
@@ -290,9 +285,9 @@ class CalculatorSubject:
         Returns:
             Whether the answer is another one by more than rounding.
         """
-        repeats, chance = self.repeats, self.repeats.chance
-        if not repeats.asks_again:
-            return False
+        chance = self.repeats.chance
+        if chance.times >= _MOST_AGAIN or chance.differ:
+            return False  # few are asked again, and one is enough
         self.forget()
         now = self.energy(atoms), None if forces is None else self.forces(atoms)
         before = now[0] if energy is None else energy, forces

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from mdnum.audit.base import CalculatorError, Progress, Ways
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
 from mdnum.audit.noise import digits, in_order
-from mdnum.audit.structures import Pair, molecules, whole
+from mdnum.audit.structures import Pair, exchanged, molecules, whole
 from mdnum.audit.subject import CalculatorSubject, differences
 from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
 
@@ -39,7 +39,7 @@ _CUT_OUT, _MANY = 40, 500
 _MOST_TRIPLES = 4
 #: Of a route through the structure, length.
 _LENGTH = 0.6
-#: Two distances this near to one another are tied, length.
+#: So near to where two neighbors change places they are tied, length.
 _TIED = 1e-6
 #: Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere.
 _MOST = 160
@@ -110,16 +110,9 @@ class Route:
                 found += [RouteCrossing(float(root), threshold) for root in roots if low < root < high]
         return sorted(found, key=lambda one: one.at)
 
-    def ties(self, along: float) -> list[tuple[int, int]]:
-        """(atom, k) where, at a place, an atom's k-th and (k+1)-th neighbors are equally far."""
-        atoms = self.at(along)
-        found: list[tuple[int, int]] = []
-        for center, row in enumerate(atoms.get_all_distances(mic=bool(atoms.pbc.any()))):
-            others = np.sort(np.delete(row, center))
-            for k in np.flatnonzero(np.diff(others) < _TIED):
-                if center == self.lead or abs(others[k] - row[self.lead]) < _TIED:
-                    found.append((center, int(k) + 1))
-        return found
+    def ties(self, along: float) -> tuple[tuple[int, int], ...]:
+        """(atom, k) where, at a place, an atom's k-th and (k+1)-th neighbors change places."""
+        return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
 @dataclass(frozen=True)
@@ -273,7 +266,7 @@ def _event(
     change = subject.forces(route.at(jump.high)) - subject.forces(route.at(jump.low))
     return Event(
         route.name, jump.at, jump, float(np.linalg.norm(change, axis=1).max()),
-        crossing and crossing.threshold, () if crossing else tuple(route.ties(jump.at)),
+        crossing and crossing.threshold, () if crossing else route.ties(jump.at),
     )  # fmt: skip
 
 

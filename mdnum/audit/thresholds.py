@@ -135,11 +135,7 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Every distance at which a pair interaction of the calculator changes its program.
-
-    Returns:
-        thresholds by pair of species and distance; the calculator is asked once.
-    """
+    """Every distance at which a pair interaction changes its program, found once for a subject."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]

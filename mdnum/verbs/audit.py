@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -176,7 +176,7 @@ def _ask_all(
         try:
             others = [one for one in state.shown if one.name != name]
             with interrupting(deadline):
-                result = _repeatable(_ask(check, subject, log), subject, others)
+                result = _ask(check, subject, log, others)
         except KeyboardInterrupt:
             if not state.shown:
                 raise
@@ -216,32 +216,25 @@ def _ask_all(
     return outcome
 
 
-def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
-    """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
+def _ask(
+    check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
+) -> CheckResult:
+    """A check's answer; where the calculator fails and it cannot continue, the failure as a finding.
+
+    With the finding that one question has had two answers, where no result before has it.
+    """
     named: dict[str, Any] = {"name": check.name, "title": check.title}
+    rest = f"the rest of {check.name}"
     try:
-        return check(subject, log)
+        result = check(subject, log)
     except base.CallsUp as up:
-        return base.CheckResult(
-            (["calls_up"], {"calls": check.calls}), skipped=[(f"the rest of {check.name}", up.why)], asked=0,
-            **named,
-        )  # fmt: skip
+        says = ["calls_up"], {"calls": check.calls}
+        result = base.CheckResult(says, skipped=[(rest, up.why)], asked=0, **named)
     except base.CalculatorError as error:
         values = {"check": check.name, "why": error.message}
         values["file"] = error.structure.name if error.structure else ""
-        saved = "saved" if error.structure else None
-        return base.CheckResult(
-            (["failed"], values),
-            [base.finding("CALCULATOR_FAILED", "error", saved, **values)],
-            skipped=[(f"the rest of {check.name}", error.message)],
-            **named,
-        )
-
-
-def _repeatable(
-    result: CheckResult, subject: CalculatorSubject, before: Iterable[CheckResult]
-) -> CheckResult:
-    """A result with the finding that one question has had two answers, where no other has it yet."""
+        failed = base.finding("CALCULATOR_FAILED", "error", "saved" if error.structure else None, **values)
+        result = base.CheckResult((["failed"], values), [failed], skipped=[(rest, error.message)], **named)
     if any(one.code == "NOT_REPEATABLE" for each in (*before, result) for one in each.findings):
         return result
     return replace(result, findings=[*subject.repeats.findings(subject.kT), *result.findings])
@@ -352,7 +345,8 @@ def _summary(state: AuditState) -> dict[str, Any]:
             "safe_to_run": said["run"], "safe_to_differentiate": said["differentiate"],
             "parts": [
                 {
-                    "name": one.name, "title": one.title, "says": _says(one), "tables": one.tables,
+                    "name": one.name, "title": one.title, "tables": one.tables,
+                    "says": " ".join(TEXTS(name, **one.says[1]) for name in one.says[0]),
                     "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
                     "seconds": one.seconds,
                 }
@@ -386,7 +380,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _in_units(value: Any, given: units.Units) -> Any:
-    """Text with the names of a unit system: checks say eV and Å, which are ε and σ in reduced units."""
+    """Text in any value with the names of a unit system: checks say eV and Å, which may be ε and σ."""
     if given.energy == "eV":
         return value
 
@@ -397,12 +391,11 @@ def _in_units(value: Any, given: units.Units) -> Any:
         return _UNIT.sub(unit, value)
     if isinstance(value, Mapping):
         return {_in_units(key, given): _in_units(item, given) for key, item in value.items()}
-    return [_in_units(item, given) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _says(result: CheckResult) -> str:
-    names, values = result.says
-    return " ".join(TEXTS(name, **values) for name in names)
+    if isinstance(value, list | tuple):
+        return type(value)(_in_units(item, given) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{name: _in_units(item, given) for name, item in vars(value).items()})
+    return value
 
 
 # -- what it means ---------------------------------------------------------------------------------
@@ -459,41 +452,40 @@ def _judge(view: AuditView) -> Verdict:
     for head, below in groups:
         found.append(_finding(head, titles[id(head)], ""))
         found += [_finding(one, titles[id(one)], head.code) for one in below]
-    texts = ("title", "text", "remedy", "values")
-    found = [replace(one, **{name: _in_units(getattr(one, name), given) for name in texts}) for one in found]
-    headline = _in_units(_headline(state, [one for one in found if not one.cause]), given)
-    return conclude(found, headline=headline, best="good", judged=True)
+    headline = _headline(state, [one for one in found if not one.cause])
+    if state.during is not None:
+        name = {"stopped": "stopped", base.TIME_UP: "time_up"}.get(state.why, "unfinished")
+        headline = TEXTS(name, check=state.during, headline=headline)
+    return _in_units(conclude(found, headline=headline, best="good", judged=True), given)
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    said, formula = base.answers(state.shown, state.checks), state.atoms.get_chemical_formula()
-    name = TEXTS("on", name=state.name, formula=formula)
+    shown, early = state.shown, base.to_come(state.shown, state.checks)
+    said, begun = base.answers(shown, state.checks), {one.name for one in shown}
+    name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())
+    if early and base.nothing_felt(shown):
+        return TEXTS("nothing_felt", name=name)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
     asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
+    nothing = early and begun and not asked
+    rest = [
+        TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name)
+        for one in shown
+        if nothing or base.largely_unasked(one)
+    ]
+    rest += [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
+    if nothing:
+        return TEXTS("nothing_yet", name=name, ways=", ".join(rest))
     if len(set(slugs.values())) == 1:
         head = TEXTS(f"same_{slugs['run']}", name=name)
     elif len(asked) == 1:
         head = TEXTS("one", name=name, answer=asked[0])
     else:
         head = TEXTS("both", name=name, run=asked[0], differentiate=asked[1])
-    begun = {one.name for one in state.shown}
-    left = [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
-
-    def ways(results: Iterable[CheckResult]) -> list[str]:
-        return [
-            TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name) for one in results
-        ]
-
-    if base.nothing_felt(state.shown) and base.to_come(state.shown, state.checks):
-        return _unfinished(state, TEXTS("nothing_felt", name=name))
-    if state.shown and not asked and base.to_come(state.shown, state.checks):
-        head = TEXTS("nothing_yet", name=name, ways=", ".join([*ways(state.shown), *left]))
-        return _unfinished(state, head)
-    rest = ", ".join([*ways(one for one in state.shown if base.largely_unasked(one)), *left])
     if rest:
         beside = "as far as asked" in said.values()
-        head = TEXTS("with_rest_beside" if beside else "with_rest", head=head, rest=rest)
+        head = TEXTS("with_rest_beside" if beside else "with_rest", head=head, rest=", ".join(rest))
     severe = sorted(
         (one for one in found if one.severity != "info"),
         # where one question has two answers, no other finding of its severity is worth as much
@@ -507,25 +499,16 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
         if "with care" in said.values():
             remedy = next((one.remedy for one in severe if one.severity == "warning" and one.remedy), "")
             head = TEXTS("what_to_do", head=head, remedy=remedy).rstrip()
-    elif state.shown:
-        nothing = "found_no_errors" if found else "found_nothing"
-        head = TEXTS(nothing, head=head, checks=len(state.shown))
+    elif shown:
+        head = TEXTS("found_no_errors" if found else "found_nothing", head=head, checks=len(shown))
     else:
         head = TEXTS("nothing_asked", head=head)
-    refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in state.shown for _, why in one.skipped)
+    refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in shown for _, why in one.skipped)
     unselected = base.in_order([one for one in CHECKS if one not in state.checks])
     values = {"elements": listed(list(dict.fromkeys(state.atoms.symbols)))}
     values |= {"checks": listed(unselected)} if unselected else {}
     head += " " + TEXTS("unasked_checks" if unselected else "unasked", **values)
-    head += " " + TEXTS("refused", n=refused) if refused else ""
-    return _unfinished(state, head)
-
-
-def _unfinished(state: AuditState, headline: str) -> str:
-    if state.during is None:
-        return headline
-    name = {"stopped": "stopped", base.TIME_UP: "time_up"}.get(state.why, "unfinished")
-    return TEXTS(name, check=state.during, headline=headline)
+    return head + (" " + TEXTS("refused", n=refused) if refused else "")
 
 
 # -- how it is shown -------------------------------------------------------------------------------
@@ -546,15 +529,9 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
     if (script := view.folder.path / _SCRIPT).exists():
         code = Code("A script that shows it without mdnum", read_text(script))
         sections.append(Section("Reproduce", [code]))
-    for result in state.shown:
-        parts = [
-            *(_plot(result, place, given) for place in range(len(result.charts))),
-            *(
-                _marked(_in_units(rows, given), _in_units(title, given))
-                for title, rows in result.tables.items()
-                if rows
-            ),
-        ]
+    for result in _in_units(state.shown, given):
+        parts = [_plot(result, place) for place in range(len(result.charts))]
+        parts += [_marked(rows, title) for title, rows in result.tables.items() if rows]
         sections.append(Section(result.title, parts))
     sections.append(Section("What was asked about", [pairs(list(_subject(summary, given)))]))
     about = f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}"
@@ -572,17 +549,16 @@ def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
     return replace(records(order, title, shown=8), bad=bad)
 
 
-def _plot(result: CheckResult, place: int, given: units.Units) -> Plot:
+def _plot(result: CheckResult, place: int) -> Plot:
     chart = result.charts[place]
-    lines = {label: np.array(line, float) for label, line in _in_units(chart.lines, given).items()}
+    lines = {label: np.array(line, float) for label, line in chart.lines.items()}
     mark = "line+points" if len(chart.x) < 40 else "line"
     log_x = chart.log_y and "step" in chart.x_label and all(x > 0 for x in chart.x)
-    words = {name: _in_units(getattr(chart, name), given) for name in ("title", "x_label", "y_label")}
     return Plot(
-        f"{result.name}-{place + 1}", **words, series=curves(np.array(chart.x), lines, mark, log=False),
-        x_scale="log" if log_x else "linear",
-        y_scale="log" if chart.log_y else "linear",
-        verticals=tuple((value, _in_units(word, given)) for word, value in chart.marks.items()),
+        f"{result.name}-{place + 1}", chart.title, chart.x_label, chart.y_label,
+        curves(np.array(chart.x), lines, mark, log=False),
+        x_scale="log" if log_x else "linear", y_scale="log" if chart.log_y else "linear",
+        verticals=tuple((value, word) for word, value in chart.marks.items()),
     )  # fmt: skip
 
 

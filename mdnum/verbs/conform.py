@@ -439,10 +439,18 @@ def page(view: View, verdict: Verdict) -> Page:
         seconds = f"{number(summary['large']['seconds'], 2)} s"
         keys.append(Key("Largest", f"{count(summary['large']['atoms'])} atoms", seconds))
     package = f"{summary['package'] or ''} {summary['version'] or ''}".strip()
+    what = [
+        ("List", summary["about"] or summary["system"]),
+        *([("Package", package)] if package else []),
+        ("Kind", "allocated once and updated" if summary["kept"] else "made anew at every question"),
+        ("Random cases", f"drawn by hypothesis, seed {summary['seed']}"),
+        ("Oracle", TEXTS("oracle")),
+        ("Time", f"{number(summary['seconds'], 3)} s"),
+    ]
     sections = [
         Section("Cases by what they are about", [_figure(summary), *_tables(summary)], terminal=True),
         Section("Conventions", [TEXTS("conventions"), pairs(list(_conventions(summary)))]),
-        Section("What was run", [pairs(list(_what(summary, package)))]),
+        Section("What was run", [pairs(what)]),
     ]
     if summary["failures"]:
         words = {True: "yes", False: "no", None: "not run"}
@@ -521,16 +529,6 @@ def _conventions(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "Asked again", "same rows, same order" if summary["keeps_order"] else "other order of rows"
     if summary["found_out"]:
         yield "Found out by asking", listed(summary["found_out"])
-
-
-def _what(summary: Mapping[str, Any], package: str) -> Iterator[tuple[str, str]]:
-    yield "List", summary["about"] or summary["system"]
-    if package:
-        yield "Package", package
-    yield "Kind", "allocated once and updated" if summary["kept"] else "made anew at every question"
-    yield "Random cases", f"drawn by hypothesis, seed {summary['seed']}"
-    yield "Oracle", TEXTS("oracle")
-    yield "Time", f"{number(summary['seconds'], 3)} s"
 
 
 VERBS = {"conform": Verb(judge, page)}

@@ -14,6 +14,7 @@ from audit import planted
 from audit.planted import Good
 
 import mdnum
+from mdnum.audit.base import TIME_UP
 from mdnum.audit.building import BUILDING_CALLS, default_structure, meant_for
 from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
 from mdnum.verbs import frame
@@ -109,7 +110,9 @@ def test_where_no_atom_feels_another_nothing_is_cleared(tmp_path):
             kind, structure, checks=wanted, out=tmp_path / f"{n}", steps=20, report=False
         )
         assert outcome.summary["status"] == frame.UNDECIDED, n
-        assert "no atom feels another" in outcome.verdict.headline
+        assert all(
+            one["numbers"]["nothing_felt"] for one in outcome.summary["parts"] if one["name"] == "forces"
+        )
         assert "safe" not in outcome.verdict.headline and "found nothing" not in outcome.verdict.headline
 
 
@@ -156,7 +159,7 @@ def test_what_is_known_when_the_calls_are_spent_has_to_do(monkeypatch):
         made = counted()
         structure = default_structure(loaded(made, sigma=3.4, epsilon=0.01, rc=8.5))
         assert made.calls <= most and len(structure) >= 32
-        assert "the calls were used up" in structure.info["origin"]
+        assert " used up" in structure.info["origin"]
 
 
 def test_a_calculation_of_many_atoms_is_not_begun_where_one_of_few_takes_long(monkeypatch):
@@ -186,12 +189,10 @@ def test_the_deadline_ends_building_and_the_audit_says_that_there_is_no_verdict(
     monkeypatch.setattr("mdnum.deadline.Deadline", Passed)
     outcome = mdnum.audit_calculator(Good, time=1.0, out=tmp_path / "a")
     assert outcome.summary["status"] == frame.UNDECIDED and (tmp_path / "a" / "report.html").exists()
-    assert "the time was up" in outcome.summary["structure"]
+    assert TIME_UP in outcome.summary["structure"]
 
 
 def test_the_first_line_names_the_structure(tmp_path):
     outcome = mdnum.audit_calculator(Good, planted.chain(), checks="caller", out=tmp_path / "a", report=False)
     assert outcome.summary["headline"].startswith("Good on Ar4Kr2")
-    assert (
-        "Not asked: stress, elements other than Ar and Kr, and the checks of" in outcome.summary["headline"]
-    )
+    assert all(part in outcome.summary["headline"] for part in ("stress", "other than Ar and Kr", "forces"))

@@ -188,7 +188,7 @@ def test_a_calculator_that_takes_long_is_asked_about_fewer_atoms(monkeypatch):
         for make in (LennardJones, Slow, Held)
     )
     assert len(slow) == 32 and len(quick) == len(held) > 100
-    assert "one calculation of 108 atoms takes 0.4 s" in slow.info["origin"]
+    assert all(part in slow.info["origin"] for part in ("108 atoms", "0.4 s"))
     assert held.info["origin"] == quick.info["origin"]
 
 

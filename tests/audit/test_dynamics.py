@@ -59,7 +59,9 @@ def test_every_crossing_is_in_the_ledger(hard_run):
 def test_jumps_are_those_of_the_potential(hard_run):
     """A pair that enters brings 0.01 eV; the rest of the step is work, to the tenth digit."""
     asked, found, crossed = hard_run
-    for step in sorted({one.step for one in crossed})[:12]:
+    steps = sorted({one.step for one in crossed})[:12]
+    assert len(steps) == 12 and {one.sign for one in crossed if one.step in steps} == {-1, 1}
+    for step in steps:
         here = [one for one in crossed if one.step == step]
         jumps, rest = account(asked.fresh(), found, step, here)
         np.testing.assert_allclose(jumps, [0.01 * one.sign for one in here], rtol=0, atol=1e-9)

@@ -16,7 +16,7 @@ from mdnum.audit.checks import CHECKS
 from mdnum.audit.checks.dynamics import DynamicsCheck
 from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.subject import CalculatorSubject
-from mdnum.verbs.audit import _ask, _repeatable
+from mdnum.verbs.audit import _ask
 
 #: Without the nightly ones: one of each kind of mistake.
 QUICK = (
@@ -34,7 +34,7 @@ def audited(make: Any, atoms: Any, neighbors: int = 40) -> list[CheckResult]:
         check = DynamicsCheck(steps=60) if name == "dynamics" else CHECKS[name]()
         if isinstance(check, SmoothnessCheck):
             check.neighbors = neighbors
-        results.append(_repeatable(_ask(check, subject, lambda *_: None), subject, results))
+        results.append(_ask(check, subject, lambda *_: None, results))
     return results
 
 

@@ -10,6 +10,7 @@ from ball import oracles
 
 from mdnum import ball
 from mdnum.ball.step import BallDecisions
+from mdnum.ball.stopping import Reason
 from mdnum.errors import InputError
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Sequential
@@ -107,6 +108,28 @@ def test_under_its_own_decisions_a_run_is_bit_identical_and_no_ball_feels_anothe
         for start in batches:
             run = run_of(*ALL[name], start=start)
             np.testing.assert_array_equal(free.y[:, index], run.y[:, index % run.balls])
+
+
+BELOW = float(np.nextafter(0.75, 0))
+
+
+@pytest.mark.parametrize(
+    ("y", "v", "gravity", "rest_speed", "after"),
+    [
+        # the rebound of 0.75 is the rest speed, or just above it: then it bounces for half of the step
+        (0.5, -0.5, 2.0, 0.75, (0.0, 0.0)), (0.5, -0.5, 2.0, BELOW, (0.125, -0.25)),
+        # without gravity nothing brings it back, and it stays all the same
+        (0.5, -1.0, 0.0, 0.75, (0.0, 0.0)), (0.5, -1.0, 0.0, 0.25, (0.25, 0.5)),
+        # what pulls it up takes it off the floor, however slow it is
+        (0.75, -2.0, -2.0, 0.75, (0.5, 1.5)),
+    ],
+)  # fmt: skip
+def test_a_ball_comes_to_rest_at_its_rest_speed_unless_it_is_pulled_up(y, v, gravity, rest_speed, after):
+    """Parabolas with an impact after half a step, every number of which is exact in binary."""
+    world = ball.World.create(ball.Impact(0.5, rest_speed), ball.EventLocated(1.0), gravity=gravity)
+    run = ball.simulate(world, world.start(np.array([y]), np.array([v])), 1)
+    assert (float(run.y[1, 0]), float(run.v[1, 0])) == after
+    assert (run.reason[0, 0] == Reason.REST.value) == (after == (0.0, 0.0))
 
 
 @pytest.mark.parametrize(

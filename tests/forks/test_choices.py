@@ -369,7 +369,7 @@ def test_images_are_exact_near_the_start(crystal: System, word: str):
     atoms = crystal.atoms.copy()
     atoms.pbc = False
     for other in (word, "translate=0.25"):
-        assert unavailable(parse(other), replace(crystal, atoms=atoms)) == "no axis is periodic"
+        assert unavailable(parse(other), replace(crystal, atoms=atoms)) is not None
 
 
 def test_what_has_no_exact_image_is_counted():

@@ -60,10 +60,12 @@ def test_a_horizon_too_short_is_open_and_every_series_ends_at_the_last_step():
 @pytest.mark.parametrize("size", [0.0, 1e-3])
 def test_nudged_starts_differ_by_the_size_asked_for_and_never_by_nothing(size):
     program = MdProgram(crystal(precision__state="float32"))
-    for one in program.nudged(size, 3, 1):
-        d = np.asarray(one.start.state.x, np.float64) - np.asarray(program.start.state.x, np.float64)
-        largest = np.sqrt((d**2).sum(axis=0)).max()
-        assert largest > 0 and (not size or largest == pytest.approx(size, rel=1e-3))
+    starts = [np.asarray(one.start.state.x, np.float64) for one in (program, *program.nudged(size, 3, 1))]
+    largest = [np.sqrt(((x - starts[0]) ** 2).sum(axis=0)).max() for x in starts[1:]]
+    assert len(largest) == 3 and min(largest) > 0
+    assert not size or largest == pytest.approx([size] * 3, rel=1e-3)
+    # no two are the same
+    assert len({x.tobytes() for x in starts}) == 4
 
 
 def test_repeats_are_perturbed_by_what_a_choice_does_at_first():

@@ -18,6 +18,7 @@ from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import (
     Custom,
     EinsteinDiffusion,
+    FinalProjection,
     GreenKuboDiffusion,
     MeanPressure,
     RadialDistribution,
@@ -25,6 +26,7 @@ from mdnum.gradients.losses import (
 )
 from mdnum.gradients.problem import Problem
 from mdnum.gradients.recorded import Symmetric
+from mdnum.gradients.tape import pace_of
 from mdnum.rollout.engine import Engine, unwrapped
 from mdnum.systems import build
 
@@ -44,6 +46,25 @@ def run(smooth):
             x.append(unwrapped(np.asarray(simulation.cell.matrix), wrapped, images))
             v.append(segment.unsorted("v", row))
     return SimpleNamespace(simulation=simulation, x=np.stack(x), v=np.stack(v))
+
+
+@pytest.mark.parametrize(("first", "every", "steps"), [(0, 7, 28), (5, 3, 29), (10, 5, 40), (12, 4, 48)])
+def test_a_frame_is_shared_by_the_steps_since_the_frame_before(first, every, steps):
+    """And the first one by the same number of steps before it, so that shares add up to the frames."""
+    pace = pace_of(EinsteinDiffusion(every=every, first=first), steps)
+    found = np.array(
+        [0.004 * pace.share(jnp.int64(step), jnp.float64(0.004)) for step in range(-9, steps + 1)]
+    )
+    frames = range(first, steps + 1, every)
+    expected = [any(0 <= frame - step < every for frame in frames) / every for step in range(-9, steps + 1)]
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    assert found.sum() == pytest.approx(len(frames), rel=1e-13)
+
+
+def test_a_loss_of_one_frame_has_no_pace():
+    for loss in (FinalProjection(), MeanPressure(every=50, first=3)):
+        pace = pace_of(loss, 30)
+        assert not any(float(pace.share(jnp.int64(step), jnp.float64(0.004))) for step in range(31))
 
 
 def g_of_r(run) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -90,6 +91,11 @@ def test_places_and_momenta_stay_whole_and_momentum_is_conserved(liquid):
         total = [sum(int(p) for p in row) for row in momentum]
         start = total if start is None else start
         assert total == start
+    # the unit that a person is told: momenta are whole multiples of it, and have no larger one in common
+    told = liquid.lattice.to_dict(float(liquid.integrator.timestep))["momentum"]
+    counted = liquid.masses[:, None] * rows[-1][1] / told
+    whole = np.rint(counted)
+    assert np.abs(counted - whole).max() < 1e-3 and math.gcd(*map(int, whole.flat)) == 1
 
 
 def relabelled(simulation, labels):

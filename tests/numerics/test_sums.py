@@ -138,6 +138,26 @@ def all_without_a_zero(terms):
     return [reduction(terms).astype(jnp.float64) * 2 for reduction, _ in WRITTEN_OUT]
 
 
+def test_no_term_goes_through_more_additions_than_the_bound_is_made_for():
+    """An addition that counts: a sum is as deep as its deeper addend, and one more."""
+    cases = [
+        (reduction, terms)
+        for reduction in (Sequential(), Blocked(3), Halves(), Twice())
+        for terms in (1, 2, 3, 8, 9)
+    ]
+
+    @jax.jit
+    def depths():
+        return [
+            reduction.sum_of(jnp.zeros(terms), lambda a, b: jnp.maximum(a, b) + 1)
+            for reduction, terms in cases
+        ]
+
+    for (reduction, terms), found in zip(cases, depths(), strict=True):
+        # the first term of a loop is added to zero, which rounds nothing
+        assert int(found) - (not isinstance(reduction, Blocked)) == reduction.depth(terms), (reduction, terms)
+
+
 @pytest.mark.parametrize("dtype", ENDS)
 def test_a_sum_of_an_array_has_the_bits_of_the_loop(dtype):
     # not a multiple of a width: the last node of each tree is short

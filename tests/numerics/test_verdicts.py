@@ -96,6 +96,22 @@ def test_an_end_of_one_run_is_a_fork_by_itself():
     assert verdict.word == "open" and verdict.reasons == (("ended", {**ended, "steps": 0}),)
 
 
+@pytest.mark.parametrize(
+    ("delay", "steps", "told"),
+    [
+        # both splits seen: exactly so many steps later is not more than so many
+        (Delay(100, 150, 500, 500), 49, True), (Delay(100, 150, 500, 500), 50, False),
+        # the one under the first run's decisions not seen: it comes after the last step that is known
+        (Delay(100, None, 500, 149), 49, True), (Delay(100, None, 500, 149), 50, None),
+        # the free one not seen: it comes after the last step that is known, so the delay is at most the rest
+        (Delay(None, 150, 99, 500), 50, False), (Delay(None, 150, 99, 500), 49, None),
+        (Delay(None, None, 99, 149), 0, None),
+    ],
+)  # fmt: skip
+def test_a_delay_is_known_as_far_as_both_runs_were_followed(delay, steps, told):
+    assert delay.beyond(steps) is told
+
+
 def later(*gains: int) -> list[Delay]:
     """Repeats whose flips are worth so many steps."""
     return [Delay(SPLIT - 7, SPLIT - 7 + gain, STEPS - 1, STEPS - 1) for gain in gains]

@@ -225,7 +225,11 @@ def test_a_group_with_its_neighbors_has_the_numbers_of_the_whole(kind: str):
     atoms, system = (crystal(), make(crystal(), LENNARD_JONES, SHORT)) if kind == "crystal" else MIXED
     whole = reference(system).make()
     forces, energies = (whole.get_property(name, atoms) for name in ("forces", "energies"))
-    for cluster, chosen in neighborhoods(atoms, build(system).r_cut, places=5, count=9):
+    groups = list(neighborhoods(atoms, build(system).r_cut, places=5, count=9))
+    # so many groups, each about another atom, and of no more atoms than it takes
+    assert len(groups) == 5 == len({int(chosen[0]) for _, chosen in groups})
+    for cluster, chosen in groups:
+        assert len(set(chosen.tolist())) == 9 < len(cluster)
         seen = reference(system).make()
         np.testing.assert_allclose(seen.get_property("forces", cluster)[:9], forces[chosen], atol=1e-12)
         np.testing.assert_allclose(seen.get_property("energies", cluster)[:9], energies[chosen], atol=1e-12)

@@ -15,6 +15,15 @@ from mdnum.report.finding import Finding, Texts, conclude, fill, restore
 TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
 
 
+def sentences(path: Path) -> list[str]:
+    """Those of a text file: they are in tables; what is outside of these, such as a script, is none."""
+    entries = tomllib.loads(path.read_text())
+    tables = [
+        each for each in (*entries.values(), *entries.get("plots", {}).values()) if isinstance(each, dict)
+    ]
+    return [text for table in tables for text in table.values() if isinstance(text, str)]
+
+
 @pytest.mark.parametrize(
     ("written", "read"),
     [
@@ -100,13 +109,15 @@ def test_variants_replace_and_add_and_a_finding_comes_back_from_a_summary(tmp_pa
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.stem)
 def test_every_sentence_can_be_filled(path):
     """A field that is misspelled or a format that is none would show only when its finding comes up."""
-    entries = tomllib.loads(path.read_text())
-    tables = [*entries.values(), *entries.get("plots", {}).values()]
-    # sentences stand in tables; by itself stands what is no sentence, such as lines of a script
-    for entry in (each for each in tables if isinstance(each, dict)):
-        for text in (each for each in entry.values() if isinstance(each, str)):
-            fields = {name: 2 for _, name, _, _ in string.Formatter().parse(text) if name}
-            assert "{" not in fill(text, fields)
+    for text in sentences(path):
+        fields = {name: 2 for _, name, _, _ in string.Formatter().parse(text) if name}
+        assert "{" not in fill(text, fields)
+
+
+def test_sentences_are_found_with_their_fields():
+    found = {path.stem: sentences(path) for path in TEXTS}
+    for verb in ("audit", "ball", "check", "conform", "flips", "fork", "grad", "run"):
+        assert len(found[verb]) > 40 and sum("{" in text for text in found[verb]) > 10, verb
 
 
 def test_the_headline_names_the_worst_thing():

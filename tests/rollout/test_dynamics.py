@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rollout.harness import liquid, shaken, write_system
 
+from mdnum.md.cell import Cell, wrap_positions
+from mdnum.md.integrators import Langevin
 from mdnum.rollout.engine import Engine, unwrapped
 from mdnum.systems import load
 from mdnum.systems.build import build
@@ -60,6 +65,32 @@ def test_against_a_plain_velocity_verlet(smooth):
     assert np.max(np.abs(found_v.sum(axis=0) - smooth.velocities.sum(axis=0))) < 1e-11
 
 
+def test_what_is_wrapped_into_a_tilted_box_is_unwrapped_to_where_it_was():
+    matrix = np.array([[9.0, 0, 0], [2.5, 8.0, 0], [-1.5, 3.0, 7.0]])
+    x = np.random.default_rng(3).normal(0, 40, (50, 3))
+    wrapped, images = wrap_positions(Cell.create(matrix, np.ones(3, bool)), x)
+    assert (np.abs(images).max(axis=0) > 3).all()
+    np.testing.assert_allclose(unwrapped(matrix, wrapped, images), x, rtol=0, atol=1e-12)
+
+
+def test_noise_and_drift_of_an_atom_do_not_depend_on_its_place_in_the_list():
+    """The same atoms in another order: every number of an atom goes with it."""
+    rng = np.random.default_rng(2)
+    x, v, masses = rng.normal(size=(3, 7)), rng.normal(size=(3, 7)), rng.uniform(0.5, 20.0, 7)
+    integrator = Langevin(*map(jnp.float64, (0.01, 2.0, 1.3)), jax.random.key(4))
+    order = np.array([3, 0, 6, 1, 5, 2, 4])
+    drift = eqx.filter_jit(integrator.drift)
+    drifts = [
+        [np.asarray(one) for one in drift(x[:, k], v[:, k], masses[k], np.int64(9), k)]
+        for k in (np.arange(7), order)
+    ]
+    for ours, theirs in zip(*drifts, strict=True):
+        np.testing.assert_allclose(ours[..., order] if ours.ndim else ours, theirs, rtol=1e-14)
+    # the noise itself: one number for each component, none twice
+    noise = drifts[0][1] - np.exp(-0.02) * v
+    assert len(np.unique(noise)) == 21 and np.abs(noise).min() > 1e-6
+
+
 @pytest.fixture(scope="module")
 def bath(tmp_path_factory):
     return write_system(tmp_path_factory.mktemp("bath"), liquid(rattle=0.03), dynamics=BATH)
@@ -110,10 +141,16 @@ def test_noise_belongs_to_the_atom_and_the_step(bath):
 
 
 def test_velocities_drawn_have_the_temperature_and_no_drift(tmp_path):
+    """Also where masses differ: the total momentum is zero, and not the mean velocity."""
     atoms = liquid(cells=3)
+    atoms.set_masses(np.geomspace(0.1, 10.0, 108))
     simulation = build(load(write_system(tmp_path, atoms, dynamics={"temperature": 0.8, "seed": 5})))
-    v = simulation.velocities
-    assert np.max(np.abs(v.sum(axis=0))) < 1e-12
-    assert (v**2).sum() / (3 * 107) == pytest.approx(0.8, rel=0.15)
+    v, masses = simulation.velocities, atoms.get_masses()
+    assert np.array_equal(simulation.masses, masses)
+    assert np.max(np.abs(masses @ v)) < 1e-12 < 1e-3 < np.max(np.abs(v.mean(axis=0)))
+    thermal = masses[:, None] * v**2
+    assert thermal.sum() / (3 * 107) == pytest.approx(0.8, rel=0.15)
+    # light atoms are as warm as heavy ones
+    assert thermal[:54].sum() / thermal[54:].sum() == pytest.approx(1.0, rel=0.4)
     again = build(load(write_system(tmp_path / "again", atoms, dynamics={"temperature": 0.8, "seed": 5})))
     assert np.array_equal(again.velocities, v)

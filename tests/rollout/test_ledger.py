@@ -23,6 +23,7 @@ from rollout.harness import (
     tables_equal,
     write_system,
 )
+from small_systems import make, mixture
 
 from mdnum.md import decide, foreign
 from mdnum.md.neighbors import VerletList
@@ -131,6 +132,18 @@ def test_a_budget_notices_a_flip_that_was_not_told(fluid, tmp_path):
         assert restored.residual == budget.residual and restored.closes == budget.closes
     assert told.closes and not silent.closes
     assert abs(silent.residual) == pytest.approx(abs(lennard_jones(4.0)), rel=1e-6)
+
+
+def test_a_budget_notices_the_smallest_jump_of_a_mixture():
+    """Jumps ten times apart: a budget with an allowed error of a tenth of the largest hides all others."""
+    depths = {"Ni-Ni": 1.0, "Ni-P": 0.1, "P-P": 0.01}
+    pairs = {pair: {"sigma": 1.0, "epsilon": depth} for pair, depth in depths.items()}
+    potential = {"kind": "lennard-jones", "pairs": pairs}
+    simulation = build(make(mixture(), potential, {"kind": "hard", "radius": 2.0}))
+    smallest = 0.01 * abs(lennard_jones(4.0))
+    assert EnergyBudget(simulation).tolerance == pytest.approx(0.1 * smallest, rel=1e-12)
+    for share, closes in ((1.0, False), (-1.0, False), (0.11, False), (0.09, True)):
+        assert EnergyBudget(simulation, residual=share * smallest).closes == closes
 
 
 def test_a_capacity_that_grows_loses_no_step(fluid, tmp_path, monkeypatch):

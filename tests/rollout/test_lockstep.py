@@ -8,16 +8,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from rollout.harness import CRYSTAL, furthest, history, moved
+from small_systems import KOB_ANDERSEN, make, mixture
 
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.neighbors import PairTable, RebuildRule
+from mdnum.rollout import lockstep as lockstep_module
 from mdnum.rollout.compared import Apart, ReferenceFrame, differ, in_user_order
-from mdnum.rollout.engine import Engine
+from mdnum.rollout.engine import Engine, Segment
 from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import true_pairs
-from mdnum.rollout.lockstep import lockstep
+from mdnum.rollout.lockstep import Counterfactual, lockstep
 from mdnum.rollout.program import pair_margin
-from mdnum.rollout.tracks import Handed
+from mdnum.rollout.tracks import Handed, Overridden, Rows
 from mdnum.systems.build import Simulation, build
 
 FLOAT32 = {f"precision.{role}": "float32" for role in ("force", "decision", "accumulate")}
@@ -110,6 +112,63 @@ def test_every_run_is_compared_with_the_one_that_its_name_says(crystal, alone):
         got = np.concatenate([stretch.separation[name] for stretch in stretches])
         np.testing.assert_allclose(got, furthest(a, one, other), rtol=1e-12)
     assert stretches[0].separation["A|B from A"][0] == 0, "the same start"
+
+
+class Scripted(Handed):
+    """A run of two atoms that goes nowhere; how far the decisions it is given are from its own is written."""
+
+    def __init__(self, furthest: list[float]):
+        self.failed, self._left, self._step = "", furthest, 0
+
+    def follow(self, segment: Segment) -> tuple[Rows, Overridden]:
+        count, first = segment.rows, self._step
+        note, self._left = np.array(self._left[:count]), self._left[count:]
+        self._step += count
+        x = np.zeros((count, 3, 2)) + np.arange(first, first + count)[:, None, None]
+        return Rows(first, x, x, x[:, 0, 0].copy()), Overridden(np.arange(first, first + count), note)
+
+
+@pytest.mark.parametrize("guard", [0.5, None])
+@pytest.mark.parametrize("asked", [[9], [0, 1, 2, 3, 4, 9], [2, 5, 9]])
+def test_a_counterfactual_ends_before_the_first_decision_beyond_its_guard(crystal, guard, asked):
+    """Beyond means more than: the guard itself is still a decision that rounding could have changed."""
+    furthest = [0.0, 0.1, 0.2, 0.5, 0.1, 0.0, 0.51, 0.0, 9.0, 0.0]
+    run = Counterfactual(Scripted(furthest), guard)
+    whole = next(iter(Engine(crystal, STEPS).segments()))
+    for first, last in ((0, 3), (4, 8), (9, 9)):
+        run(replace(whole, first=first, rows=last - first + 1))
+    end = 10 if guard is None else 6
+    seen = []
+    for last in asked:
+        rows, note = run.until(last)
+        if rows is None:
+            assert len(seen) == end and not len(note.count)
+            continue
+        steps = list(range(rows.first, rows.first + len(rows)))
+        assert rows.energy.tolist() == note.count.tolist() == steps
+        assert note.furthest.tolist() == furthest[rows.first : rows.first + len(rows)]
+        seen += steps
+        assert seen == list(range(min(last + 1, end)))
+    assert len(seen) == end
+
+
+@pytest.mark.parametrize("compare", ["r2 <", "r <"])
+def test_the_nearest_decision_of_a_mixture_is_no_further_than_any_pair_from_its_cutoff(compare):
+    """As a length, from a margin that does not say whose cutoff it was: the longest is the safe one."""
+    cutoff = {"kind": "hard", "radius": 2.5, "pairs": {"Ni-P": 1.4, "P-P": 0.8}, "compare": compare}
+    simulation = build(make(mixture(), KOB_ANDERSEN, cutoff))
+    radii, away = np.array(simulation.decider.r_cut), np.array([-0.3, -1e-3, 1e-9, 0.02, 0.4])
+    r = radii[:, None] + away
+    margin = (radii[:, None] ** 2 - r**2 if compare == "r2 <" else radii[:, None] - r).ravel()
+    x = np.zeros((margin.size, 3, 1))
+    for smallest in (np.abs(margin), np.full(margin.size, np.inf)):
+        rows = Rows(0, x, x, np.zeros(margin.size), nearest=smallest)
+        told = lockstep_module._nearest(simulation, rows, rows)
+        true = np.where(np.isinf(smallest), np.inf, np.abs(np.tile(away, len(radii))))
+        assert (told <= true * (1 + 1e-6)).all() and (told > 0).all()
+    # of the longest cutoff it is that distance, of pairs outside
+    outside = Rows(0, x[:3], x[:3], np.zeros(3), nearest=np.abs(margin.reshape(3, 5)[np.argmax(radii), 2:]))
+    np.testing.assert_allclose(lockstep_module._nearest(simulation, outside, outside), away[2:], rtol=1e-5)
 
 
 def test_one_wrong_decision_is_found():

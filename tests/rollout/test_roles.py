@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from ase.build import bulk
 from oracles import all_pairs
 from rollout.harness import assert_ledger_is_complete, frames_of, go, liquid, write_system
 
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.flips import PairRecorder
+from mdnum.systems import load
+from mdnum.systems.build import build
+
+ARGON = {"sigma": 1.0, "epsilon": 1.0}
 ROLES = ("state", "force", "decision", "accumulate")
 NARROW = {f"precision.{role}": "float32" for role in ROLES}
 
@@ -82,20 +90,36 @@ def test_one_narrow_role_at_a_time(path, tmp_path, role):
 
 
 def test_ambiguous_pairs_are_counted_where_a_shell_sits_at_the_cutoff(tmp_path):
-    """A perfect crystal whose second shell is at r_cut but for rounding: each of those pairs is in doubt."""
-    from ase.build import bulk
-
+    """A perfect crystal whose second shell is inside the cutoff of its large atoms by less than their bound;
+    the first shell of its small ones is outside theirs by more than their bound, which is a smaller one."""
     # 1.7 has rounding in every coordinate
     atoms = bulk("Ar", "fcc", a=1.7, cubic=True) * (3, 3, 3)
     atoms.positions += 0.1234567
-    path = write_system(
-        tmp_path, atoms, cutoff={"radius": 1.7}, neighbors={"skin": 0.6}, dynamics={"temperature": 0.0}
-    )
-    result, folder = go(tmp_path, path, 70, save_every=1)
-    series = folder.read("series")
-    assert series["ambiguous"][0] == 108 * 6 // 2
-    _, _, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
+    atoms.symbols[:31] = "Ne"
+    shells = {"Ar-Ar": 1.7**2, "Ne-Ne": 1.7**2 / 2}
+    shares = {"Ar-Ar": 0.85, "Ne-Ne": -3.0}
+
+    def written(bounds):
+        """The system with its cutoffs so far from the shells as a multiple of their bounds."""
+        radii = {kind: float(np.sqrt(r2 + shares[kind] * bounds[kind])) for kind, r2 in shells.items()}
+        return write_system(
+            tmp_path, atoms, cutoff={"radius": 1.5, "pairs": radii}, neighbors={"skin": 0.4},
+            dynamics={"temperature": 0.0}, precision={"decision": "float32"},
+            potential={"kind": "lennard-jones", "pairs": dict.fromkeys((*shells, "Ar-Ne"), ARGON)},
+        )  # fmt: skip
+
+    first = build(load(written(dict.fromkeys(shells, 0.0))))
+    species, decider = first.system.species, first.decider
+    of_type = dict(zip(itertools.combinations_with_replacement(species, 2), decider.bounds, strict=True))
+    bounds = {kind: of_type[tuple(kind.split("-"))] for kind in shells}
+    assert bounds["Ar-Ar"] > 1.4 * bounds["Ne-Ne"]
+    simulation = build(load(written(bounds)))
+    (segment,) = Engine(simulation, 0).segments()
+    i, j, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
     at_shell = np.abs((d**2).sum(axis=1) - 1.7**2) < 1e-9
-    assert at_shell.sum() == 108 * 6 // 2
-    assert series["min_margin"][0] <= result.simulation.decider.bounds[0]
-    assert result.summary["ambiguous"] == series["ambiguous"].sum()
+    large = np.array(atoms.symbols) == "Ar"
+    doubtful = PairRecorder(simulation).doubtful(segment)
+    expected = at_shell & large[i] & large[j]
+    assert np.array_equal(np.stack([doubtful.i, doubtful.j]), np.stack([i, j])[:, expected])
+    assert PairRecorder(simulation).ambiguous(segment).tolist() == [expected.sum()] and expected.sum() > 100
+    assert bounds["Ne-Ne"] < segment.rows_of("nearest")[0] < bounds["Ar-Ar"]

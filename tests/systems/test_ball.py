@@ -240,7 +240,7 @@ def test_a_tolerance_below_what_a_role_can_tell_from_zero(files: dict[str, Path]
     said = refusal(files["projection"], {key: name, "stop.tol": repr(least / 2)})
     assert f"too small for {name}" in said
     assert key in said
-    assert f"smallest usable tolerance is {least:.3g}" in said
+    assert f"{least:.3g}" in said
     load(files["projection"], {key: name, "stop.tol": repr(least)})
     if name in ("float16", "float32"):
         over = repr(float(limits.max) * 4)

@@ -120,22 +120,30 @@ ITEM: TIMESTEP
 ITEM: NUMBER OF ATOMS
 3
 ITEM: BOX BOUNDS xy xz yz pp pp ff
--1.0 9.5 1.5
-2.0 10.0 -1.0
-0.0 8.0 0.25
+{bounds}
 ITEM: ATOMS id element {columns}
 {rows}
 """
 
 
-def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path):
-    # bounds are those around the tilted box, whose corner is at 0, 2, 0
-    matrix = np.array([[8.0, 0, 0], [1.5, 7.75, 0], [-1.0, 0.25, 8.0]])
+# in each of them another corner of the box is the first along x, and another the last
+@pytest.mark.parametrize(
+    "tilt", [(1.5, -1.0, 0.25), (-2.0, -0.5, -0.75), (-1.0, 3.0, -0.5), (2.0, 0.5, 0.75)], ids=str
+)
+def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path, tilt):
+    matrix, origin = np.diag([8.0, 7.75, 8.0]), np.array([0.5, 2.0, -1.0])
+    matrix[1, 0], matrix[2, 0], matrix[2, 1] = tilt
+    # bounds are those around the corners of the tilted box
+    corners = origin + np.array(list(np.ndindex(2, 2, 2))) @ matrix
+    bounds = "\n".join(
+        f"{low} {high} {value}"
+        for low, high, value in zip(corners.min(axis=0), corners.max(axis=0), tilt, strict=True)
+    )
     scaled = np.array([[0.1, 0.2, 0.3], [0.5, -0.25, 1.5], [0.0, 0.0, 0.0]])
     text = ""
     for step, order in ((0, (0, 1, 2)), (5, (2, 0, 1))):
         rows = "\n".join(f"{k + 1} {'OHH'[k]} {' '.join(map(repr, scaled[k].tolist()))} 1 2 3" for k in order)
-        text += DUMP.format(time=0.5 * step, step=step, columns="xs ys zs vx vy vz", rows=rows)
+        text += DUMP.format(time=0.5 * step, step=step, bounds=bounds, columns="xs ys zs vx vy vz", rows=rows)
     (tmp_path / "run.lammpstrj").write_text(text)
     trajectory = open_trajectory(tmp_path / "run.lammpstrj")
     frames = list(trajectory.frames())
@@ -143,9 +151,9 @@ def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path
     assert trajectory.species.tolist() == ["O", "H", "H"]
     assert [frame.time for frame in frames] == [0.0, 2.5]
     for frame in frames:
-        np.testing.assert_allclose(frame.box.matrix, matrix, atol=1e-15)
+        np.testing.assert_allclose(frame.box.matrix, matrix, atol=1e-14)
         assert frame.box.pbc.tolist() == [True, True, False]
-        np.testing.assert_allclose(frame.positions, np.array([0.0, 2.0, 0.0]) + scaled @ matrix, atol=1e-15)
+        np.testing.assert_allclose(frame.positions, origin + scaled @ matrix, atol=1e-14)
         np.testing.assert_array_equal(frame.velocities, [[1, 2, 3]] * 3)
 
 
@@ -160,7 +168,9 @@ def test_a_lammps_dump_agrees_with_ase():
 
 
 def test_lammps_atoms_without_ids_are_refused(tmp_path):
-    text = DUMP.format(time=0, step=0, columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2").replace("id ", "")
+    text = DUMP.format(
+        time=0, step=0, bounds="0 9 0\n0 9 0\n0 9 0", columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2"
+    ).replace("id ", "")
     (tmp_path / "run.dump").write_text(text)
     with pytest.raises(InputError, match="no ids"):
         open_trajectory(tmp_path / "run.dump")

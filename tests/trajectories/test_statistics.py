@@ -28,6 +28,7 @@ from mdnum.trajectories.statistics import (
     Classes,
     ClassTally,
     Durations,
+    Lifetime,
     Residues,
     again,
     mean_by_rate,
@@ -125,6 +126,11 @@ def test_a_worked_example_of_survival() -> None:
     # Greenwood by hand: S(2)^2 (1/(5*4) + 2/(4*2))
     np.testing.assert_allclose(found.error[:2], [0.8 * (1 / 20) ** 0.5, 0.4 * (1 / 20 + 2 / 8) ** 0.5])
     assert found.mean == pytest.approx(1 + 0.8 + 2 * 0.4)
+    # the first frames at which at most three quarters, half and a quarter are left
+    lifetime = Lifetime.of(Durations(*counts))
+    assert (lifetime.quarter_gone, lifetime.median, lifetime.three_quarters_gone) == (2, 2, 4)
+    assert (lifetime.followed, lifetime.leaves, lifetime.longest) == (5, 4, found.longest)
+    assert lifetime.mean == found.mean and lifetime.mean_is_whole
     # 4 leaves in 1 + 2 + 2 + 4 frames inside, and 2 more after which the last one was seen to stay
     assert mean_by_rate(Durations(*counts)) == (11 / 4, 11 / 8)
 

@@ -23,7 +23,7 @@ from other_package import install
 
 import mdnum
 from mdnum.audit import checks
-from mdnum.audit.base import CheckResult, Meter, answers, finding, in_order
+from mdnum.audit.base import TIME_UP, CheckResult, Meter, answers, finding, in_order
 from mdnum.audit.causes import heads
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
@@ -240,10 +240,12 @@ def test_findings_add_up_to_two_answers(parts, answer, headline):
 
 def test_checks_that_were_not_selected_are_named_and_a_measured_number_is_not_nothing():
     every = [part(name) for name in CHECKS]
-    assert "9 checks found nothing. Not asked: stress, and elements" in judged(every)[2]
+    headline = judged(every)[2]
+    assert f" {len(CHECKS)} checks" in headline and "stress" in headline
+    assert not [name for name in CHECKS if name in headline]
     headline = judged([part("forces", ("A", "info")), *every[1:-1]])[2]
-    assert f"{len(CHECKS) - 1} checks found no errors or warnings" in headline
-    assert "Ar, and the checks of dynamics." in headline
+    assert f" {len(CHECKS) - 1} checks" in headline
+    assert [name for name in CHECKS if name in headline] == [list(CHECKS)[-1]] == ["dynamics"]
 
 
 def test_no_bound_is_below_the_largest_error(good):
@@ -259,7 +261,7 @@ def test_what_is_largely_unasked_is_not_safe():
     few = part("invariance", asked=11, possible=52)
     run, differentiate, headline = judged([parts[0], few, *parts[2:]])
     assert (run, differentiate) == ("as far as asked", "yes")
-    assert "11 of 52 ways of invariance" in headline and "safe to run" not in headline
+    assert "11 of 52" in headline and "invariance" in headline and "safe to run" not in headline
     # nearly all of its ways is enough, nothing at all is not
     assert judged([parts[0], part("invariance", asked=50, possible=52), *parts[2:]])[0] == "yes"
     run, differentiate, headline = judged([], every)
@@ -267,7 +269,7 @@ def test_what_is_largely_unasked_is_not_safe():
     # nothing is safe as long as a check that it needs has not begun
     run, differentiate, headline = judged([few, *parts[:1]], every)
     assert run == differentiate == "not asked"
-    assert headline.startswith("x on Ar: nothing can be said yet (11 of 52")
+    assert headline.startswith("x on Ar: ") and "11 of 52" in headline
     run, differentiate, headline = judged([few, *parts[:1], *parts[2:4]], every)
     assert (run, differentiate) == ("not asked", "yes") and "safe to differentiate" in headline
     # codes that do not bear on a question
@@ -357,7 +359,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     summary = json.loads((tmp_path / "cut/summary.json").read_text())
     assert [one["name"] for one in summary["parts"]] == ["forces"]
     assert summary["status"] == "unfinished"
-    assert summary["headline"].startswith("Not finished: invariance comes next.")
+    assert "invariance" in summary["headline"]
     assert call("report", "cut") == 0
     assert "invariance not asked" in (tmp_path / "cut/report.html").read_text()
     asked.clear()
@@ -395,8 +397,8 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     assert cut.summary["status"] == frame.PARTIAL
     ways = {one["name"]: one for one in cut.summary["parts"]}["curl"]
     assert 1 < ways["asked"] < ways["possible"] == 11
-    assert f"{ways['asked']} of 11 ways of curl, invariance not asked" in cut.summary["headline"]
-    left = {"what": "the check of invariance", "why": "the time was up", "part": "invariance"}
+    assert f"{ways['asked']} of 11" in cut.summary["headline"] and "invariance" in cut.summary["headline"]
+    left = {"what": "the check of invariance", "why": TIME_UP, "part": "invariance"}
     assert left in cut.summary["left_out"]
     # asked again, and not as far: nothing that was known is lost
     Spent.looks = 3

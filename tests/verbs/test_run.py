@@ -218,8 +218,8 @@ def test_lost_pairs_come_with_numbers_and_a_remedy_and_before_what_follows_from_
     finding = verdict.findings[0]
     assert (verdict.tone, finding.code, len(verdict.evidence)) == ("error", "LOST_PAIRS", 4)
     assert finding.values == {"lost": 3, "pair_steps": 1108, "since": 25, "every": 20}
-    assert "blindly every 20 steps" in finding.remedy
-    assert verdict.headline.startswith("The neighbor list lost 3")
+    assert "every 20 steps" in finding.remedy
+    assert verdict.headline.startswith(finding.title[0].upper() + finding.title[1:])
     series = with_row(good.series, 77, pairs=1)
     first, *rest = judge(changed(good, {"energy_budget_closes": False}, epochs=lost, series=series)).findings
     assert [first.code, *(each.code for each in rest[:2])] == ["LOST_PAIRS", "EVENT_ALGEBRA", "BUDGET_OPEN"]
@@ -303,7 +303,7 @@ def test_findings_are_stored_and_decided_again(tmp_path):
     folder.write_summary({**stored, "ase": {"ok": True}, "findings": [*stored["findings"], other]})
     second = frame.finish(folder, report=False)
     assert [each.code for each in second.verdict.findings] == ["FINDERS_DISAGREE", "HARD_CUTOFF"]
-    assert second.verdict.headline.endswith("Look first: finders disagree.")
+    assert other["title"] in second.verdict.headline
 
 
 def test_a_killed_run_is_judged_up_to_its_checkpoint_and_none_without_a_step(tmp_path):
@@ -514,7 +514,7 @@ def test_sort_search_and_pages(tmp_path):
     assert seen["steps"] == f"{int(within.sum()):,} of {total:,} rows"
     assert set(seen["step_cells"]) <= {"10", "11", "12"}
     assert seen["none"] == f"0 of {total:,} rows"
-    assert seen["unknown"] == "“colour” is not understood"
+    assert "“colour”" in seen["unknown"]
     # nothing sticks out of a phone's screen (headless browsers do not go below 500 pixels)
     assert seen["width"] <= 500
 

@@ -9,7 +9,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, finding
-from mdnum.audit.noise import FEW, NoiseFloor, settled
+from mdnum.audit.noise import NoiseFloor, settled
 from mdnum.audit.structures import molecules, nearest_distance, whole
 from mdnum.audit.subject import CalculatorSubject, largest
 
@@ -35,7 +35,7 @@ class AloneCheck(AuditCheck):
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Single atoms, and an atom far from a cluster."""
         with subject.meter.limited():
-            self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed), at_least=FEW))
+            self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
         return CheckResult(
             says=(

@@ -12,17 +12,8 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import (
-    AuditCheck,
-    CalculatorError,
-    CheckResult,
-    Observed,
-    Progress,
-    Severity,
-    Ways,
-    finding,
-)  # fmt: skip
-from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
+from mdnum.audit.base import AuditCheck, CheckResult, Observed, Progress, Severity, Ways, finding
+from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject, Forces, bits, differences, largest
 
 #: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
@@ -45,7 +36,7 @@ class CallerCheck(AuditCheck):
         """Every question, each with an object of its own."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
-            atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
+            atoms, noise = settled(subject.fresh(), rng)
         changes = _changes(atoms, np.random.default_rng(self.seed))
         questions: dict[str, Callable[[], Iterator[Observed]]] = {
             **{
@@ -164,18 +155,13 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     finally:
         for put, state in kept:
             put(state)
-    told: dict[str, tuple[str, Severity, bool]] = {
-        "asked": ("asked", "error", True),
-        "made": ("made", "warning", True),
-        "drawn": ("asked", "info", False),
-    }
-    for variant, (when, severity, seeded) in told.items():
-        pairs = {name: states[when, name] for name in generators}
-        names = [
-            name
-            for name, ((before, after), (_, other)) in pairs.items()
-            if before != after and (after == other) is seeded
-        ]
+    told: dict[str, Severity] = {"asked": "error", "made": "warning", "drawn": "info"}
+    for variant, severity in told.items():
+        names = []
+        for name in generators:
+            (before, after), (_, other) = states["made" if variant == "made" else "asked", name]
+            if before != after and (after == other) is (variant != "drawn"):
+                names.append(name)
         if names:
             yield finding("RANDOM_SEEDED", severity, variant, which=" and ".join(names))
             return
@@ -187,7 +173,7 @@ def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
     for given, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other, there = subject.fresh(), given.copy()
         other.copies = False
-        if isinstance(other.try_both(there), CalculatorError):
+        if not other.answers(there):
             continue  # reported elsewhere
         both = zip(("positions", "numbers", "cell", "pbc"), bits(given), bits(there), strict=True)
         if changed := [word for word, before, after in both if before.tobytes() != after.tobytes()]:

@@ -11,7 +11,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
-from mdnum.audit.noise import FEW, NoiseFloor, displaced, rounding, settled
+from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
 #: Å; the loop with the smaller error counts.
@@ -60,10 +60,10 @@ class CurlCheck(AuditCheck):
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
         with subject.meter.limited():
-            atoms, noise = settled(worker, rng, at_least=FEW, brief=self.brief)
+            atoms, noise = settled(worker, rng, brief=self.brief)
             wanted = list(_planes(worker, atoms, rng))
 
-        def asked(plane: tuple[str, Displacement, Displacement], noise: NoiseFloor = noise) -> Loop:
+        def asked(plane: tuple[str, Displacement, Displacement]) -> Loop:
             name, u, v = plane
             return agreed([around(worker, atoms, u, v, radius, noise, name) for radius in radii])
 
@@ -71,10 +71,6 @@ class CurlCheck(AuditCheck):
             worker, wanted, lambda plane: f"a loop of {plane[0]}", asked, progress, self.name, spread=True,
             required=True, most=1 if self.brief else None,
         )  # fmt: skip
-        if self.brief and not all(one.conservative for one in found.values()):
-            # before forces are called wrong, how coarsely they are rounded
-            louder = noise.louder(rounding(worker, atoms))
-            found = {place: asked(wanted[place], louder) for place in found}
         loops = list(found.values())
         wrong = [one for one in loops if not one.conservative]
         worst = max(wrong, key=lambda one: one.share, default=None)

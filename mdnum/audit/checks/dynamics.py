@@ -104,7 +104,7 @@ class DynamicsCheck(AuditCheck):
                 numbers={"steps": after, "blew_up": True, "drift": None},
             )
         if self.brief:
-            noise = settled(subject.fresh(), np.random.default_rng(self.seed), FEW, brief=True)[1]
+            noise = settled(subject.fresh(), np.random.default_rng(self.seed), brief=True)[1]
             return _brief(whole, _aged(subject, whole, _FEW_COMPARED, noise), subject.units)
         half, _ = run(subject.fresh(), start, step / 2, 2 * count, each(count + count // 4))
         probe = subject.fresh()

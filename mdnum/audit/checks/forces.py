@@ -23,19 +23,7 @@ from mdnum.audit.base import (
     finding,
 )
 from mdnum.audit.checks import invariance
-from mdnum.audit.noise import (
-    FEW,
-    NoiseFloor,
-    along_a_line,
-    digits,
-    direction,
-    displaced,
-    order_change,
-    precision,
-    rounding,
-    settled,
-    steps,
-)  # fmt: skip
+from mdnum.audit.noise import NoiseFloor, digits, direction, displaced, measured, precision, settled, steps
 from mdnum.audit.places import WrongPlaces, wrong_places
 from mdnum.audit.subject import CalculatorSubject, no_rounding, rms
 
@@ -109,7 +97,7 @@ class ForcesCheck(AuditCheck):
         worker = subject.fresh()
         ways = Ways()
         with subject.meter.limited():
-            atoms, noise = settled(worker, rng, at_least=FEW, brief=self.brief)
+            atoms, noise = settled(worker, rng, brief=self.brief)
             summed = 0.0
             if not self.brief and not steps(worker, atoms).energy:
                 summed = worker.known["order"][1].energy
@@ -132,14 +120,6 @@ class ForcesCheck(AuditCheck):
             lambda way: slope(worker, atoms, way[1], forces, noise, way[0]),
             progress, self.name, spread=True, required=True, most=1 if self.brief else None,
         )  # fmt: skip
-        if self.brief and not (
-            all(one.agrees for one in found.values())
-            and all(row["found"] <= row["rounding explains"] for row in _sums(atoms, forces, noise))
-        ):
-            # before forces are called wrong, how coarsely answers are rounded
-            noise = noise.louder(rounding(worker, atoms))
-            for place in found:
-                found[place] = slope(worker, atoms, wanted[place][1], forces, noise, wanted[place][0])
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = [
             finding(
@@ -171,23 +151,29 @@ class ForcesCheck(AuditCheck):
             if not any(one.severity == "error" for one in drowned):
                 observed += precision(worker, atoms, noise)
             observed += _two_energies(worker, atoms, noise, wanted[first][1], found[first])
-        values = _values(slopes, unclear, scale)
-        if unclear and not observed:  # otherwise that is why
-            observed.append(finding("NOISE_FLOOR", "warning", "some", **values))
-        clear = len(slopes) > len(unclear)
-        says = ["forces_right", "forces_unclear"] if unclear else ["forces_right"]
-        if values["wrong"]:
-            says = ["forces_wrong"]
-        elif known > _DROWNED * scale or not clear:
-            says = ["forces_drowned"]
         numbers = {
-            "directions": len(slopes), "disagree": values["wrong"], "could_not_tell": len(unclear),
-            "largest_difference": values["gap"], "largest_error": values["error"], "rms_force": scale,
+            "directions": len(slopes), "disagree": sum(not one.agrees for one in slopes),
+            "could_not_tell": len(unclear), "largest_difference": max(one.gap for one in slopes),
+            "largest_error": max(one.error for one in slopes), "rms_force": scale,
             # the structure is displaced: in a perfect crystal, too, there would be a force
             "nothing_felt": scale <= max(noise.force, _NOTHING)
             and all(abs(one.difference) <= max(_SIGNIFICANT * one.error, _NOTHING) for one in slopes),
             "step": _worst(slopes).step, "noise_energy": noise.energy, "noise_force": noise.force,
         }  # fmt: skip
+        clear = [one for one in slopes if not any(one is other for other in unclear)]
+        gap, error = (max(getattr(one, name) for one in clear or slopes) for name in ("gap", "error"))
+        values: dict[str, Any] = numbers | {
+            "clear": len(clear or slopes), "clear_gap": gap, "clear_error": error,
+            "clear_bound": max(gap, error), "unclear_direction": unclear[0].direction if unclear else "",
+            "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
+        }  # fmt: skip
+        if unclear and not observed:  # otherwise that is why
+            observed.append(finding("NOISE_FLOOR", "warning", "some", **values))
+        says = ["forces_right", "forces_unclear"] if unclear else ["forces_right"]
+        if numbers["disagree"]:
+            says = ["forces_wrong"]
+        elif known > _DROWNED * scale or not clear:
+            says = ["forces_drowned"]
         return CheckResult(
             says=(says, values),
             findings=observed,
@@ -202,19 +188,6 @@ class ForcesCheck(AuditCheck):
         )
 
 
-def _values(slopes: list[Slope], unclear: list[Slope], scale: float) -> dict[str, Any]:
-    clear = [one for one in slopes if not any(one is other for other in unclear)] or slopes
-    gap, error = max(one.gap for one in clear), max(one.error for one in clear)
-    return {
-        "directions": len(slopes), "clear": len(clear), "wrong": sum(not one.agrees for one in slopes),
-        "gap": max(one.gap for one in slopes), "error": max(one.error for one in slopes),
-        "clear_gap": gap, "clear_error": error, "clear_bound": max(gap, error),
-        "scale": scale, "unclear": len(unclear),
-        "unclear_direction": unclear[0].direction if unclear else "",
-        "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
-    }  # fmt: skip
-
-
 def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> tuple[Atoms, NoiseFloor]:
     """The atoms that are nearest to one of them, without periods, and the noise there."""
     away = atoms.get_distances(0, range(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
@@ -222,8 +195,7 @@ def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -
     there = Atoms(atoms.numbers[nearest], away[nearest])
     there.positions += 1.0 - there.positions.min(axis=0)
     there.set_cell([_BOX] * 3)
-    noise = along_a_line(subject, there, rng)
-    return there, noise.louder(order_change(subject, there, noise, rng)[1])
+    return there, measured(subject, there, rng)
 
 
 def _worst(slopes: list[Slope]) -> Slope:

@@ -12,9 +12,9 @@ from ase import Atoms
 from jaxtyping import Float, Int
 
 from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
-from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, order_change, settled, under_jitter
+from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, measured, settled, under_jitter
 from mdnum.audit.places import wrong_places
-from mdnum.audit.structures import group, nearest_distance
+from mdnum.audit.structures import group, modified, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 
 #: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
@@ -120,18 +120,14 @@ class InvarianceCheck(AuditCheck):
         differences = list(found.values())
         wrong = [one for one in differences if not one.agrees]
         worst = max(wrong or differences, key=lambda one: one.energy, default=None)
-        values = {
-            "ways": len(differences), "wrong": len(wrong), "refused": len(refused),
-            "noise": judge.noise.energy, "energy": worst.energy if worst else 0.0,
-            "worst": worst.same.what if worst else "",
-            "force": max((one.force for one in wrong), default=0.0),
-        }  # fmt: skip
         numbers = {
             "ways": len(differences), "told_apart": len(wrong), "refused": len(refused),
             "noise_energy": judge.noise.energy, "noise_force": judge.noise.force,
             "largest": max((one.energy for one in differences), default=0.0),
             "largest_force": max((one.force for one in differences), default=0.0),
         }  # fmt: skip
+        values = {"energy": worst.energy, "worst": worst.same.what} if worst else {}
+        values |= numbers | {"force": max((one.force for one in wrong), default=0.0)}
         says = "invariance_wrong" if wrong else "invariance_right" if differences else "invariance_none"
         return CheckResult(
             says=([says, "invariance_refused"] if refused else [says], values),
@@ -216,7 +212,7 @@ class _Judge:
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
-        self.atoms, self.noise = settled(self.worker, rng)
+        self.atoms, self.noise = settled(self.worker, rng, at_least=1)
         self.notes: list[Observed] = []
         # by structures, which are kept so that their ids are theirs
         self._known: dict[tuple[int, int], tuple[Atoms, float, Forces, NoiseFloor]] = {}
@@ -236,8 +232,7 @@ class _Judge:
                 noise = found.allowed
                 for there, copies in ((base, 1), (same.atoms, same.copies)):
                     other = self.subject.fresh()
-                    line = along_a_line(other, there, self._rng)
-                    line = line.louder(order_change(other, there, line, self._rng)[1]).allowed
+                    line = measured(other, there, self._rng).allowed
                     noise = noise.louder(replace(line, energy=line.energy / copies))
                 found = replace(found, allowed=noise)
             # who stands alone may have answered so by chance, and is asked again
@@ -417,7 +412,9 @@ def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
         rounding = 2 * float(np.spacing(np.max(np.abs(cell))))
         for toward, word in ((np.inf, "larger"), (0.0, "smaller")):
             # away from zero, whatever the sign, and zeros stay zeros
-            there = _in_cell(base, np.where(cell == 0, cell, np.nextafter(cell, np.copysign(toward, cell))))
+            there = modified(
+                base, cell=np.where(cell == 0, cell, np.nextafter(cell, np.copysign(toward, cell)))
+            )
             yield _same("CELL_ULP", base, f"cell one ulp {word}{what}", there, rounding=rounding, before=base)
 
 
@@ -465,7 +462,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
         ("a and b exchanged", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
         ("c replaced by -c", [[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
     ):
-        there = _in_cell(atoms, np.array(matrix) @ atoms.cell.array)
+        there = modified(atoms, cell=np.array(matrix) @ atoms.cell.array)
         code = "LATTICE" if np.linalg.det(matrix) > 0 else "LEFT_HANDED"
         yield _same(code, atoms, f"the same lattice, {what}", there)
 
@@ -485,15 +482,13 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         if np.linalg.det(turn) < 0:
             # the same lattice by vectors that are not left-handed for it, which is another question
             cell[np.argmax(np.abs(cell[:, 0]))] *= -1
-        there = _in_cell(atoms, cell)
-        there.positions = atoms.positions @ turn.T
+        there = modified(atoms, cell=cell, positions=atoms.positions @ turn.T)
         yield _same(code, atoms, what, there, factor=4, turn=turn)
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
     """A cluster in cells that do not repeat: what is written in them must not matter."""
-    base = _in_cell(atoms, np.zeros((3, 3)))
-    base.pbc = False
+    base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
         ("a large one", np.diag([span] * 3)),
@@ -501,18 +496,12 @@ def without_periods(atoms: Atoms) -> Iterator[Same]:
         ("a skewed one", np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 2.0, 6.0]])),
     ):
         what = f"without periods, in {what}"
-        yield _same("DUMMY_CELL", base, what, _in_cell(base, cell), rounding=0.0, before=base)
+        yield _same("DUMMY_CELL", base, what, modified(base, cell=cell), rounding=0.0, before=base)
 
 
 def _wrapped(atoms: Atoms) -> Atoms:
     there = atoms.copy()
     there.wrap(eps=0)
-    return there
-
-
-def _in_cell(atoms: Atoms, cell: np.ndarray) -> Atoms:
-    there = atoms.copy()
-    there.set_cell(cell)
     return there
 
 

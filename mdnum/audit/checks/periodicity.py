@@ -9,7 +9,7 @@ from ase import Atoms
 
 from mdnum.audit.checks.invariance import InvarianceCheck, Same, ulp
 from mdnum.audit.noise import displaced
-from mdnum.audit.structures import FARTHEST, nearest_distance
+from mdnum.audit.structures import FARTHEST, modified, nearest_distance
 
 #: Of the nearest distance: length of a free vector with which every atom would feel its own image.
 _SHORT = 1.3
@@ -27,9 +27,8 @@ class PeriodicityCheck(InvarianceCheck):
         """Slab and wire, written down in many ways."""
         axes = np.flatnonzero(atoms.pbc)
         if not len(axes) and len(atoms):  # a molecule that repeats along x
-            atoms, axes = atoms.copy(), np.array([0])
             apart = float(np.ptp(atoms.positions[:, 0])) + 1.2 * (nearest_distance(atoms) or 4.0)
-            atoms.set_cell(np.diag([apart, 0.0, 0.0]))
+            atoms, axes = modified(atoms, cell=np.diag([apart, 0.0, 0.0])), np.array([0])
         wanted = {tuple(axes[:2]): None, tuple(axes[-1:]): None}
         for repeating in wanted:
             yield from mixed(atoms, np.isin(range(3), repeating), rng)
@@ -71,10 +70,8 @@ def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Itera
 
 def _with(atoms: Atoms, periodic: np.ndarray, free: np.ndarray) -> Atoms:
     """The structure with other vectors along its free axes, in a right-handed cell."""
-    there, cell = atoms.copy(), atoms.cell.array.copy()
+    cell = atoms.cell.array.copy()
     cell[~periodic] = free
     if np.linalg.det(cell) < 0:
         cell[np.flatnonzero(~periodic)[-1]] *= -1
-    there.set_cell(cell)
-    there.pbc = periodic
-    return there
+    return modified(atoms, cell=cell, pbc=periodic)

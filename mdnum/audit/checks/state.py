@@ -9,22 +9,10 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import (
-    CALLS_UP,
-    TIME_UP,
-    AuditCheck,
-    CalculatorError,
-    CallsUp,
-    CheckResult,
-    Observed,
-    Progress,
-    Skipped,
-    TimeUp,
-    finding,
-)
-from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
+from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed, Progress, Ways, finding
+from mdnum.audit.noise import NoiseFloor, digits, displaced, settled
 from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
-from mdnum.audit.structures import pairs
+from mdnum.audit.structures import modified, pairs
 from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
 
@@ -53,29 +41,29 @@ class StateCheck(AuditCheck):
         """One object, asked again and again, beside new ones."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
-            atoms, noise = settled(subject.fresh(), rng, at_least=FEW, brief=self.brief)
+            atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
             if self.brief:
                 return self._brief(subject, atoms, rng)
         # two atoms first, which most calculators answer for quickly
-        approached, skipped = _approached(subject)
+        approached, ways = _approached(subject)
         sequences = approached | all_sequences(atoms, rng)
-        total, done = sum(map(len, sequences.values())), 0
         rows: list[Comparison] = []
-        for name, sequence in sequences.items():
-            left = sum(one.compared for one in sequence)
-            try:
-                with subject.meter.limited():
-                    for reached, row in _through(subject, sequence, noise, name):
-                        rows.append(row)
-                        left -= 1
-                        progress(done + reached, total, {"phase": "state", "unit": "structures"})
-            except TimeUp as up:
-                skipped.append((f"{left} questions of the sequence “{name}”", up.why))
-            done += len(sequence)
-        if not rows and any(why in (TIME_UP, CALLS_UP) for _, why in skipped):
-            raise CallsUp if subject.meter.calls >= subject.meter.most else TimeUp
+
+        def asked(name: str) -> None:
+            for row in _through(subject, sequences[name], noise, name):
+                rows.append(row)
+
+        def unanswered(name: str) -> str:
+            left = sum(one.compared for one in sequences[name]) - sum(row.sequence == name for row in rows)
+            return f"{left} questions of the sequence “{name}”"
+
+        ways.each(subject, [*sequences], unanswered, asked, progress, self.name, unit="sequences")
+        if not rows and (up := subject.meter.up):
+            raise up
         repeats = _repeated(subject, atoms)
-        tolerance = _tolerance(subject, atoms)
+        tolerance, grain = _tolerance(subject, atoms), _grain(atoms)
+        severity = "error" if tolerance > max(_HARMLESS, grain) else "warning"
+        kept = [finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=grain)] if tolerance else []
         stale = [row for row in rows if row.remembers and not row.broken]
         worst = max(stale, key=lambda row: row.energy, default=None)
         chance: dict[str, Any] = {"answers": 0}
@@ -99,7 +87,7 @@ class StateCheck(AuditCheck):
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
                 *self._memory(stale),
-                *_kept(tolerance, atoms),
+                *kept,
                 *self._failures(rows),
             ],
             tables={
@@ -108,7 +96,10 @@ class StateCheck(AuditCheck):
             },
             numbers=numbers,
             limits={"remembered": (0, ("STALE_STATE",)), "kept_within": (0, ("KEPT_ANSWER",))},
-            skipped=[*skipped, *((row.what, row.why) for row in rows if row.refused and not row.remembers)],
+            skipped=[
+                *ways.skipped,
+                *((row.what, row.why) for row in rows if row.refused and not row.remembers),
+            ],
             asked=len(rows),
             possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
@@ -176,7 +167,7 @@ class Comparison:
         }  # fmt: skip
 
 
-def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], list[Skipped]]:
+def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
     """Sequences of two atoms at the cutoff; what could not be, and why."""
     what = "two atoms at the cutoff"
     try:
@@ -184,20 +175,22 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
         with subject.trying():
             found = pairs(subject)[0]
     except CalculatorError as error:
-        return {}, [(what, error.message)]
+        return {}, Ways([(what, error.message)])
     radii = [one.radius for one in thresholds if found and set(one.species) == set(found[0].species)]
-    return (dict(approaches(found[0], max(radii))), []) if radii else ({}, [(what, "no cutoff was found")])
+    if not radii:
+        return {}, Ways([(what, "no cutoff was found")])
+    return dict(approaches(found[0], max(radii))), Ways()
 
 
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
-) -> Iterator[tuple[int, Comparison]]:
+) -> Iterator[Comparison]:
     """One object through a sequence: each answer, compared with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
     size, failed = 0.0, False
-    for place, asked in enumerate(sequence):
+    for asked in sequence:
         old = used.try_both(asked.atoms)
         was_broken, failed = failed, isinstance(old, CalculatorError)
         previous, before = before or asked.atoms, asked.atoms
@@ -223,7 +216,7 @@ def _through(
             row.allowed = noise.allowed.energy * share
             force = share * noise.louder(NoiseFloor(0.0, _EPS * max(1.0, largest(new[1])))).allowed.force
             row.remembers = row.energy > row.allowed or row.force > force
-        yield place + 1, row
+        yield row
 
 
 def _again(
@@ -232,7 +225,7 @@ def _again(
     """Whether another object, on the way on which the worst difference showed, answers as that one did."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
-    ((_, again),) = _through(subject, way, noise, worst.sequence)
+    (again,) = _through(subject, way, noise, worst.sequence)
     if worst.refused or again.refused:
         return isinstance(worst.old, CalculatorError) and isinstance(again.old, CalculatorError)
     # both must come again: what objects in use answer, and what new ones do
@@ -311,12 +304,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     if not atoms.pbc.any():
         return kept
     edge = float(np.max(atoms.cell.lengths()))
-
-    def stretched(place: float) -> Atoms:
-        there = atoms.copy()
-        there.set_cell((1 + place / edge) * atoms.cell.array)
-        return there
-
+    stretched = lambda place: modified(atoms, cell=(1 + place / edge) * atoms.cell.array)  # noqa: E731
     return max(kept, _kept_within(subject, _TINY[::2], stretched))
 
 
@@ -346,9 +334,3 @@ def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[fl
 def _grain(atoms: Atoms) -> float:
     """The last digit of the largest coordinate in single precision, Å."""
     return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
-
-
-def _kept(tolerance: float, atoms: Atoms) -> Iterator[Observed]:
-    if tolerance:
-        severity = "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning"
-        yield finding("KEPT_ANSWER", severity, tolerance=tolerance, grain=_grain(atoms))

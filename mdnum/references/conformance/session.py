@@ -287,11 +287,8 @@ class RemoteSession:
         """Ends the process."""
         process, self._process = self._process, None
         if process is not None:
-            process.kill()
-            process.wait()
-            for stream in (process.stdin, process.stdout):
-                if stream is not None:
-                    stream.close()
+            with process:  # which closes its streams and waits for its end
+                process.kill()
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._from = self._printed.seek(0, os.SEEK_END)

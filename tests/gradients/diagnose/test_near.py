@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from ase import Atoms
+from scipy.integrate import quad
 from scipy.optimize import brentq
 from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
-from mdnum.gradients.diagnose.near import Near
+from mdnum.gradients.diagnose.near import Near, Turns
 from mdnum.gradients.diagnose.trust import shorter, spread
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.recorded import EventAware, passed
@@ -94,6 +95,25 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
     # at a fixed number of steps, twice as many of half the length move with it as far as one of them
     by_time = float(own.gradient["dynamics.timestep"])
     assert found.half["dynamics.timestep"][0] == pytest.approx(by_time, rel=0.02)
+
+
+def test_the_term_of_a_near_miss_is_the_mean_over_the_depths_it_may_have():
+    """Two crossings at a depth d add 2 w / sqrt(2 a d): the mean by quadrature, or that of a known depth."""
+    shift, bend, weight = np.array([3e-4, 1e-3, 5e-5, 2e-4]), np.array([4.0, 0.3, 7.0, 2.0]), 0.8
+    moved = np.array([[1.0, -0.2], [0.5, 3.0], [-2.0, 0.1], [0.7, 0.0]])
+    table = {"step": np.arange(4), "shift": shift, "bend": bend, "weight": np.full(4, weight), "moved": moved}
+    # within reach on either side; out of reach; beyond the cutoff between two steps alone, far within
+    gap, unseen = np.array([2e-4, -1.5e-3, 0.02, -0.01]), np.array([False, False, False, True])
+    turns = Turns({**table, "gap": gap, "unseen": unseen})
+    # the typical shift is that of all four; what moves further than others reaches further
+    typical = np.sqrt(np.mean(shift**2))
+    np.testing.assert_allclose(turns.reach, 2 * np.maximum(shift, typical), rtol=1e-12)
+    assert turns.within.tolist() == [True, True, False, True]
+    for k in (0, 1):
+        total, _ = quad(lambda d, a=bend[k]: 2 * weight / np.sqrt(2 * a * d), 0, turns.reach[k])
+        np.testing.assert_allclose(turns.term[k], np.abs(moved[k]) * total / turns.reach[k], rtol=1e-6)
+    assert not turns.term[2].any()
+    np.testing.assert_allclose(turns.term[3], np.abs(moved[3]) * 2 * weight / np.sqrt(2 * 2.0 * 0.01))
 
 
 @pytest.mark.parametrize("loss", [None, MeanPotential()])

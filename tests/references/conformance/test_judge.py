@@ -9,9 +9,9 @@ import pytest
 
 from mdnum.references.conformance.answer import ListAnswer, Malformed, read
 from mdnum.references.conformance.case import gas, once
-from mdnum.references.conformance.judge import DOUBLE, SINGLE, Conventions, judge, truth
+from mdnum.references.conformance.judge import DOUBLE, SINGLE, Conventions, conditioning, judge, truth
 from mdnum.references.conformance.questions import lattice
-from mdnum.references.oracle import all_pairs
+from mdnum.references.oracle import all_pairs, rounding_bound
 
 _CASE = once("a gas", "few", gas(20, 3.0, 0), 3.0)
 
@@ -128,6 +128,22 @@ def test_what_float32_may_decide_float64_may_not():
     nothing = ListAnswer(np.zeros(0, int), np.zeros(0, int))
     assert judge(nothing, truth(case, 0, unit=SINGLE), Conventions(unit=DOUBLE))
     assert not judge(nothing, truth(case, 0, unit=SINGLE), Conventions(unit=SINGLE))
+
+
+def test_rounding_that_is_allowed_grows_with_the_angles_of_a_box_and_not_with_its_lengths():
+    """For two edges at an angle the condition number is the cotangent of half of it."""
+    angle, every = 0.3, np.ones(3, bool)
+    tilted = np.array([[1.0, 0, 0], [np.cos(angle), np.sin(angle), 0], [0, 0, 1.0]])
+    for lengths in ((1.0, 1.0, 1.0), (4.0, 700.0, 0.02)):
+        scaled = np.array(lengths)[:, None]
+        assert conditioning(scaled * np.eye(3), every) == 1.0
+        assert conditioning(scaled * tilted, every) == pytest.approx(1 / np.tan(angle / 2), rel=1e-9)
+        # directions that do not repeat have no say
+        assert conditioning(scaled * tilted, np.array([True, False, True])) == pytest.approx(1.0, rel=1e-12)
+        assert conditioning(scaled * tilted, ~every) == 1.0
+    long = once("a channel", "few", [[1.0, 1, 1], [2.0, 1, 900]], np.diag([8.0, 8.0, 1000.0]), r_cut=2.5)
+    still = long.stills[0]
+    assert truth(long, 0).scale == rounding_bound(still.positions, still.cell, 2.5, unit_roundoff=1.0)
 
 
 def test_a_lattice_is_known_as_brute_force_finds_it():
