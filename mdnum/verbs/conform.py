@@ -189,8 +189,8 @@ def conform(
             kept.save(urgent)
             if (now := monotonic()) >= due:
                 folder.write_summary(summarized() | {"status": "stopped"})
-                # most of the time is for asking
-                due = monotonic() + max(1.0, 20 * (monotonic() - now))
+                # most of the time is for asking, and what a kill leaves is not old
+                due = monotonic() + min(max(1.0, 20 * (monotonic() - now)), 5.0)
 
         interrupted = False
         try:
