@@ -308,7 +308,7 @@ def test_check_prints_every_record_and_exits_by_agreement(
         expected = 0 if ok else 1
         assert call("check", "energy", crystal, "--set", "cutoff.kind=shifted") == expected
         out = capsys.readouterr().out
-        assert all(word in out for word in ("first", "last", "1.25", "2.5"))
+        assert all(word in out for word in ("first", "last", "1.25", "2.5", "(ε, ε/σ)"))
         assert call("check", "energy", crystal, "--json") == expected
         assert json.loads(capsys.readouterr().out)["ok"] is ok
     assert asked[0].spec.cutoff.kind == "shifted"
@@ -355,3 +355,24 @@ def test_programs_are_kept_beside_other_caches_and_nobody_elses_are_touched(tmp_
     (tmp_path / "file").touch()
     assert call("systems", "list") == 0 and name not in os.environ
     assert not capsys.readouterr().err
+
+
+def test_a_number_that_is_none_is_named_in_plain_words(capsys: pytest.CaptureFixture[str]):
+    for words, said in (
+        (("run", "argon/crystal-108", "--steps", "ten"), "--steps ten: expected a whole number"),
+        (("flips", "x.xyz", "--cutoff", "far"), "--cutoff far: expected a number"),
+    ):
+        line = refused(capsys, *words)
+        assert said in line and "Input should" not in line
+
+
+def test_prose_is_as_wide_as_people_read_where_it_is_piped(rollout: Recorder, capsys):
+    rollout.summary = {"findings": [
+        {"code": "LONG", "severity": "info", "title": "x", "text": "word " * 80, "remedy": "act " * 80}
+    ]}  # fmt: skip
+    call("run", "argon/crystal-108")
+    lines = capsys.readouterr().out.splitlines()
+    wrapped = [line for line in lines if line.startswith(("  word", "  act"))]
+    assert (
+        len(wrapped) > 8 and max(map(len, lines)) <= 100 and not any(line.endswith(" ") for line in wrapped)
+    )

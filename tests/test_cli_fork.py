@@ -168,3 +168,15 @@ def test_what_is_missing_is_named_with_its_extra(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(program, "installed", lambda: False)
     assert call("fork", "certify", "argon/crystal-108", "--steps", "2", "--set", "cutoff.radius=1.5") == 2
     assert "mdnum[exact]" in capsys.readouterr().err
+
+
+def test_two_paths_are_sent_to_the_verb_that_compares_them(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    assert call("fork", "a.traj", "b.traj") == 2
+    assert "mdnum flips a.traj b.traj" in capsys.readouterr().err
+    folders = [str(tmp_path / name) for name in ("a", "b")]
+    for one in folders:
+        Path(one).mkdir()
+    assert call("fork", *folders) == 2
+    assert f"mdnum fork compare {folders[0]} {folders[1]}" in capsys.readouterr().err

@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             say(error.format_message())
             sys.exit(EXIT_USAGE)
         place = error.ctx.command_path if error.ctx else "mdnum"
-        asked = InputError(error.format_message(), remedy=f"See `{place} --help`")
+        asked = InputError(_said(error), remedy=f"See `{place} --help`")
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(EXIT_STOPPED)
     except MemoryError as error:
@@ -93,3 +93,16 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         sys.exit(code or 0)
     print_error(asked, as_json=as_json)
     sys.exit(asked.exit_code)
+
+
+#: What was expected, by the name that the parser of options has for it.
+_EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
+
+
+def _said(error: Any) -> str:
+    """What is wrong with the words of a command, with the word itself where it is a number's."""
+    details = getattr(error.__cause__, "errors", None)
+    if details is None or details()[0]["type"] not in _EXPECTED:
+        return error.format_message()
+    (detail, *_), name = details(), error.param.opts[0]
+    return f"{name} {detail['input']}: expected {_EXPECTED[detail['type']]}"

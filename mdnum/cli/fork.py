@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,10 @@ class _Questions(TyperGroup):
                     f"{once} is no option of `mdnum fork`, but a question",
                     remedy=f"Ask `mdnum fork {_ONCE[once]}`",
                 )
+            if len(args) > 1 and not args[1].startswith("-"):
+                both = " ".join(args[:2])
+                verb = "fork compare" if all(os.path.isdir(word) for word in args[:2]) else "flips"
+                raise InputError(f"{both}: expected one system", remedy=f"Ask `mdnum {verb} {both}`")
             args = ["vary", *args]
         return super().parse_args(ctx, args)
 

@@ -37,7 +37,7 @@ EXIT_USAGE = 2
 EXIT_UNDECIDED = 3  # time was up before a verdict
 EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
 
-_PIPE_WIDTH = 200
+_PIPE_WIDTH, _PROSE_WIDTH = 200, 100
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
 _MOST_ROWS = 12
@@ -228,8 +228,12 @@ def print_lines(lines: Iterable[str]) -> None:
         typer.echo("mdnum: " + " ".join(line.split()), err=True)
 
 
-def console() -> Console:
-    """rich's console on stdout, made when first needed because importing rich is slow; prints nothing raw."""
+def console(width: int = _PIPE_WIDTH) -> Console:
+    """rich's console on stdout, made when first needed because importing rich is slow; prints nothing raw.
+
+    Args:
+        width: columns where nobody's window is known.
+    """
     from rich.console import Console
     from rich.segment import Segment
 
@@ -240,8 +244,21 @@ def console() -> Console:
 
     # no highlighting: a number is not more important for being a number; wide where nobody's window is
     # known, because a table folded to 80 columns is hard to read in a log and harder to grep
-    width = None if sys.stdout.isatty() else _PIPE_WIDTH
-    return Printable(highlight=False, width=width)
+    return Printable(highlight=False, width=None if sys.stdout.isatty() else width)
+
+
+def print_prose(text: str, indent: int = 2, style: str = "") -> None:
+    """A paragraph, in lines that can be read; a word that is longer than a line stays whole."""
+    from textwrap import fill
+
+    from rich.text import Text
+
+    out, space = console(_PROSE_WIDTH), " " * indent
+    lines = fill(
+        text, out.width, initial_indent=space, subsequent_indent=space, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+    out.print(Text(lines, style=style), soft_wrap=True)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -286,13 +303,12 @@ def print_findings(findings: Iterable[Finding]) -> None:
     """Each finding as a title line, what was seen, and what to do."""
     from rich.text import Text
 
-    out = console()
     for finding in findings:
         line = Text(finding.severity, style=_STYLE.get(finding.severity, ""))
         line.append(f": {finding.title}", style="bold")
-        out.print(line)
+        console().print(line)
         for text in filter(None, (finding.text, finding.remedy)):
-            out.print(Text(f"  {text}"))
+            print_prose(text)
 
 
 def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
@@ -317,9 +333,9 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
         print_json({"folder": outcome.folder, **outcome.summary})
         return code
     out = console()
-    out.print(outcome.verdict.headline, style="bold", markup=False)
+    print_prose(outcome.verdict.headline, 0, "bold")
     if outcome.page.about:
-        out.print(f"  {outcome.page.about}", markup=False)
+        print_prose(outcome.page.about)
     if outcome.page.keys:
         rows = [(key.label, f"{key.value}  {key.note}".rstrip()) for key in outcome.page.keys]
         print_table("", ("", ""), rows)
@@ -328,14 +344,14 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
             out.print(section.title, style="bold", markup=False)
             for part in section.parts:
                 if isinstance(part, str):
-                    out.print(f"  {part}", markup=False)
+                    print_prose(part)
                 elif type(part).__name__ == "Table":
                     _print_part(part)
     for head in (finding for finding in outcome.verdict.findings if not finding.cause):
         print_findings([head])
         below = dict.fromkeys(one.title for one in outcome.verdict.findings if one.cause == head.code)
         if below:
-            out.print(f"  What may follow from it: {'; '.join(below)}.", markup=False)
+            print_prose(f"What may follow from it: {'; '.join(below)}.")
     report = outcome.folder / "report.html"
     out.print(f"wrote {report if report.exists() else outcome.folder}", markup=False)
     return code

@@ -383,11 +383,15 @@ def _compared(question: str, title: str, help: str) -> Callable[..., int]:
     ) -> int:
         from mdnum.verbs.check import check
 
-        checked = check(question, _load(system, settings, world="md"))
+        loaded = _load(system, settings, world="md")
+        checked, units = check(question, loaded), loaded.units
         if as_json:
             output.print_json(checked.summary)
         else:
-            output.print_records(f"{system}: {title}", checked.report.rows())
+            used = f"{units.energy}, {units.length}, {units.time}"
+            used = used if question == "dynamics" else f"{units.energy}, {units.energy}/{units.length}"
+            shown = "" if question == "pairs" else f" ({used})"
+            output.print_records(f"{system}: {title}{shown}", checked.report.rows())
             output.print_findings(checked.verdict.findings)
             output.say(checked.verdict.headline)
         return output.exit_code(checked.verdict.findings, "complete" if checked.report.ok else "failed")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
@@ -323,12 +324,28 @@ def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple
 
 
 def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """The gradient, with a warning of a derivative that is exactly zero: a training loop reads no notes."""
+    """The gradient, with a warning of a derivative that is exactly zero: a training loop reads no notes.
+
+    Raises:
+        NumericalError: it is not finite; names the first operation at fault where one is.
+    """
     found = chosen(problem, names)
     for name, value in found.gradient.items():
         if not np.any(np.asarray(value)):
             note = found.notes.get(name, "exactly 0 in this run")
             warnings.warn(f"{found.method} by {name}: {note}", UserWarning, stacklevel=3)
+    bad = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]
+    if bad or not np.isfinite(found.value):
+        from mdnum.gradients.diagnose.detective import detective
+
+        why = ""
+        with suppress(InputError):
+            blamed = detective(problem, names, saltation=False)
+            inputs = ", ".join(f"{one:.3g}" for one in blamed.inputs)
+            if blamed.operation:
+                why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
+        what = "the loss" if not np.isfinite(found.value) else f"the gradient by {', '.join(bad)}"
+        raise NumericalError(f"{what} is not finite{why}", where=found.method, remedy="Mend that operation")
     return found
 
 

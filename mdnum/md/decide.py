@@ -236,13 +236,13 @@ class SlotJudge:
         """
         d = displacements(self.components, self.cell, j)
         quantity = self.decider.quantity(*d, self.zero)
-        threshold = of_type(self.value, types)
-        return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
+        # padding repeats the last atom: it is outside of whatever there is, and near to nothing
+        threshold = jnp.where(j < self.atoms, of_type(self.value, types), -jnp.inf)
+        return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
         """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
-        # padding repeats the last atom, which is listed too or too far away to be the nearest to a threshold
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
             bits = bits | (inside[k].astype(jnp.uint8) << jnp.uint8(k))

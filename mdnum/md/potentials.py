@@ -40,7 +40,7 @@ class PairPotential(eqx.Module):
             r: distances, length.
             constants: of the pair.
         """
-        made = cls(**{name: jnp.asarray(value) for name, value in constants.items()})
+        made = cls(**{name: jnp.atleast_1d(value) for name, value in constants.items()})
         energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
         return np.asarray(energy), np.asarray(slope)
 

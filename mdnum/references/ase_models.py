@@ -24,18 +24,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ase import Atoms
-from ase.calculators.calculator import Calculator, PropertyNotImplementedError
+from ase.calculators.calculator import Calculator, Parameters, PropertyNotImplementedError
 from ase.calculators.tersoff import Tersoff, TersoffParameters
 from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from numpy import ndarray
 from pydantic import ValidationError
 
 from mdnum import systems
-from mdnum.errors import InputError
+from mdnum.errors import InputError, NumericalError
 from mdnum.references.independent import (
     ClassicalCalculator,
     OnNeighborList,
@@ -47,6 +47,9 @@ from mdnum.references.independent import (
     pair_forms,
 )
 from mdnum.systems import System, SystemSpec
+
+if TYPE_CHECKING:
+    from mdnum.systems.build import Evaluator, Simulation
 
 
 @dataclass(frozen=True)
@@ -285,13 +288,17 @@ class MdnumCalculator(ClassicalCalculator):
     skin; for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
-        system: a `System`, or the name or path of one; its structure is not used.
+        system: a `System`, or the name or path of one, whose structure is not used; or a `Simulation`, for
+            its own atoms at other places.
         overrides: keys of the system file to change, as `--set` does.
         potential, cutoff, units: instead of a system: the tables of a system file as dictionaries, and
             "metal" (Å, eV) or "lj".
     Raises:
         InputError: neither or both of system and potential; tables that a system file could not hold. At the
-            first use: species without constants, a cell narrower than two cutoffs.
+            first use: species without constants, a cell narrower than two cutoffs; a coordinate that is not
+            finite.
+        NumericalError: an energy or a force that is not finite, as of two atoms at one place.
+        TypeError: another keyword.
 
     Example:
         >>> argon = MdnumCalculator(
@@ -302,53 +309,97 @@ class MdnumCalculator(ClassicalCalculator):
 
     def __init__(
         self,
-        system: System | str | None = None,
+        system: System | Simulation | str | None = None,
         *,
         overrides: Mapping[str, Any] | None = None,
         potential: Mapping[str, Any] | None = None,
         cutoff: Mapping[str, Any] | None = None,
         units: str = "metal",
-        **kwargs: Any,
     ):
-        super().__init__(**kwargs)
+        from mdnum.systems.build import Simulation
+
+        super().__init__()
+        self._evaluator: Evaluator | None = None
+        self._given: Simulation | None = None
         where = "MdnumCalculator"
         if (system is None) == (potential is None):
             remedy = "Say MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
             raise InputError("give either a system or a potential", remedy=remedy, where=where)
         if potential is not None:
             self._template = System("calculator", _spec(potential, cutoff, units), None, Atoms())
-        elif isinstance(system, System):
+        elif isinstance(system, System | Simulation):
             if overrides:
                 remedy = "Pass the name of the system, or load it with the overrides"
                 raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
-            self._template = system
+            self._template = system if isinstance(system, System) else system.system
+            self._given = system if isinstance(system, Simulation) else None
         else:
             self._template = systems.load(str(system), overrides, world="md")
-        self._evaluator: Any = None
+        if not (self._template.spec.cutoff if self._given is None else self._given.pairwise):
+            # a potential of many bodies need not split its energy by atom
+            self.implemented_properties = [one for one in self.implemented_properties if one != "energies"]
+        kept = self._template.spec.model_dump(exclude_none=True, include={"potential", "cutoff", "units"})
+        self.parameters = Parameters(kept)
 
     @property
     def system(self) -> System:
         """What is evaluated: the tables of the system file with the atoms of the last call."""
         return self._template if self._evaluator is None else self._evaluator.simulation.system
 
-    def evaluated(self, atoms, changes):
-        if self._evaluator is None or _REBUILD & set(changes):
-            from mdnum.systems.build import Evaluator
+    def set(self, **changes: Any) -> dict[str, Any]:
+        """Changes nothing: another potential is another calculator.
 
-            # only what the forces depend on: constraints and the like stay with ASE
-            bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-            # the evaluator keeps as much of the skin as the box has room for; it must not be refused for it
-            neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
-            spec = self._template.spec.model_copy(update={"neighbors": neighbors})
-            simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
-            self._evaluator = Evaluator(simulation, skin=self._template.spec.skin)
+        Raises:
+            TypeError: something is to be changed.
+        """
+        if changes:
+            raise TypeError(f"MdnumCalculator has no {', '.join(changes)} to set; make another calculator")
+        return {}
+
+    def evaluated(self, atoms, changes):
+        numbers = {"atom": atoms.positions, "lattice vector": np.asarray(atoms.cell)}
+        for what, rows in numbers.items():
+            if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
+                place = f"{what} {bad[0]} is {rows[bad[0]].tolist()}"
+                raise InputError(f"{place}; expected finite numbers", where="MdnumCalculator")
+        if self._evaluator is None or _REBUILD & set(changes):
+            self._evaluator = self._made_for(atoms)
         evaluation = self._evaluator(atoms.get_positions(), np.asarray(atoms.cell))
         results = {"energy": float(evaluation.energy), "forces": np.array(evaluation.forces)}
-        if np.isfinite(evaluation.energies).all():  # a many-body potential need not split by atom
+        if not all(np.isfinite(value).all() for value in results.values()):
+            pair = ""
+            if len(r := evaluation.distance):
+                near = int(np.argmin(r))
+                pair = f"; the closest pair is {evaluation.i[near]}-{evaluation.j[near]} at {r[near]:.4g}"
+            raise NumericalError(
+                f"an energy or a force is not finite{pair}", where="MdnumCalculator",
+                remedy="Relax the structure with a softer potential, or move the atoms apart",
+            )  # fmt: skip
+        if "energies" in self.implemented_properties:
             results["energies"] = np.array(evaluation.energies)
-        if atoms.cell.rank == 3 and atoms.pbc.all():
+        if atoms.cell.rank == 3 and atoms.pbc.any():
             results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(evaluation.stress))
         return results
+
+    def _made_for(self, atoms: Atoms) -> Evaluator:
+        """What evaluates these atoms, wherever they are and in whatever box."""
+        from mdnum.systems.build import Evaluator
+
+        # only what the forces depend on: constraints and the like stay with ASE
+        bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+        if self._given is not None:
+            own = self._given.system.atoms
+            if not (np.array_equal(own.numbers, bare.numbers) and np.array_equal(own.pbc, bare.pbc)):
+                raise InputError(
+                    "these are other atoms than the simulation's", where="MdnumCalculator",
+                    remedy="Give the system instead: MdnumCalculator(mdnum.load(...))",
+                )  # fmt: skip
+            return Evaluator(self._given)
+        # the evaluator keeps as much of the skin as the box has room for; it must not be refused for it
+        neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
+        spec = self._template.spec.model_copy(update={"neighbors": neighbors})
+        simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
+        return Evaluator(simulation, skin=self._template.spec.skin)
 
 
 def _spec(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None, units: str) -> SystemSpec:

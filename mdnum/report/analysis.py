@@ -1,4 +1,4 @@
-"""What a table of flips says: chatter, stays, the busiest pairs, margins in units of rounding."""
+"""What the tables of a run say: chatter, stays, busiest pairs, margins in roundings, and its energies."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ Flips = Mapping[str, np.ndarray]
 
 # flips that are followed pair by pair at a time, at least
 _AT_ONCE = 2_000_000
+# fewer rows have no fluctuation to speak of; blocks of which the drift's error is estimated
+_LEAST_ROWS, _BLOCKS = 40, 10
 
 
 @dataclass(frozen=True)
@@ -220,3 +222,42 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
     pairs = series["pairs"]
     net = np.cumsum(series["entered"].astype(np.int64) - series["left"])
     return pairs == pairs[0] + net - net[0]
+
+
+@dataclass(frozen=True)
+class Conservation:
+    """How well a run keeps what it should conserve, over its second half."""
+
+    fluctuation: float  # standard deviation of the conserved energy over that of what moves
+    drift: float  # of the conserved energy over the whole run, energy
+    drift_error: float  # its standard error
+
+    @classmethod
+    def of(
+        cls,
+        conserved: Float[np.ndarray, "rows"],
+        kinetic: Float[np.ndarray, "rows"],
+        least: float,
+    ) -> Conservation | None:
+        """From one value of each a step; None of too few, or where nothing moves.
+
+        A line is taken off before the fluctuation is: a drift is another matter. The first half is left out,
+        since a run that starts from a lattice turns half of its kinetic energy into potential energy.
+
+        Args:
+            conserved: what should not change. kinetic: the kinetic energy.
+            least: what moves counts as at least so much; atoms that fly freely keep their kinetic energy.
+        """
+        rows = len(conserved)
+        if rows < _LEAST_ROWS or not np.isfinite(conserved).all():
+            return None
+        half, moving = conserved[rows // 2 :], max(least, float(np.std(kinetic[rows // 2 :])))
+        if not moving > 0:
+            return None
+        at = np.arange(len(half))
+        noise = half - np.polyval(np.polyfit(at, half - half[0], 1), at)
+        blocks = np.array([part.mean() for part in np.array_split(conserved - conserved[0], _BLOCKS)])
+        line, covariance = np.polyfit(np.arange(_BLOCKS), blocks, 1, cov=True)
+        return cls(
+            float(np.std(noise)) / moving, _BLOCKS * float(line[0]), _BLOCKS * float(covariance[0, 0]) ** 0.5
+        )

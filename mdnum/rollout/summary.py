@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mdnum.md.cell import displacement, wrap_positions
 from mdnum.numerics import Ledger, unit_roundoff
+from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
 from mdnum.systems import schema
@@ -165,6 +166,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "lattice": None
         if simulation.lattice is None
         else simulation.lattice.to_dict(float(simulation.integrator.timestep)),
+        "beyond_cutoff": beyond_cutoff(simulation),
         "ase": None,
         "findings": [],
         "verdict": "",

@@ -274,9 +274,15 @@ def _many_body_model(system: System):
     if isinstance(potential, schema.EmbeddedAtomTable):
         symbols = system.atoms.get_chemical_symbols()
         return manybody.embedded_atom(system.folder / potential.file, symbols, pbc)
+    assert isinstance(potential, schema.TersoffTable | schema.StillingerWeberTable)
+    if others := sorted(set(system.species) - {potential.parameters}):
+        raise InputError(
+            f"the structure holds {', '.join(others)}, and the constants are those of {potential.parameters}",
+            where=f"{system.name}: [potential]",
+            remedy="Use a structure of that element alone, or a potential for all of them",
+        )
     if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
-    assert isinstance(potential, schema.StillingerWeberTable)
     return manybody.stillinger_weber(potential.parameters, pbc)
 
 

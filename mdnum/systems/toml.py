@@ -388,6 +388,22 @@ def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
         raise InputError(
             context["said"], remedy=context["remedy"], where=source.place(tuple(context["key"].split(".")))
         )
+    key = _place(detail, root, data)
+    if detail["type"] == "union_tag_invalid":
+        key = (*key, _tag(context))
+    if detail["type"] == "value_error" and not key:
+        named = re.search(r"\[(\w+)\]", detail["msg"])
+        key = (named[1],) if named and named[1] in data else ()
+    message, remedy = _sentence(detail, key, root, data)
+    others = dict.fromkeys(".".join(_place(one, root, data)) for one in details)
+    if others := [one for one in others if one and one != ".".join(key)]:
+        remedy += "" if remedy.endswith((".", "?")) else "."
+        remedy = f"{remedy} Something is wrong with {', '.join(others[:3])}, too"
+    raise InputError(message, remedy=remedy, where=source.place(key))
+
+
+def _place(detail: Any, root: type[TomlTable], data: Mapping[str, Any]) -> Key:
+    """The dotted key that a mistake is about."""
     key: Key = ()
     tag_follows = False
     for part in detail["loc"]:
@@ -395,16 +411,7 @@ def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
         if not (tag_follows or part == "[key]" or isinstance(part, int)):
             key = (*key, part)
         tag_follows = not tag_follows and isinstance(part, str) and len(models(root, key, data)) > 1
-    if detail["type"] == "union_tag_invalid":
-        key = (*key, _tag(context))
-    if detail["type"] == "value_error" and not key:
-        named = re.search(r"\[(\w+)\]", detail["msg"])
-        key = (named[1],) if named and named[1] in data else ()
-    message, remedy = _sentence(detail, key, root, data)
-    if others := len(details) - 1:
-        remedy += "" if remedy.endswith((".", "?")) else "."
-        remedy = f"{remedy} {others} more {'problem follows' if others == 1 else 'problems follow'}"
-    raise InputError(message, remedy=remedy, where=source.place(key))
+    return key
 
 
 def _tag(context: Mapping[str, Any]) -> str:

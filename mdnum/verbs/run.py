@@ -38,6 +38,13 @@ if TYPE_CHECKING:
 CHATTER_SHARE = 0.15
 #: Drift over the run, per atom and in units of k_B T, from which on it is worth a warning.
 DRIFT_SHARE = 0.01
+#: Standard errors that a drift must be away from none.
+ERRORS = 2.0
+#: Fluctuation of the conserved energy over the kinetic energy's from which on a time step is too long, and
+#: steps in a vibration: below half of what is usually recommended, 10 to 20 (see scripts/time_steps.py).
+FLUCTUATION, STEPS_PER_PERIOD = 0.05, 6.0
+#: A jump of energy at the cutoff, or of force times its radius, that is nothing, in k_B T.
+NO_JUMP = 1e-9
 #: What compiles and keeps what the loop calls.
 COMPILE = "from mdnum.md import decide, kernel; kernel._driver(), decide._noting()"
 #: Steps of a run in fixed-point numbers that are made in float64 too.
@@ -89,7 +96,7 @@ def run(
             f"is the folder of `mdnum {folder.verb}`, and no run", where=str(resume), remedy=remedy
         )
     frames: SimpleQueue[np.ndarray | None] = SimpleQueue()
-    compared: list[Future[EnergyReport | None]] = []
+    compared: list[Future[tuple[EnergyReport | None, float | None]]] = []
     with ThreadPoolExecutor(1) as thread:
 
         def shown(simulation: Simulation, positions: np.ndarray) -> None:
@@ -123,8 +130,9 @@ def run(
             if drawn is not None:
                 drawn.result()
         if check:
-            _keep(view, compared[0].result())
+            _keep(view, *compared[0].result())
             _beside_float64(view, result)
+        view.summary["time_step"] = view.time_step
     return finish(folder, report=report, result=result, progress=progress, view=view)
 
 
@@ -144,13 +152,19 @@ def _compile_beside() -> None:
 
 def _beside_the_loop(
     simulation: Simulation, frames: SimpleQueue[np.ndarray | None], check: bool, report: bool
-) -> EnergyReport | None:
-    """The comparison of the first and the last frame with ASE; the loop is not in Python, most of this is."""
+) -> tuple[EnergyReport | None, float | None]:
+    """The comparison of the first and the last frame with ASE, and the fastest period in them.
+
+    The loop is not in Python, most of this is.
+    """
     if report:
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
-        return None
+        return None, None
     from mdnum.references.energy_check import SAMPLED, check_energy
+    from mdnum.rollout.adequacy import fastest_period
+
+    periods: list[float | None] = []
 
     def shown() -> Iterator[np.ndarray]:
         while (positions := frames.get()) is not None:
@@ -164,18 +178,21 @@ def _beside_the_loop(
             # of a run that was stopped nobody asks
             given = iter(both if len(both) == 2 else ())
         for name, positions in zip(("initial", "last"), given, strict=False):
+            periods.append(fastest_period(simulation, positions))
             atoms = simulation.system.atoms.copy()
             atoms.set_positions(positions)
             yield name, atoms
 
-    return check_energy(simulation, named())
+    compared = check_energy(simulation, named())
+    return compared, min((one for one in periods if one is not None), default=None)
 
 
-def _keep(run: RunView, compared: EnergyReport | None) -> None:
-    """Puts the comparison with ASE into the summary."""
+def _keep(run: RunView, compared: EnergyReport | None, period: float | None) -> None:
+    """Puts the comparison with ASE and the fastest period into the summary."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
+    run.summary["fastest_period"] = period
     run.summary["ase"] = plain(compared.worst)
     run.summary["findings"] += map(plain, energy_findings(compared))
     run.folder.write_summary(run.summary)
@@ -208,7 +225,7 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
 def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
-        *_status(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
+        *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
         *_decisions(run), *_drift(run), *_cutoff(run), *_start(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
@@ -235,6 +252,14 @@ def _status(run: RunView) -> Iterator[Finding]:
         yield TEXTS.finding("RUN_FAILED", step=run.step(-1), of=of, error=str(error))
     elif status != "complete":
         yield TEXTS.finding("NOT_FINISHED", steps=run.steps, of=of)
+
+
+def _time_step(run: RunView) -> Iterator[Finding]:
+    found = run.time_step
+    moved, steps = found["fluctuation"], found["per_period"]
+    variants = ["period"] * (steps is not None) + ["energy"] * (moved is not None)
+    if (moved or 0.0) >= FLUCTUATION or (steps or np.inf) <= STEPS_PER_PERIOD:
+        yield TEXTS.finding("TIME_STEP", *variants, share=moved, steps=steps)
 
 
 def _lists(run: RunView) -> Iterator[Finding]:
@@ -302,19 +327,20 @@ def _ase(run: RunView) -> Iterator[Finding]:
 
 
 def _decisions(run: RunView) -> Iterator[Finding]:
-    margin = abs(float(run.series["min_margin"][0]))
+    margin, key, own = abs(float(run.series["min_margin"][0])), run.cutoff_key, ["own"] * (not run.cutoff_key)
     if not margin or run.series["ambiguous"][0]:
-        yield TEXTS.finding("TIE_AT_CUTOFF", margin=margin)
+        yield TEXTS.finding("TIE_AT_CUTOFF", *own, margin=margin, key=key)
     ambiguous = run.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
     if ambiguous:
-        yield TEXTS.finding("AMBIGUOUS_DECISIONS", ambiguous=ambiguous, expected=run.expected_ambiguous)
+        expected = run.expected_ambiguous
+        yield TEXTS.finding("AMBIGUOUS_DECISIONS", *own, ambiguous=ambiguous, expected=expected, key=key)
     undone = run.flips.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if run.flips.total >= 20 and undone >= CHATTER_SHARE * run.flips.total:
         busiest = run.flips.busiest
         smooth = not run.jump and not run.cutoff.get("force_jump")
         yield TEXTS.finding(
-            "CHATTER", *["smooth"] * smooth, undone=undone,
+            "CHATTER", *own, *["smooth"] * smooth, key=key, undone=undone,
             flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
             pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
         )  # fmt: skip
@@ -328,8 +354,7 @@ def _start(run: RunView) -> Iterator[Finding]:
 
 
 def _drift(run: RunView) -> Iterator[Finding]:
-    atoms, units = run.summary.get("atoms"), run.units
-    thermal = units.k_B * float(np.mean(run.series["temperature"]))
+    atoms, units, thermal = run.summary.get("atoms"), run.units, run.thermal
     if not atoms or not thermal > 0:
         return
     time, left = run.series["time"], run.budget["residual"]
@@ -342,37 +367,54 @@ def _drift(run: RunView) -> Iterator[Finding]:
         fitted.add(time, left)
         drift = None if fitted.slope is None else fitted.slope / atoms
     if drift is not None and run.steps > 1 and np.isfinite(left).all():
-        span = float(time[-1] - time[0])
+        span, error = float(time[-1] - time[0]), run.time_step["drift_error"]
         moved = abs(float(drift)) * span
-        if moved >= DRIFT_SHARE * thermal:
+        if moved >= max(DRIFT_SHARE, ERRORS * (error or 0.0)) * thermal:
+            variants = ["jump"] * bool(run.cutoff.get("force_jump")) + ["error"] * (error is not None)
             yield TEXTS.finding(
-                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")),
-                drift=float(drift), moved=moved, share=moved / thermal, time=span, energy=units.energy,
-                time_unit=units.time,
+                "DRIFT", *variants, drift=float(drift), moved=moved, share=moved / thermal, time=span,
+                energy=units.energy, time_unit=units.time, error=error,
             )  # fmt: skip
     if run.jump and run.conservative:
         moves = np.cumsum(run.series["energy_jump"], dtype=np.float64)
         low, high = min(float(moves.min()), 0.0), max(float(moves.max()), 0.0)
         share = (high - low) / (atoms * thermal)
         if share >= DRIFT_SHARE:
-            yield TEXTS.finding("WANDER", low=low, high=high, share=share, unit=units.energy)
+            own = ["own"] * (not run.cutoff_key)
+            yield TEXTS.finding(
+                "WANDER", *own, low=low, high=high, share=share, unit=units.energy, key=run.cutoff_key
+            )
 
 
 def _cutoff(run: RunView) -> Iterator[Finding]:
-    kind, force = run.cutoff.get("kind"), float(run.cutoff.get("force_jump") or 0.0)
-    values = {"kind": kind, "force": abs(force), "energy": run.units.energy, "length": run.units.length}
-    if kind and run.jump:
-        yield TEXTS.finding("HARD_CUTOFF", jump=run.jump, **values)
-    elif kind and force:
-        yield TEXTS.finding("FORCE_JUMP", *["shifted"] * (kind == "shifted"), "gradient", **values)
+    kind, force = run.cutoff.get("kind"), abs(float(run.cutoff.get("force_jump") or 0.0))
+    jump, length = abs(run.jump), float(run.cutoff.get("radius") or 1.0)
+    values = {"kind": kind, "force": force, "energy": run.units.energy, "length": run.units.length}
+    own = ["own"] * (not run.cutoff_key)
+    # rounding where a potential ends is no jump
+    if kind and jump > NO_JUMP * run.thermal:
+        share = jump / run.thermal if run.thermal > 0 else None
+        own += ["share"] * bool(share)
+        yield TEXTS.finding("HARD_CUTOFF", *own, jump=run.jump, share=share, **values)
+    elif kind and force * length > NO_JUMP * run.thermal:
+        yield TEXTS.finding("FORCE_JUMP", *own, *["shifted"] * (kind == "shifted"), "gradient", **values)
 
 
 def _evidence(run: RunView) -> Iterator[str]:
     summary, units = run.summary, run.units
     if analysis.algebra_holds(run.series).all():
         yield TEXTS("flips_accounted", flips=run.flips.total, steps=len(run.series["step"]))
+    if not any(_time_step(run)):
+        said = {name: value for name, value in run.time_step.items() if value is not None}
+        if "fluctuation" in said:
+            yield TEXTS("step_conserves" if "drift" in said else "step_conserves_only", **said)
+        if "per_period" in said:
+            yield TEXTS("step_resolves", **said)
+        if not said:
+            yield TEXTS("step_unknown")
     if len(run.epochs["epoch"]) and not run.total("lost_pairs"):
-        yield TEXTS("lists_sound", lists=len(run.epochs["epoch"]))
+        lists, used = len(run.epochs["epoch"]), float(np.max(run.epochs["skin_consumed"]))
+        yield TEXTS("lists_sound" if np.isfinite(used) else "lists_fresh", lists=lists, used=used)
     if summary.get("energy_budget_closes"):
         yield TEXTS(
             "budget_closes" if run.jump else "budget_closes_smooth", residual=run.residual,
@@ -385,6 +427,10 @@ def _evidence(run: RunView) -> Iterator[str]:
             atoms=summary.get("atoms"), reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
             force=ase.get("force_max"), unit=f"{units.energy}/{units.length}",
         )  # fmt: skip
+    if beyond := summary.get("beyond_cutoff"):
+        mean = float(np.mean(run.series["potential"])) / summary["atoms"]
+        share = abs(beyond["energy"] / mean) if mean else None
+        yield TEXTS("beyond_cutoff", **beyond, share=share, unit=units.energy, pressure_unit=units.pressure)
 
 
 VERBS = {"md": Verb(judge, page, RunView, unfinished=True)}

@@ -74,6 +74,17 @@ class RunView(View):
         return self.summary.get("cutoff") or {}
 
     @property
+    def cutoff_key(self) -> str:
+        """The key of the system file that says where pairs end; empty where the potential does."""
+        given = self.system.get("cutoff") or {}
+        return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
+
+    @cached_property
+    def thermal(self) -> float:
+        """k_B T of the run's mean temperature, energy."""
+        return self.units.k_B * float(np.mean(self.series["temperature"]))
+
+    @property
     def jump(self) -> float:
         """Energy of a pair at the cutoff, 0 where it ends at zero."""
         return float(self.cutoff.get("energy_jump") or 0.0)
@@ -99,6 +110,30 @@ class RunView(View):
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
+
+    @cached_property
+    def time_step(self) -> dict[str, float | None]:
+        """What the energies and the fastest vibration say of the time step; None for what is not known.
+
+        `per_period`: steps in the fastest vibration of the first and the last configuration; `fluctuation`:
+        of the energy that is conserved, the flips' jumps left out, over the kinetic energy's; `drift` of that
+        energy over the run and `drift_error`, its standard error, in k_B T per atom.
+        """
+        period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
+        atoms = self.summary.get("atoms") or 0
+        thermal = self.thermal * atoms
+        # atoms in harmonic wells have 0.87 sqrt(N) k_B T (those that fly freely have none in an isolated run)
+        least = thermal / (2 * np.sqrt(atoms)) if atoms else 0.0
+        found = analysis.Conservation.of(self.budget["residual"], self.series["kinetic"], least)
+        drift = error = None
+        if found is not None and thermal > 0:
+            drift, error = found.drift / thermal, found.drift_error / thermal
+        return {
+            "per_period": period / step if period and step else None,
+            "fluctuation": None if found is None else found.fluctuation,
+            "drift": drift,
+            "drift_error": error,
+        }
 
     @property
     def residual(self) -> float:
@@ -164,6 +199,9 @@ def _keys(run: RunView) -> Iterator[Key]:
     yield Key("Budget residual", number(run.residual, 2), run.units.energy + budget)
     drift, per = summary.get("energy_drift"), f"{run.units.energy}/atom/{run.units.time}"
     yield Key("Energy drift", number(drift, 2, signed=True), per)
+    steps, moved = run.time_step["per_period"], run.time_step["fluctuation"]
+    share = "" if moved is None else f"; energy noise {percent(moved)} of the kinetic"
+    yield Key("Fastest vibration", number(steps, 3), "steps" + share)
     error = run.ase.get("energy_rel")
     compared = "not compared" if error is None else "relative energy difference"
     compared += " of a sample" if "sampled" in run.ase else ""

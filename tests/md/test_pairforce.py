@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from ase import Atoms
 from oracles import COMPARISONS, all_pairs
 from rollout.harness import evaluated, liquid, listed, nearest, write_system
+from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
@@ -332,3 +334,15 @@ def test_thresholds_are_the_numbers_the_program_compares_with():
 def test_an_unknown_convention_is_refused():
     with pytest.raises(InputError, match="r3 <"):
         PairDecider((1.0,), "r3 <")
+
+
+@pytest.mark.parametrize("precision", [{}, dict.fromkeys(("state", "force", "decision"), "float32")])
+def test_a_list_of_no_pair_has_no_nearest_one(precision):
+    """The slots that fill a table up are near to no threshold, with forces and without."""
+    atoms = Atoms("Ar3", [[0, 0, 0], [5, 0, 0], [0, 6, 0]], cell=[20] * 3, pbc=True)
+    simulation = build(make(atoms, LENNARD_JONES, {"kind": "hard", "radius": 2.2}, precision=precision))
+    table = simulation.verlet_list().build(simulation.positions, simulation.cell)
+    x = jnp.asarray(simulation.positions[table.order].T, simulation.policy.dtype("state"))
+    tables, force = simulation.tables(table), simulation.force
+    made = force(x, tables, decisions=True).decisions
+    assert np.isinf(made.nearest) and np.isinf(force.decide(x, tables).nearest)

@@ -14,9 +14,10 @@ from ase.filters import FrechetCellFilter
 from ase.optimize import BFGS, FIRE
 from small_systems import LENNARD_JONES, crystal, make
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, NumericalError
 from mdnum.references import MdnumCalculator
 from mdnum.references.ase_models import evaluate, reference
+from mdnum.systems import build
 
 SWITCHED = {"kind": "switched", "radius": 2.2, "onset": 1.8}
 #: Of the lattice, near that of zero stress: lists of one length serve all tests.
@@ -129,4 +130,67 @@ def test_what_cannot_be_calculated_is_an_error(keys: dict, message: str):
     atoms = bulk("Ar", "fcc", a=1.7, cubic=True)
     atoms.calc = argon()
     with pytest.raises(InputError, match="half the smallest perpendicular"):
+        atoms.get_potential_energy()
+
+
+def test_what_is_no_configuration_is_refused_and_never_answered():
+    """Numbers that are not finite, two atoms at one place, and elements with another's constants."""
+    atoms = crystal(lattice_constant=NEAR)
+    for spoiled in (np.nan, np.inf):
+        atoms.calc = argon()
+        atoms.positions[3, 1], kept = spoiled, atoms.positions[3, 1]
+        with pytest.raises(InputError, match="atom 3 is"):
+            atoms.get_potential_energy()
+        atoms.positions[3, 1] = kept
+    atoms.positions[7] = atoms.positions[3]
+    with pytest.raises(NumericalError, match="closest pair is 3-7 at 0"):
+        atoms.get_forces()
+    for element in ("C", "Ge"):
+        for system in ("silicon/tersoff-512", "silicon/stillinger-weber-512"):
+            other = bulk(element, "diamond", a=5.43, cubic=True) * (2, 2, 2)
+            other.calc = MdnumCalculator(system)
+            with pytest.raises(InputError, match=f"holds {element}, .*Si"):
+                other.get_potential_energy()
+
+
+def test_what_it_has_is_advertised_and_other_keywords_are_refused():
+    many_body = MdnumCalculator("silicon/stillinger-weber-512")
+    assert "energies" in argon().implemented_properties and "energies" not in many_body.implemented_properties
+    assert many_body.parameters["potential"]["kind"] == "stillinger-weber"
+    assert argon().parameters["cutoff"]["onset"] == SWITCHED["onset"]
+    with pytest.raises(TypeError, match="override"):
+        MdnumCalculator("argon/liquid-864", override={"cutoff.kind": "switched"})
+    with pytest.raises(TypeError, match="overrides"):
+        argon().set(overrides={"cutoff.kind": "switched"})
+    # a slab has a stress in its plane, as ASE's own calculators give it
+    slab = crystal(lattice_constant=NEAR)
+    slab.center(vacuum=3.0, axis=2)
+    slab.pbc = (True, True, False)
+    slab.calc = argon()
+    theirs = evaluate(reference(make(slab, LENNARD_JONES, SWITCHED)).make(), slab)
+    ours, volume = slab.get_stress(voigt=False), slab.get_volume()
+    assert theirs["stress"] is None and np.abs(ours[:2, :2]).max() > 0.01
+    for axis in (0, 1):
+        energies = []
+        for sign in (1, -1):
+            strained = slab.copy()
+            cell = np.array(slab.cell)
+            cell[axis] *= 1 + sign * 1e-6
+            strained.set_cell(cell, scale_atoms=True)
+            strained.calc = argon()
+            energies.append(strained.get_potential_energy())
+        assert ours[axis, axis] == pytest.approx((energies[0] - energies[1]) / 2e-6 / volume, abs=1e-6)
+
+
+def test_a_simulation_is_evaluated_at_other_places_of_its_own_atoms():
+    system = make(crystal(lattice_constant=NEAR), LENNARD_JONES, SWITCHED, neighbors={"skin": 0.1})
+    atoms = system.atoms.copy()
+    atoms.rattle(0.03, seed=1)
+    atoms.calc = MdnumCalculator(build(system))
+    energy = atoms.get_potential_energy()
+    atoms.calc = argon()
+    assert energy == pytest.approx(atoms.get_potential_energy(), rel=1e-13)
+    atoms.calc = MdnumCalculator(build(system))
+    atoms.pop(3)
+    with pytest.raises(InputError, match="other atoms"):
         atoms.get_potential_energy()

@@ -96,7 +96,12 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
             "unknown potential kind … Did you mean lennard-jones? … eam",
         ),
         ('kind = "nve"', "", 19, "'kind' missing in [dynamics] … nve, langevin"),
-        ('"nve"', '"langevin"', 19, "key 'temperature' missing in [dynamics] … 1 more problem follows"),
+        (
+            '"nve"',
+            '"langevin"',
+            19,
+            "key 'temperature' missing in [dynamics] … Something is wrong with dynamics.friction, too",
+        ),
         ("radius = 8.0", "radius = true", 14, "cutoff.radius = true … expected a number"),
         ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the radius"),
         ("radius = 8.0", "", 12, "[cutoff] … radius missing … in_sigma"),

@@ -179,6 +179,7 @@ def test_every_planted_defect_is_found(good):
     planted = {
         "RUN_FAILED": changed(good, {"status": "failed", "error": "a force is NaN"}),
         "NOT_FINISHED": changed(good, {"status": None}),
+        "TIME_STEP": changed(good, {"fastest_period": 0.01}),
         "LOST_PAIRS": changed(
             good, epochs=with_row(run.epochs, 1, lost_pairs=3, lost_pair_steps=11, first_lost_step=25)
         ),
@@ -207,7 +208,7 @@ def test_every_planted_defect_is_found(good):
     values = found(planted["BUDGET_OPEN"])["BUDGET_OPEN"].values
     assert values["step"] == 77 and values["largest"] == pytest.approx(values["jump"], rel=0.01)
     verdict = judge(good)
-    assert (verdict.tone, verdict.headline, len(verdict.evidence)) == ("good", TEXTS("notes"), 4)
+    assert (verdict.tone, verdict.headline, len(verdict.evidence)) == ("good", TEXTS("notes"), 5)
 
 
 def test_lost_pairs_come_with_numbers_and_a_remedy_and_before_what_follows_from_them(good):
@@ -215,7 +216,7 @@ def test_lost_pairs_come_with_numbers_and_a_remedy_and_before_what_follows_from_
     blind = {**good.system, "neighbors": {"rebuild": {"check": False, "every": 20}}}
     verdict = judge(changed(good, epochs=lost, system=blind))
     finding = verdict.findings[0]
-    assert (verdict.tone, finding.code, len(verdict.evidence)) == ("error", "LOST_PAIRS", 3)
+    assert (verdict.tone, finding.code, len(verdict.evidence)) == ("error", "LOST_PAIRS", 4)
     assert finding.values == {"lost": 3, "pair_steps": 1108, "since": 25, "every": 20}
     assert "every 20 steps" in finding.remedy
     assert verdict.headline.startswith(finding.title[0].upper() + finding.title[1:])
@@ -223,6 +224,58 @@ def test_lost_pairs_come_with_numbers_and_a_remedy_and_before_what_follows_from_
     first, *rest = judge(changed(good, {"energy_budget_closes": False}, epochs=lost, series=series)).findings
     assert [first.code, *(each.code for each in rest[:2])] == ["LOST_PAIRS", "EVENT_ALGEBRA", "BUDGET_OPEN"]
     assert {each.remedy for each in rest[:2]} == {TEXTS.entries["EVENT_ALGEBRA"]["remedy_lost"]}
+
+
+def test_a_time_step_is_judged_by_what_the_energy_does_and_by_the_fastest_vibration(good):
+    """A known noise on a known swing; a drift of known size and its error; nothing where nothing is known."""
+    rows = 4001
+    at, noise = np.arange(rows), np.random.default_rng(3).normal(size=rows)
+    series = {name: np.resize(values, rows) for name, values in good.series.items()}
+    series |= {"step": at, "time": at * DT, "kinetic": 10 + np.sin(0.3 * at), "energy_jump": np.zeros(rows)}
+    sigma = 0.08 / 2**0.5  # 8 % of the swing's standard deviation
+    flips = analysis.scan({name: values[:0] for name, values in good.folder.read("flips").items()}, rows)
+
+    def run(conserved, **summary):
+        own = {name: np.zeros(rows, int) for name in ("entered", "left")} | {"pairs": np.full(rows, 100)}
+        return changed(good, summary, flips=flips, series=series | own | {"conserved": conserved})
+
+    noisy = run(sigma * noise)
+    assert noisy.time_step["fluctuation"] == pytest.approx(0.08, rel=0.05)
+    assert judge(noisy).headline.endswith(found(noisy)["TIME_STEP"].title + ".")
+    calm = run(sigma / 8 * noise, fastest_period=20 * DT)
+    assert "TIME_STEP" not in found(calm) and calm.time_step["per_period"] == pytest.approx(20)
+    assert "TIME_STEP" in found(run(sigma / 8 * noise, fastest_period=5 * DT))
+    # a line through it is a drift and no fluctuation
+    thermal = ATOMS * good.thermal
+    line = 0.03 * thermal * at / rows
+    tilted = run(sigma / 8 * noise + line).time_step
+    assert tilted["fluctuation"] == pytest.approx(calm.time_step["fluctuation"], rel=1e-6)
+    assert tilted["drift"] == pytest.approx(0.03, rel=0.02) and 0 < tilted["drift_error"] < 1e-3
+    # a walk that ends away from where it began is not told from none
+    walk = np.cumsum(noise)
+    assert "DRIFT" in found(run(line)) and "DRIFT" not in found(run(walk * 0.02 * thermal / np.ptp(walk)))
+    short = changed(good, series={name: values[:30] for name, values in good.series.items()})
+    assert set(short.time_step.values()) == {None}
+
+
+def test_remedies_name_what_the_system_has(good):
+    """A key that its file holds, and no cutoff where the potential has its own end; rounding is no kick."""
+    tie = {"series": with_row(good.series, 0, min_margin=0.0)}
+    for key in ("radius", "in_sigma", "pairs"):
+        view = changed(good, system={**good.system, "cutoff": {"kind": "hard", key: 2.5}}, **tie)
+        assert f"cutoff.{key}" in found(view)["TIE_AT_CUTOFF"].remedy
+    many_body = {name: value for name, value in good.system.items() if name != "cutoff"}
+    for jump in (JUMP, 0.0):
+        view = changed(
+            good, {"cutoff": {**good.cutoff, "energy_jump": jump, "force_jump": 1e-3}, "ambiguous": 2},
+            system=many_body, **tie,
+        )  # fmt: skip
+        assert not any("cutoff." in each.remedy for each in judge(view).findings)
+        assert ("HARD_CUTOFF" in found(view)) == bool(jump)
+    rounding = {"cutoff": {**good.cutoff, "energy_jump": 9e-24, "force_jump": 1e-22}}
+    assert not {"HARD_CUTOFF", "FORCE_JUMP"} & set(found(changed(good, rounding)))
+    kick = found(good)["HARD_CUTOFF"]
+    assert kick.values["share"] == pytest.approx(abs(JUMP) / good.thermal)
 
 
 def test_chatter_is_a_matter_of_the_cutoff(good):

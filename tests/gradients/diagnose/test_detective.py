@@ -9,7 +9,8 @@ import pytest
 from ase import Atoms
 from small_systems import LENNARD_JONES, make
 
-from mdnum.gradients import Problem
+from mdnum.errors import NumericalError
+from mdnum.gradients import Problem, value_and_grad
 from mdnum.gradients.diagnose.detective import detective, first_not_finite
 from mdnum.gradients.losses import Custom, VelocityAutocorrelation
 from mdnum.gradients.parameters import with_values
@@ -70,6 +71,13 @@ def test_a_root_of_the_loss_at_zero_is_found_in_the_loss(meeting, loss, expected
     assert (found.found, found.forward, found.part, found.operation) == expected
     assert "gone" in found.source or expected[3] != "div"
     assert np.isnan(found.distance) and found.j == -1 and (found.step == -1) == (not found.found)
+
+
+def test_a_gradient_that_is_not_finite_is_refused_with_the_operation_at_fault(meeting):
+    far = with_values(meeting.simulation, {"initial.velocities": np.zeros((2, 3))})
+    function = value_and_grad(Problem(far, Custom(see=gone), 1), ["initial.velocities"], "symmetric")
+    with pytest.raises(NumericalError, match=r"gradient by initial.velocities is not finite: .* div\(.*gone"):
+        function()
 
 
 def test_what_is_masked_away_is_not_blamed():
