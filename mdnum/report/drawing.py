@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Canvas
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullLocator, ScalarFormatter
 
 from mdnum.report.section import Figure, Plot, Region, Series
@@ -153,14 +154,18 @@ def _plot(plot: Plot, figure: Canvas) -> None:
         _series(axes, series, bases, sum(_coincide(series, other) for other in plot.series[at + 1 :]))
     if not axes.lines and not axes.collections:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, color=MUTED, ha="center", va="center")
+    curves = list(axes.lines)
     for value, word in _apart(plot.verticals, bases["x"], axes.get_xlim()):
         axes.axvline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
-        place = {"xy": (value, 0.98), "xycoords": axes.get_xaxis_transform(), "va": "top", "rotation": 90}
-        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right", gid=HALO)
+        up = not _high(curves, axes, value)
+        place = {"xy": (value, 0.98 if up else 0.02), "xycoords": axes.get_xaxis_transform(), "rotation": 90}
+        place |= {"va": "top" if up else "bottom", "ha": "right"}
+        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, gid=HALO)
     for value, word in _apart(plot.horizontals, bases["y"], axes.get_ylim()):
         axes.axhline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
-        place = {"xy": (0.99, value), "xycoords": axes.get_yaxis_transform(), "va": "bottom"}
-        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right", gid=HALO)
+        # beside the axes, where no curve is
+        place = {"xy": (1.005, value), "xycoords": axes.get_yaxis_transform(), "va": "center", "ha": "left"}
+        axes.annotate(fill(typeset(word), 14), **place, color=MUTED, fontsize=8, gid=HALO)
     for setter, label, base in (
         (axes.set_xlabel, plot.x_label, bases["x"]),
         (axes.set_ylabel, plot.y_label, bases["y"]),
@@ -170,6 +175,16 @@ def _plot(plot: Plot, figure: Canvas) -> None:
     # a line alone is named too, unless the axis names it
     if plot.region is not None or any(one.label != plot.y_label for one in plot.series):
         legend(axes)
+
+
+def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
+    """Whether curves run through the upper part of the axes beside this place, and none through the lower."""
+    to_axes = axes.transData + axes.transAxes.inverted()
+    points = [to_axes.transform(np.column_stack(np.asarray(one.get_data(), float))) for one in curves]
+    at = np.concatenate(points or [np.zeros((0, 2))])
+    beside = np.abs(at[:, 0] - to_axes.transform((x, axes.get_ylim()[0]))[0]) < 0.04
+    heights = at[beside & np.isfinite(at[:, 1]), 1]
+    return bool(np.any(heights > 0.65) and not np.any(heights < 0.3))
 
 
 def _values(plot: Plot, name: str) -> np.ndarray:

@@ -216,3 +216,16 @@ def test_every_color_of_text_can_be_read():
             for ground in (theme["paper"], card):
                 low, high = sorted((luminance(theme[role]), luminance(ground)))
                 assert (high + 0.05) / (low + 0.05) >= 4.5, (role, ground)
+
+
+@pytest.mark.parametrize(("height", "below"), [(0.9, True), (0.05, False)])
+def test_words_stand_where_no_curve_is(height, below):
+    """Of a vertical in the free half of the axes, of a horizontal beside them."""
+    x = np.linspace(0, 1, 50)
+    curve = Series("a", x, np.where(x > 0.3, height, 0.5))
+    ends = Series("b", np.array([0.0, 1e-3]), np.array([0.0, 1.0]))
+    plot = Plot("p", "t", "x", "y", (curve, ends), verticals=((0.7, "fork"),), horizontals=((0.5, "limit"),))
+    axes = drawing.draw(plot).axes[0]
+    fork, limit = axes.texts
+    assert (fork.get_verticalalignment() == "bottom") is below
+    assert limit.xy[0] > 1 and limit.get_horizontalalignment() == "left"
