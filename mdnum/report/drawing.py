@@ -180,7 +180,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
     """Whether curves run through the upper part of the axes beside this place, and none through the lower."""
     to_axes = axes.transData + axes.transAxes.inverted()
-    points = [to_axes.transform(np.column_stack(np.asarray(one.get_data(), float))) for one in curves]
+    points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])
     beside = np.abs(at[:, 0] - to_axes.transform((x, axes.get_ylim()[0]))[0]) < 0.04
     heights = at[beside & np.isfinite(at[:, 1]), 1]

@@ -40,9 +40,10 @@ CHATTER_SHARE = 0.15
 DRIFT_SHARE = 0.01
 #: Standard errors that a drift must be away from none.
 ERRORS = 2.0
-#: Fluctuation of the conserved energy over the kinetic energy's from which on a time step is too long, and
-#: steps in a vibration: below half of what is usually recommended, 10 to 20 (see scripts/time_steps.py).
-FLUCTUATION, STEPS_PER_PERIOD = 0.05, 6.0
+#: Fluctuation of the conserved energy over the kinetic energy's from which on a time step is too long (where
+#: averages begin to move: docs/time-steps.md), and steps in the fastest vibration (GROMACS reference manual,
+#: "Removing fastest degrees of freedom").
+FLUCTUATION, STEPS_PER_PERIOD = 0.05, 5.0
 #: A jump of energy at the cutoff, or of force times its radius, that is nothing, in k_B T.
 NO_JUMP = 1e-9
 #: What compiles and keeps what the loop calls.
