@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Int, UInt8
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+
+from mdnum.compiled import njit
 
 # Decisions are packed eight slots to a byte. A step of a list with W*8 slots for each of C columns leaves a
 # (W, C) array of bytes; slot k of column c is bit k % 8 of byte [k // 8, c].
@@ -37,7 +38,7 @@ def bits_set(typingctx: Any, word: Any) -> Any:
     return types.uint64(types.uint64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _scan(before, rows, columns, row, slot, column, values):
     """Note the bits that change from row to row; returns their number, of which those that fit are noted."""
     at, room = 0, row.shape[0]
@@ -110,7 +111,7 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def digit_order(room, count, most):
     """A stable order of so many keys, whole numbers from 0 to below the most: digit by digit, the last first.
 

@@ -24,6 +24,7 @@ from mdnum.cli.output import ProgressBar, describe
 from mdnum.cli.verbs import app, check, fork, systems
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
+from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 
 SUMMARY: dict[str, Any] = {
@@ -171,9 +172,24 @@ def test_a_bug_keeps_its_traceback(rollout: Recorder):
             main(["run", "x"])
 
 
+def test_a_run_that_is_stopped_names_the_folder_that_it_chose(tmp_path: Path, monkeypatch, capsys):
+    def stopped(system: str, **options: Any) -> None:
+        folder = RunFolder.create(default_folder(system))
+        folder.checkpoint({}, force=True)
+        options["progress"](3, 10, {"phase": "run", "folder": folder.path})
+        options["progress"](0, 0, {"phase": "report"})
+        folder.close()
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(mdnum, "run", stopped, raising=False)
+    assert call("run", "argon/crystal-108") == 130
+    assert "Continue it with `mdnum run --resume runs/argon-crystal-108-1`" in capsys.readouterr().err
+
+
 def test_default_folders_count_up(tmp_path: Path):
     assert default_folder("argon/liquid-864", tmp_path).name == "argon-liquid-864-1"
-    for name in ("argon-liquid-864-1", "argon-liquid-864-9", "argon-liquid-864-x", "argon-liquid-8"):
+    for name in ("argon-liquid-864-9", "argon-liquid-864-x", "argon-liquid-8"):
         (tmp_path / name).mkdir()
     assert default_folder("argon/liquid-864", tmp_path).name == "argon-liquid-864-10"
     assert default_folder("some where/my liquid.toml", tmp_path).name == "my-liquid-1"

@@ -15,9 +15,9 @@ from ase import Atoms
 from ase.io import read as ase_read
 
 from mdnum.errors import FolderError
-from mdnum.store import COLUMNS, TABLES, RunFolder, columns_of, tables
+from mdnum.safe_path import environment, python
+from mdnum.store import COLUMNS, TABLES, RunFolder, columns_of, files, tables
 from mdnum.store import checkpoint as frames
-from mdnum.store import files as atomic
 
 
 def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
@@ -209,7 +209,7 @@ def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, 
         return wrapper
 
     with monkeypatch.context() as patch:
-        patch.setattr(atomic.os, "replace", dies(os.replace))
+        patch.setattr(files.os, "replace", dies(os.replace))
         patch.setattr(tables.Path, "unlink", dies(tables.Path.unlink))
         with pytest.raises(Killed):
             folder.finalize()
@@ -389,6 +389,55 @@ def test_two_writers_are_refused(tmp_path):
         RunFolder.open(first.path).resume()
     first.close()
     assert RunFolder.open(first.path).resume()["step"] == 10
+
+
+NAMES = """
+import sys
+from mdnum.store import RunFolder
+from mdnum.store.files import default_folder
+print("ready", flush=True)
+sys.stdin.readline()
+for _ in range(10):
+    print(RunFolder.create(default_folder("argon/liquid-864")).path.name)
+"""
+
+
+def test_processes_that_start_at_once_get_a_folder_each(tmp_path):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    words, env = python("-c", NAMES), environment()
+    started = [subprocess.Popen(words, cwd=tmp_path, env=env, **pipes) for _ in range(8)]
+    assert [one.stdout.readline() for one in started] == ["ready\n"] * 8
+    for one in started:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    names = [name for one in started for name in one.communicate()[0].split()]
+    assert not any(one.returncode for one in started)
+    assert sorted(names) == sorted(f"argon-liquid-864-{number}" for number in range(1, 81))
+
+
+def test_a_name_is_not_taken_from_a_file_or_a_link(tmp_path):
+    (tmp_path / "x-1").write_text("")
+    (tmp_path / "x-2").symlink_to("nowhere")
+    assert files.default_folder("x", tmp_path).name == "x-3"
+    with pytest.raises(FolderError, match="a file of this name is there"):
+        files.default_folder("x", tmp_path / "x-1")
+
+
+def test_a_run_that_began_and_ended_meanwhile_is_kept(tmp_path, monkeypatch):
+    take, others = RunFolder._take_lock, []
+
+    def late(self):
+        if not others:
+            others.append(self)
+            done = RunFolder.create(tmp_path / "run")
+            write_run(done, 0, 10)
+            done.finalize()
+        take(self)
+
+    monkeypatch.setattr(RunFolder, "_take_lock", late)
+    with pytest.raises(FolderError, match="already holds a run"):
+        RunFolder.create(tmp_path / "run")
+    assert RunFolder.open(tmp_path / "run").rows("series") == 10
 
 
 def test_changed_folder_is_not_resumed(tmp_path):

@@ -180,7 +180,7 @@ def _again(given: Mapping[str, Any]) -> str | None:
     """What can be done about the folder of a command that was stopped and has a --resume."""
     from mdnum.store import RunFolder
 
-    folder = given.get("resume") or given["out"]
+    folder = given.get("resume") or given["out"] or given["progress"].folder
     with suppress(MdnumError):
         return RunFolder.open(folder).again if "resume" in given and folder is not None else None
     return None  # it was stopped before there was one
@@ -422,6 +422,8 @@ class ProgressBar:
         self._timer: threading.Timer | None = None
         self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
         self._closed = False
+        #: the folder that the rollout writes, once it has named it
+        self.folder: Path | None = None
 
     def __enter__(self) -> Self:
         self._began = time.monotonic()
@@ -440,6 +442,7 @@ class ProgressBar:
         """What a rollout reports: the step reached, of how many, and counts so far."""
         with self._lock:
             self._last = (step, steps, dict(info))
+            self.folder = info.get("folder", self.folder)
             self._draw()
 
     @property

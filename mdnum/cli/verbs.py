@@ -74,10 +74,6 @@ def run(
         output.refuse_beside_resume(given, "run")
     elif system is None:
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
-    else:
-        from mdnum.store.files import default_folder
-
-        how["out"] = how["out"] or default_folder(system)
     return mdnum.run(system, steps=steps, save_every=save_every, resume=resume, check=not no_check, **how)
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike
 
+from mdnum.compiled import njit
 from mdnum.errors import InputError
 from mdnum.numerics.rounding import Reach
 
@@ -149,7 +149,7 @@ def _subtract(lattice, x, y, z, n):
     return x, y, z
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def nearest_image(lattice, x, y, z):
     """`Cell.minimum_image` of one displacement in compiled loops over pairs, with the same bits.
 

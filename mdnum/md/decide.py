@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.bits import bits_set, lowest_bit
+from mdnum.compiled import cfunc, njit
 from mdnum.errors import InputError
 from mdnum.md import foreign
 from mdnum.md.cell import Cell
@@ -369,7 +370,7 @@ def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
 @cache
 def _noting() -> str:
     """The name by which XLA knows `_note`."""
-    made = numba.cfunc(numba.types.intp(numba.types.intp), cache=True)(_note)
+    made = cfunc(numba.types.intp(numba.types.intp), _note)
     return registered("mdnum_changes", made.ctypes, made)
 
 
@@ -405,7 +406,7 @@ def _note(frame):
 _TOGETHER = 128
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def note(before, bits, index, x, v, row, pairs, ends, count):
     """Add what changed in a row to the parts of `Changes`; what there is no room for is counted.
 

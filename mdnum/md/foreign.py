@@ -15,6 +15,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from mdnum.compiled import njit
+
 # of the foreign-function interface, whose layout in memory the loop relies on
 VERSION = (0, 3)
 
@@ -125,7 +127,7 @@ def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
     return made(types.intp, types.intp), generate
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def asked_to_run(frame):
     """Whether a call is more than a question or a preparation; a question is answered."""
     asked = peek(frame, 1)

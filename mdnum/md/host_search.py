@@ -12,7 +12,6 @@ import threading
 from typing import Any
 
 import llvmlite.binding as llvm
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from llvmlite import ir
@@ -20,6 +19,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from mdnum.compiled import njit
 from mdnum.md.cell import Cell
 from mdnum.provenance import cores
 
@@ -127,7 +127,7 @@ def _turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any
     return types.void(rows, types.intp, types.intp, out, types.intp, types.intp), generate
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _bin_atoms(fractional, bins, bin_of, start, order):
     """Counting sort of atoms by bin; atoms keep their order within a bin."""
     n = fractional.shape[1]
@@ -149,7 +149,7 @@ def _bin_atoms(fractional, bins, bin_of, start, order):
         cursor[b] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _layered(x, start, bins):
     """The atoms layer after layer along the third axis: there the bins along the second lie side by side.
 
@@ -174,7 +174,7 @@ def _layered(x, start, bins):
     return layered, label, begin
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _runs(b0, b1, box, run, shift):
     """The bins of a layer that are near a column, with the lattice vector that brings each run of them near.
 
@@ -206,7 +206,7 @@ def _runs(b0, b1, box, run, shift):
     return found, middle
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
     """Copy the atoms that are near a column of bins, layer after layer, moved by their lattice vectors.
 
@@ -253,7 +253,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 # they are not vectorized, and a search takes twice as long.
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
     """Which candidates are near."""
     for k in range(len(x)):
@@ -261,7 +261,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
     """As `_within`, where an axis has a single bin and the nearest image is looked for pair by pair."""
     for k in range(len(x)):
@@ -275,7 +275,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _compressed(mask, label, first, atoms, out, place):
     """Write the labels that the mask keeps, of so many atoms from the first on; how many."""
     filled = place
@@ -284,7 +284,7 @@ def _compressed(mask, label, first, atoms, out, place):
     return filled - place
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _transposed(rows, table, first, begin, end):
     """The slots of consecutive atoms, which share cache lines: written together."""
     room, n = table.shape
@@ -298,7 +298,7 @@ def _transposed(rows, table, first, begin, end):
             table[k, first + i] = rows[i, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _fill(x, layered, box, inverse, start, r2_list, table, columns):
     """Neighbors of the (bin-sorted) atoms in some columns of bins.
 

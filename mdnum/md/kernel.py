@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import llvmlite.binding as llvm
-import numba
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, UInt8
 from numba import types
 
+from mdnum.compiled import cfunc, njit
 from mdnum.md.decide import Decisions, Tables
 from mdnum.md.foreign import (
     ALIVE,
@@ -496,14 +496,14 @@ def _registered(source: str) -> str:
 # Loops over n numbers at given addresses: each a function of its own, so that it becomes one of vectors.
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _filled(out_at, n, value):
     out = carray(pointer(out_at), (n,), np.float64)
     for k in range(n):
         out[k] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _interleaved(columns_at, columns, atoms, table_at, apart):
     """Numbers of one atom after the other, and those of an atom behind the last, which padding names."""
     of = carray(pointer(columns_at), (columns * atoms,), np.float64)
@@ -515,7 +515,7 @@ def _interleaved(columns_at, columns, atoms, table_at, apart):
         table[atoms * apart + row] = np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _least(values_at, n, out_at):
     values = carray(pointer(values_at), (n,), np.float64)
     least = np.inf
@@ -530,7 +530,7 @@ def _least(values_at, n, out_at):
 _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST = (*range(9), 16)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _work(job):
     """Take one block of a job after the other, until none is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
@@ -574,7 +574,7 @@ def _work(job):
     free(room)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _leave(job):
     """The last one to use a job clears it away."""
     if added(job + 8 * _USERS, -1) == 1:
@@ -588,7 +588,7 @@ def _help(job):
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _helped(job, frame, helpers, task):
     """Ask XLA's threads for help; without any the work is done all the same."""
     api, asked = peek(frame, 2), job + 8 * _ASKED
@@ -646,7 +646,7 @@ def _over_blocks(frame, word, task):
 def _driver() -> tuple[int, int]:
     """Addresses of the loop over a list and of what helps it; compiled once after an installation."""
     made = [
-        numba.cfunc(types.intp(*[types.intp] * count), cache=True)(function)
+        cfunc(types.intp(*[types.intp] * count), function)
         for function, count in ((_over_blocks, 3), (_help, 1))
     ]
     ALIVE.extend(made)

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, overload
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from mdnum.compiled import njit
 from mdnum.md.cell import Cell
 from mdnum.md.neighbors import PairTable
 
@@ -208,7 +208,7 @@ def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
 # --- rows of runs beside one another: atoms put in one order, and how far the same atoms are apart ----
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _place(values, order, out):
     for row in range(values.shape[0]):
         for axis in range(values.shape[1]):
@@ -229,7 +229,7 @@ def in_user_order(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _largest(a, b, matrix, inverse, pbc, orthorhombic, out):
     periodic = pbc[0] or pbc[1] or pbc[2]
     for row in range(out.shape[0]):
@@ -258,7 +258,7 @@ def _largest(a, b, matrix, inverse, pbc, orthorhombic, out):
         out[row] = np.sqrt(most)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _overridden(
     own, told, index, order, x, species, r_cut, matrix, inverse, pbc, orthorhombic, count, furthest
 ):
@@ -336,7 +336,7 @@ class Apart:
         return count, furthest
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _differ(a, b, out):
     for row in range(out.shape[0]):
         if out[row]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.bits import digit_order
+from mdnum.compiled import njit
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
 from mdnum.md.decide import Changes, note
@@ -19,7 +19,7 @@ from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _mixed(key):
     """A well-mixed 64-bit number for a key (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
@@ -28,7 +28,7 @@ def _mixed(key):
     return z ^ (z >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def fingerprint_of_bits(bits, index, order):
     """Number and mixed sum of the keys of all pairs inside; the same for every list that decides alike."""
     count, total = 0, np.uint64(0)
@@ -47,7 +47,7 @@ def fingerprint_of_bits(bits, index, order):
     return count, total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _fingerprint_of_keys(keys):
     total = np.uint64(0)
     for key in keys:
@@ -55,7 +55,7 @@ def _fingerprint_of_keys(keys):
     return len(keys), total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
     """`Changes` of consecutive rows of one list."""
     held = before.copy()
@@ -64,7 +64,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 
 
 # atoms in one place have no radial speed: not a number, as in numpy
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice, narrow, first, factor):
     """Columns of a ledger from `Changes`, sorted, and whether a margin contradicts its decision.
 
@@ -355,7 +355,7 @@ def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "wor
     return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _write_keys(bits, index, order, place, keys):
     """Keys atom after atom, each with its neighbors in order; returns how many there are."""
     atoms, at = order.shape[0], 0

@@ -270,6 +270,7 @@ class Rollout:
             "steps_per_second": tally.steps_per_second,
             "flips": tally.entered + tally.left,
             "rebuilds": self.done.health.rebuilds,
+            "folder": self.folder.path,
         }
         self.progress(step, self.steps, info)
 

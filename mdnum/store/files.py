@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -28,6 +29,7 @@ _REMEDIES = {
     errno.EACCES: ("permission denied", "Choose a folder that can be written to"),
     errno.EPERM: ("permission denied", "Choose a folder that can be written to"),
     errno.EROFS: ("the file system is read-only", "Choose a folder that can be written to"),
+    errno.EEXIST: ("a file of this name is there", "Choose another folder"),
     errno.ENOTDIR: ("a part of the path is a file, not a folder", "Choose another folder"),
     errno.ENOENT: ("the folder is gone", "Do not move or remove a run folder while it is written"),
 }
@@ -334,19 +336,26 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """runs/NAME-N with the system's name in dashes and the first N past those that exist.
+    """A new folder runs/NAME-N: the system's name in dashes, and the first N past those that exist.
+
+    Making it takes the name: of processes that look at the same time no two get the same.
 
     Args:
         system: a system's name, or the path of its file.
         runs: the folder of run folders.
+
+    Raises:
+        FolderError: it cannot be made.
     """
     path = Path(system)
     word = path.stem if path.suffix == ".toml" else system
     slug = re.sub(r"[^A-Za-z0-9._]+", "-", word).strip("-.") or "run"
     taken = re.compile(re.escape(slug) + r"-(\d+)")
-    numbers = [
-        int(match[1])
-        for entry in (runs.iterdir() if runs.is_dir() else ())
-        if (match := taken.fullmatch(entry.name))
-    ]
-    return runs / f"{slug}-{max(numbers, default=0) + 1}"
+    with disk_errors(runs):
+        runs.mkdir(parents=True, exist_ok=True)
+        numbers = [int(match[1]) for entry in runs.iterdir() if (match := taken.fullmatch(entry.name))]
+        for number in count(max(numbers, default=0) + 1):
+            with suppress(FileExistsError):
+                (made := runs / f"{slug}-{number}").mkdir()
+                return made
+    raise AssertionError

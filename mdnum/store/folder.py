@@ -104,10 +104,7 @@ class RunFolder:
         folder = cls(Path(path), world)
         if folder.path.exists() and not folder.path.is_dir():
             raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
-        present = sorted(entry.name for entry in folder.path.iterdir()) if folder.path.is_dir() else []
-        present = [name for name in present if name != _LOCK]
-        if present and not overwrite and not _came_to_nothing(folder.path, present):
-            _refuse_to_overwrite(folder.path, present)
+        folder._usable(overwrite)
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -116,6 +113,8 @@ class RunFolder:
             ) from error
         with disk_errors(folder.path):
             folder._take_lock()
+            # once more: another process may have begun a run there meanwhile, and have finished it
+            present = folder._usable(overwrite)
             for name in SUBFOLDERS:
                 # through a link, the files of somebody else would be removed
                 refuse_link(folder.path / name / "any")
@@ -509,6 +508,14 @@ class RunFolder:
         return [f"{self.path / name}: {wrong}." for name, wrong in self.damaged().items()]
 
     # -- inside ----------------------------------------------------------------------------------
+
+    def _usable(self, overwrite: bool) -> list[str]:
+        """Names in a folder in which a run may begin; none where it is not there."""
+        there = self.path.iterdir() if self.path.is_dir() else ()
+        present = sorted(entry.name for entry in there if entry.name != _LOCK)
+        if present and not overwrite and not _came_to_nothing(self.path, present):
+            _refuse_to_overwrite(self.path, present)
+        return present
 
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:

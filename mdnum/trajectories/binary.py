@@ -18,9 +18,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
+from mdnum.compiled import njit
 from mdnum.reading import reading
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import NARROWED, box_of, file_of
@@ -184,7 +184,7 @@ class XtcFile(XdrFile):
             raise ValueError("damaged: the compressed coordinates do not end where their length says")
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _walk(stream, atoms, whole, small):
     """Bits that the coordinates of so many atoms take; -8 where the stream is none.
 

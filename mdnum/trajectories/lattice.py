@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mdnum.compiled import njit
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box
 
@@ -126,7 +126,7 @@ def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "ima
 
 
 # inlined: a call that takes arrays costs more than what is done here
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
     """Squared distance from atom i to an image of atom j, i < j: the number that decides."""
     if s0 == 0 and s1 == 0 and s2 == 0:
@@ -138,7 +138,7 @@ def square_of(x, i, j, s0, s1, s2, vectors):
     return d0 * d0 + d1 * d1 + d2 * d2
 
 
-@numba.njit(cache=True, nogil=True, inline="never")
+@njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
     """`square_of` the image that rounding to the lattice names, of pairs; y is room for (3, block).
 
@@ -167,7 +167,7 @@ def near_squares(x, i, j, lattice, y, squares):
         squares[k] = d0 * d0 + d1 * d1 + d2 * d2
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def image_square(x, i, j, rank, lattice):
     """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.
 
@@ -370,7 +370,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
     return bins, reach, step
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def wrap(x, lattice, bins, step):
     """Wrap every atom, and name the lattice vectors taken off and its bin."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
@@ -400,7 +400,7 @@ def wrap(x, lattice, bins, step):
     return wrapped, home, bin_of
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _sorted_by_bin(bin_of, chosen, total):
     """(start, order) of the chosen atoms: a counting sort that keeps their order within a bin."""
     start = np.zeros(total + 1, np.int64)
@@ -420,14 +420,14 @@ def _sorted_by_bin(bin_of, chosen, total):
     return start, order
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def lattice_vector(code):
     """The three integers of the code of a lattice vector."""
     code = np.int64(code)
     return (code >> 20) - 512, ((code >> 10) & 1023) - 512, (code & 1023) - 512
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
     """The run of bins that begins d away from a bin: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
@@ -437,7 +437,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
     return n0, n1, n2, row + low, row + high, d2 + high - low + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _most_around(bins, reach, start):
     """Most atoms, and most runs, around any bin."""
     atoms, runs = 0, 0
@@ -458,7 +458,7 @@ def _most_around(bins, reach, start):
 
 # Not inlined, and in loops from 0 over slices: an index that could be negative costs a test for each
 # candidate, and the loop its vector instructions.
-@numba.njit(cache=True, nogil=True, inline="never")
+@njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
     """Squares of near[:, first:last] as seen from x, and which of them, counted from first, are within."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
@@ -475,7 +475,7 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
     return kept
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def meet(atoms, limits, found):
     """Record the pairs of all centers; returns how many of each kind.
 

@@ -10,11 +10,11 @@ import os
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.bits import digit_order
+from mdnum.compiled import njit
 from mdnum.errors import InputError
 from mdnum.trajectories.lattice import (
     DIRECTED,
@@ -114,7 +114,7 @@ def search(
     return Found(kind, found.i_open[:left], found.j_open[:left], found.value[:left], left, close, smallest)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
     """The number that decides on a pair found with n added to the wrapped coordinates of j.
 
@@ -124,7 +124,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
     return square_of(x, i, j, s0, s1, s2, vectors)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _settle(x, atoms, kind, square, radius, bound, found):
     """Decide on the candidates that wrapped coordinates left open; returns the smallest |margin|.
 
@@ -247,7 +247,7 @@ def nearest(
         centers, radius = lacking, min(radius * 1.4, everything)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
@@ -345,7 +345,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
         room = total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _compared(old, new, made):
     """Write what differs; rows that do not fit are counted only. seen[j] = (images before, images now)."""
     atoms = old.first.shape[0]
@@ -387,7 +387,7 @@ def image_distances(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _image_distances(x, lattice, i, j, rank, out):
     narrowest = min(lattice.widths[0], lattice.widths[1], lattice.widths[2])
     near, block = 0.2499 * narrowest * narrowest, 1024

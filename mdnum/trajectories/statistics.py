@@ -19,10 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.compiled import njit
 from mdnum.trajectories.history import Contacts, History, Strides, Sums, contacts, doublings, mended
 from mdnum.trajectories.ledger import Columns
 from mdnum.trajectories.topology import AtomTable
@@ -154,7 +154,7 @@ def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[
     return both, once
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _again(pairs, begin, end, lags, frames, both, once):
     for place in range(lags.shape[0]):
         lag = lags[place]

@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8, UInt16
 from llvmlite import ir
@@ -24,6 +23,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from mdnum.bits import lowest_bit
+from mdnum.compiled import njit
 from mdnum.trajectories.lattice import Participants, Placed, wrap
 from mdnum.trajectories.search import Changed, exact_square
 
@@ -266,7 +266,7 @@ def _tiled(
     return Tiled(first.copy(), second.copy(), vector.astype(np.uint8), rows, inside)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _halved(x, order):
     """Sort atoms so that each run of sixteen is compact: in halves along the longest edge, and these again.
 
@@ -313,7 +313,7 @@ def _halved(x, order):
             top += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _nodes(boxes, runs):
     """Boxes around the clusters of each run, around its halves, and so on: the halves follow their whole.
 
@@ -343,7 +343,7 @@ def _nodes(boxes, runs):
     return nodes
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
     """Write the tiles between two runs of clusters as far as they fit; how many there are."""
     count, square, same = 0, reach * reach, a == b
@@ -381,7 +381,7 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
     """Write followed coordinates; the two largest squared displacements, and their sum over all atoms.
 
@@ -424,7 +424,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
     return most, second, total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _stays(boxes, around, drift):
     """Whether each box is inside the one around it, less the drift."""
     out = 0
@@ -525,7 +525,7 @@ def _lanes(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
     return types.uintp(types.uintp, types.uintp, types.float32, types.float32), generate
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _box(columns, boxes):
     """The box around each cluster, leaving out empty slots."""
     for k in range(columns.shape[0]):
@@ -537,7 +537,7 @@ def _box(columns, boxes):
             boxes[k, c], boxes[k, 3 + c] = low, high
 
 
-@numba.njit(cache=True, nogil=True)
+@njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
     """Decide on the pairs of tiles from one on; (tile to go on with, flips, close, smallest |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
@@ -590,7 +590,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
     return at, count, close, smallest
 
 
-@numba.njit(cache=True, nogil=True, inline="never")
+@njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
     """Decide on the pairs of a row that are in doubt: (bits inside, how many within the bound, smallest)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order

@@ -1,0 +1,69 @@
+"""numba's decorators as mdnum uses them: what they compile is kept for later processes where it can be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+from mdnum.errors import InputError
+
+if numba.config.DISABLE_JIT:  # pyright: ignore
+    raise InputError(
+        "NUMBA_DISABLE_JIT is set, and what XLA calls has to be compiled", remedy="Unset NUMBA_DISABLE_JIT"
+    )
+
+#: What the command line says of a process that could not keep everything.
+NOT_KEPT = (
+    "what was compiled cannot be kept, so that every command compiles it again: neither the installation nor "
+    "a cache folder can be written. Set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that can be written."
+)
+_missed = False
+
+
+def njit(function: Any = None, /, **options: Any) -> Any:
+    """`numba.njit` without the GIL; kept in a file, or compiled by each process where no folder takes one."""
+    if function is None:
+        return lambda function: njit(function, **options)
+    return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))
+
+
+def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
+    """`numba.cfunc`, kept as by `njit`."""
+    return _kept(lambda keep: numba.cfunc(signature, cache=keep)(function))
+
+
+def all_kept() -> bool:
+    """Whether everything that this process compiled so far is kept."""
+    return not _missed
+
+
+def _kept(compiled: Callable[[bool], Any]) -> Any:
+    global _missed
+    try:
+        made = compiled(True)
+    except (OSError, RuntimeError) as error:
+        # numba has no class for it
+        if isinstance(error, RuntimeError) and "cannot cache" not in str(error):
+            raise
+        _missed = True
+        return compiled(False)
+    cache = getattr(made, "_cache", None)
+    for name in ("load_overload", "save_overload"):
+        if hasattr(cache, name):
+            setattr(cache, name, _attempt(getattr(cache, name)))
+    return made
+
+
+def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
+    """A use of a cache in whose folder files may be unreadable, or find no room: both are met only then."""
+
+    def attempt(*given: Any) -> Any:
+        global _missed
+        try:
+            return use(*given)
+        except OSError:
+            _missed = True
+
+    return attempt
