@@ -19,7 +19,8 @@ NOT_KEPT = (
     "what was compiled cannot be kept, so that every command compiles it again: neither the installation nor "
     "a cache folder can be written. Set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that can be written."
 )
-_missed = False
+# what could not be kept
+_missed: list[Any] = []
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
@@ -36,19 +37,19 @@ def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
 
 def all_kept() -> bool:
     """Whether everything that this process compiled so far is kept."""
-    return not _missed
+    # a function that was not called has not been compiled
+    return not any(getattr(one, "signatures", True) for one in _missed)
 
 
 def _kept(compiled: Callable[[bool], Any]) -> Any:
-    global _missed
     try:
         made = compiled(True)
     except (OSError, RuntimeError) as error:
         # numba has no class for it
         if isinstance(error, RuntimeError) and "cannot cache" not in str(error):
             raise
-        _missed = True
-        return compiled(False)
+        _missed.append(made := compiled(False))
+        return made
     cache = getattr(made, "_cache", None)
     for name in ("load_overload", "save_overload"):
         if hasattr(cache, name):
@@ -60,10 +61,9 @@ def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
     """A use of a cache in whose folder files may be unreadable, or find no room: both are met only then."""
 
     def attempt(*given: Any) -> Any:
-        global _missed
         try:
             return use(*given)
         except OSError:
-            _missed = True
+            _missed.append(None)
 
     return attempt

@@ -16,6 +16,8 @@ import jaxtyping
 import pytest
 import typing_rules
 
+from mdnum.cli import programs_folder
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rewrite-goldens", action="store_true", help="write the records of tests/goldens anew")
@@ -31,7 +33,8 @@ def _share_programs() -> None:
         os.environ[name] = tempfile.mkdtemp(prefix="mdnum-programs-")
         atexit.register(shutil.rmtree, os.environ[name], ignore_errors=True)
     for option, value in (
-        ("jax_compilation_cache_dir", os.environ[name]),
+        # where the command line, too, keeps what it compiles under this name
+        ("jax_compilation_cache_dir", os.path.join(os.environ[name], programs_folder())),
         ("jax_persistent_cache_min_compile_time_secs", 0),
         ("jax_persistent_cache_min_entry_size_bytes", -1),
     ):

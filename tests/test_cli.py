@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import io
 import json
-import os
 import subprocess
 import sys
 import time
@@ -347,30 +346,6 @@ def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeyp
         assert ("UNSAFE" in out) is (expected == 1)
         assert call("doctor", "--json") == expected
         assert json.loads(capsys.readouterr().out)["rows"][0]["status"] == status
-
-
-def test_programs_are_kept_beside_other_caches_and_nobody_elses_are_touched(tmp_path, monkeypatch, capsys):
-    name = "JAX_COMPILATION_CACHE_DIR"
-    # set here, so that all are put back
-    for each in (name, "JAX_COMPILATION_CACHE_MAX_SIZE", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
-        monkeypatch.setenv(each, "0")
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert call("systems", "list") == 0 and not any(tmp_path.iterdir())
-    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
-    monkeypatch.delenv(name)
-    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
-    assert call("systems", "list") == 0
-    # XLA prints pages for every program that it loads
-    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
-    (folder,) = (tmp_path / "mdnum").iterdir()
-    assert os.environ[name] == str(folder) and int(os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"]) > 0
-    # where nothing can be kept, nothing is said of it
-    monkeypatch.delenv(name)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    (tmp_path / "file").touch()
-    assert call("systems", "list") == 0 and name not in os.environ
-    assert not capsys.readouterr().err
 
 
 def test_a_number_that_is_none_is_named_in_plain_words(capsys: pytest.CaptureFixture[str]):

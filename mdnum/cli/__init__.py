@@ -7,9 +7,11 @@ was up before a verdict.
 from __future__ import annotations
 
 import atexit
+import codecs
 import contextlib
 import gc
 import hashlib
+import logging
 import os
 import platform
 import sys
@@ -17,37 +19,79 @@ from typing import Any, NoReturn
 
 import typer
 
-from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error, say
+from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, is_interrupt, print_error, print_lines, say
 from mdnum.cli.verbs import app
-from mdnum.errors import InputError, MdnumError
+from mdnum.errors import InputError, MdnumError, json_escape
 
 # typer carries its own copy of click in some versions and imports click in others; either way
 # BadParameter derives from the usage error that its parser raises
 _UsageError: Any = typer.BadParameter.__base__
 
 
-def _keep_programs() -> None:
-    """Let jax keep what it compiles for the next command, unless the environment says otherwise.
-
-    A program compiled for one kind of processor is not offered to another: home folders are shared.
-    """
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+def programs_folder() -> str:
+    """Name of a folder of programs that were compiled for this kind of processor, and are run by no other."""
     features = platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         features = next((line for line in file if line.startswith(("flags", "Features"))), features)
-    kind = hashlib.sha256(features.encode()).hexdigest()[:12]
-    folder = os.path.join(home, "mdnum", f"programs-{kind}")
-    with contextlib.suppress(OSError):
-        os.makedirs(folder, exist_ok=True)
-    if os.access(folder, os.W_OK):
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-        os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(512 * 2**20)
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    return f"programs-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
+
+
+def _keep_programs() -> None:
+    """Let jax keep what it compiles for the next command.
+
+    Processors of several kinds share home folders, and possibly the folder that the environment names.
+    """
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # which jax sets where nobody has
         # XLA takes its own hints (prefer-no-gather) for what the processor lacks and prints pages of it
         # whenever it loads a program; what ends a process is logged still
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    named = os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = os.path.join(home, "mdnum") if named is None else named
+    if "://" not in folder and folder:
+        # an empty name turns it off, and an address is none of a folder
+        if os.path.basename(folder) != programs_folder():
+            folder = os.path.join(folder, programs_folder())
+        with contextlib.suppress(OSError):
+            os.makedirs(folder, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            return
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    if named is None:
+        os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(512 * 2**20)
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+
+
+def _set_up() -> None:
+    """What a process of the command line, and no other, may change for all of it."""
+    # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
+    # short command's time, and walking them once more as the process ends half a second
+    gc.set_threshold(1_000_000, 20, 20)
+    atexit.register(gc.freeze)
+    _keep_programs()
+    # figures become files, whatever windows are drawn with; matplotlib cannot be imported if it knows no such
+    os.environ["MPLBACKEND"] = "agg"
+    # where it cannot keep its list of fonts, it says so in two lines
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    # what an encoding lacks is written as JSON writes it, which is right in JSON and can be read elsewhere
+    codecs.register_error(
+        "mdnum", lambda error: (json_escape(error.object[error.start : error.end]), error.end)
+    )
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, ValueError):
+            stream.reconfigure(errors="mdnum")  # pyright: ignore
+
+
+def _no_device(error: BaseException) -> str | None:
+    """What there is to say of an error of jax's that finds none of the devices it was told to use."""
+    platforms, trace = os.environ.get("JAX_PLATFORMS"), error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    # for some it has a message, for others an assertion
+    raised_by = trace.tb_frame.f_code.co_filename if trace is not None else ""
+    if not platforms or not ("backend" in str(error) or os.path.basename(raised_by) == "xla_bridge.py"):
+        return None
+    return f"jax cannot use JAX_PLATFORMS={platforms!r} ({(str(error) or 'no such device').splitlines()[0]})"
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -58,11 +102,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
-    # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
-    # short command's time, and walking them once more as the process ends half a second
-    gc.set_threshold(1_000_000, 20, 20)
-    atexit.register(gc.freeze)
-    _keep_programs()
+    _set_up()
     try:
         code = app(arguments, standalone_mode=False, prog_name="mdnum")
     except MdnumError as error:
@@ -74,22 +114,24 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             sys.exit(EXIT_USAGE)
         place = error.ctx.command_path if error.ctx else "mdnum"
         asked = InputError(_said(error), remedy=f"See `{place} --help`")
-    except (KeyboardInterrupt, typer.Abort):
+    except typer.Abort:
         sys.exit(EXIT_STOPPED)
     except MemoryError as error:
         needed = f"more memory is needed than there is ({error})"
         asked = InputError(needed, remedy="Ask for fewer atoms, balls or steps")
-    except RuntimeError as error:
-        platforms = os.environ.get("JAX_PLATFORMS")
-        if not platforms or "backend" not in str(error):
-            raise
-        why = f"jax cannot use JAX_PLATFORMS={platforms!r} ({str(error).splitlines()[0]})"
-        asked = InputError(why, remedy="Set it to cpu, or unset it")
     except OSError as error:
         # a full disk, a folder without write permission: the person's to mend, not a bug to trace
         where = str(error.filename) if error.filename else None
         asked = InputError(error.strerror or str(error), where=where)
+    except BaseException as error:
+        if is_interrupt(error):
+            sys.exit(EXIT_STOPPED)
+        if (seen := _no_device(error)) is None:
+            raise
+        asked = InputError(seen, remedy="Set it to cpu, or unset it")
     else:
+        compiled = sys.modules.get("mdnum.compiled")
+        print_lines([] if compiled is None or compiled.all_kept() else [compiled.NOT_KEPT])
         sys.exit(code or 0)
     print_error(asked, as_json=as_json)
     sys.exit(asked.exit_code)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import signal
 import sys
 import threading
 import time
@@ -38,6 +39,7 @@ EXIT_UNDECIDED = 3  # time was up before a verdict
 EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
 
 _PIPE_WIDTH, _PROSE_WIDTH = 200, 100
+_MAIN = threading.main_thread()
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
 _MOST_ROWS = 12
@@ -202,7 +204,8 @@ def print_document(document: Mapping[str, Any], text: str, as_json: bool) -> int
 
 def say(text: str, *, err: bool = False) -> None:
     """A line for a person, in which nothing that came from a file reaches the terminal raw."""
-    typer.echo(printable(text), err=err)
+    # typer's own echo writes UTF-8 to a stream that is ascii
+    print(printable(text), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def print_error(error: MdnumError, *, as_json: bool) -> None:
@@ -225,7 +228,7 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
 def print_lines(lines: Iterable[str]) -> None:
     """Lines on stderr that say who speaks."""
     for line in lines:
-        typer.echo("mdnum: " + " ".join(line.split()), err=True)
+        say("mdnum: " + " ".join(line.split()), err=True)
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
@@ -392,11 +395,17 @@ def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
     try:
         with ProgressBar() as progress:
             yield progress
-    except (KeyboardInterrupt, SystemError) as error:
-        # one that meets a compiled function as it returns comes as the cause of another error
-        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+    except BaseException as error:
+        if not is_interrupt(error):
             raise
         raise Stopped("stopped", remedy=remedy()) from None
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether it began with control-C, which becomes another error inside of an import or compiled code."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | MdnumError):
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return isinstance(error, KeyboardInterrupt)
 
 
 class ProgressBar:
@@ -440,6 +449,9 @@ class ProgressBar:
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
         """What a rollout reports: the step reached, of how many, and counts so far."""
+        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL and threading.current_thread() is _MAIN:
+            # there is something to be kept by now
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         with self._lock:
             self._last = (step, steps, dict(info))
             self.folder = info.get("folder", self.folder)
