@@ -72,6 +72,16 @@ class MdnumError(Exception):
             parts.append(remedy)
         super().__init__(" ".join(part if part.endswith((".", "?", "!")) else part + "." for part in parts))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # by its attributes, not by a call: a pool of workers hangs where the error of one cannot be restored
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[MdnumError], args: tuple[Any, ...], held: dict[str, Any]) -> MdnumError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(held)
+    return error
+
 
 class InputError(MdnumError):
     """What a person wrote cannot be run: a system file, an option, a structure."""

@@ -19,6 +19,7 @@ from mdnum.ball.world import World
 from mdnum.bits import changes_in_time
 from mdnum.errors import InputError
 from mdnum.numerics.events import Ledger
+from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.rounding import gamma
 
 #: Balls times steps that leave the device at once.
@@ -137,6 +138,7 @@ def simulate(
     Raises:
         InputError: steps below 1.
     """
+    check_not_forked()
     if steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")
     balls = start.y.shape[0]

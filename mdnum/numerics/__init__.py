@@ -10,6 +10,7 @@ from mdnum.numerics.events import (
     Ledger,
     Threshold,
 )
+from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.roles import PrecisionPolicy, RolePrecision
 from mdnum.numerics.rounding import (
     Reach,
@@ -33,6 +34,7 @@ __all__ = [
     "RolePrecision",
     "Threshold",
     "changes_in_time",
+    "check_not_forked",
     "count_set",
     "distance_bound",
     "gamma",

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from mdnum.md.cell import wrap_positions
 from mdnum.md.decide import Changes, Tables, zeros
 from mdnum.md.neighbors import PairTable, VerletList
+from mdnum.numerics import check_not_forked
 from mdnum.rollout.epoch import (
     EpochOutcome,
     EpochProgram,
@@ -186,6 +187,7 @@ class Engine:
         rows: bool = True,
         pins: Pins | None = None,
     ):
+        check_not_forked()
         self.simulation = simulation
         self.last = last
         self.record = record

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 from ase import Atoms
+from ase.calculators.singlepoint import SinglePointCalculator
 
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
@@ -210,12 +211,13 @@ class Rollout:
     def _save_frames(self, segment: Segment) -> None:
         if not self.save_every:
             return
+        energies = segment.rows_of("potential")
         for row in range(segment.rows):
             step = segment.first + row
             if step % self.save_every == 0:
-                self.folder.append_frame(self._frame(segment, row, step))
+                self.folder.append_frame(self._frame(segment, row, step, float(energies[row])))
 
-    def _frame(self, segment: Segment, row: int, step: int) -> Atoms:
+    def _frame(self, segment: Segment, row: int, step: int, energy: float) -> Atoms:
         atoms: Atoms = self.simulation.system.atoms.copy()
         atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
         atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
@@ -223,6 +225,8 @@ class Rollout:
         atoms.info["images"] = segment.unsorted("images", row)
         atoms.info["step"] = step
         atoms.info["time"] = step * self.simulation.system.spec.dynamics.timestep
+        # forces and stress are not among what the loop records
+        atoms.calc = SinglePointCalculator(atoms, energy=energy)
         return atoms
 
     def _checkpoint(self, segment: Segment, *, force: bool) -> None:

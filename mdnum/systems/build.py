@@ -23,7 +23,7 @@ from mdnum.md.manybody import ManyBody
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
-from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.numerics import PrecisionPolicy, check_not_forked, unit_roundoff
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
 from mdnum.systems import pairs, schema
@@ -310,6 +310,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     Raises:
         InputError: the cutoff and skin do not fit the box, or the file cannot be run.
     """
+    check_not_forked()
     if not isinstance(system, System):
         system = load(system, overrides, world="md")
     spec, units = system.spec, system.units
@@ -499,6 +500,7 @@ class Evaluator:
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
         """The simulation in this cell, wrapped positions, the list for them, and positions in its order."""
+        check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
         here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))

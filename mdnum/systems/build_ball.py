@@ -14,7 +14,7 @@ from mdnum.ball import limits, step, stopping
 from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.numerics import neighbor, reductions
+from mdnum.numerics import check_not_forked, neighbor, reductions
 from mdnum.numerics.roles import RolePrecision
 from mdnum.systems import ball
 from mdnum.systems.load import BallSystem, load
@@ -66,6 +66,7 @@ def build_ball(
     Raises:
         InputError: the file cannot be run.
     """
+    check_not_forked()
     if not isinstance(system, BallSystem):
         system = load(system, overrides, world="ball")
     variants = tuple(

@@ -107,6 +107,8 @@ def test_the_series_are_those_of_the_frames(fluid, tmp_path):
         r2 = (d[inside] ** 2).sum(axis=1)
         kinetic = 0.5 * (atoms.get_velocities() ** 2).sum()
         assert series["potential"][step] == pytest.approx(lennard_jones(r2).sum(), rel=1e-12)
+        # the same bits: what the loop summed, and no other evaluation
+        assert atoms.get_potential_energy() == series["potential"][step]
         assert series["kinetic"][step] == pytest.approx(kinetic, rel=1e-13)
         assert series["temperature"][step] == pytest.approx(2 * kinetic / (3 * 108 - 3), rel=1e-13)
         virial = (24 * (2 * r2**-6 - r2**-3)).sum()

@@ -1,0 +1,37 @@
+"""A process forked from one in which jax computes: there jax waits for threads that no fork copies."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from jax._src import xla_bridge
+
+from mdnum.errors import InputError
+
+_forked = False
+
+
+def check_not_forked() -> None:
+    """To be called before jax is asked for anything.
+
+    Raises:
+        InputError: this process is a fork of one in which jax had been used.
+    """
+    if _forked:
+        raise InputError(
+            "this process was forked from one in which jax had been used, and jax would wait in it for ever",
+            remedy="Start workers with multiprocessing.get_context('spawn'), or use mdnum in workers "
+            "alone (docs/pools.md)",
+        )
+
+
+def _in_child() -> None:
+    global _forked
+    # looked at as it is: the lock of jax's own question may be held by a thread that is not there any more
+    started: Any = getattr(xla_bridge, "_backends", True)
+    _forked = _forked or bool(started)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_child)
