@@ -36,6 +36,9 @@ _JAX_SETTINGS = (
     "jax_threefry_partitionable",
 )
 
+# set while git runs a hook, for the repository of that
+_GIT_ELSEWHERE = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+
 
 class _System(Protocol):
     """What is asked of a system: a structural type, because systems stand above this file."""
@@ -198,6 +201,8 @@ def hashes(system: _System) -> dict[str, str | None]:
 def commit(package: Path) -> str | None:
     """The git commit that mdnum runs from, with "+" when its files were changed since.
 
+    None of the programs that a repository can name (monitors, hooks, filters, transports) is run.
+
     Args:
         package: the folder of the package.
 
@@ -205,10 +210,15 @@ def commit(package: Path) -> str | None:
         None for an installed wheel, without git, or when the folder belongs to another repository.
     """
 
+    settings = ["core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never"]
+    environment = {key: value for key, value in os.environ.items() if key not in _GIT_ELSEWHERE}
+    environment |= {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"}
+
     def git(*words: str) -> str | None:
+        command = ["git", *(word for one in settings for word in ("-c", one)), "-C", str(package), *words]
         try:
             done = subprocess.run(
-                ["git", "-C", str(package), *words], capture_output=True, text=True, timeout=10, check=False
+                command, capture_output=True, text=True, timeout=10, check=False, env=environment
             )
         except (OSError, subprocess.TimeoutExpired):
             return None  # no git here: a commit is worth knowing, not worth failing for
@@ -220,4 +230,9 @@ def commit(package: Path) -> str | None:
     head = git("rev-parse", "HEAD")
     if head is None:
         return None
-    return head + ("+" if git("status", "--porcelain", "--untracked-files=no", "--", ".") else "")
+    filters = git("config", "--name-only", "--get-regexp", r"^filter\..*") or ""
+    if "=" in filters:
+        return None  # a name that cannot be set to nothing, and that no repository of mdnum's has
+    settings += [f"{one}={'false' if one.endswith('.required') else ''}" for one in filters.splitlines()]
+    status = ("status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all", "--", ".")
+    return head + ("+" if git(*status) else "")

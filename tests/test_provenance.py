@@ -116,3 +116,48 @@ def test_commit_belongs_to_mdnum_and_says_when_files_changed(tmp_path: Path):
     assert provenance.commit(tmp_path) == head
     (tmp_path / "provenance.py").write_text("x = 2\n")
     assert provenance.commit(tmp_path) == head + "+"
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no git here")
+@pytest.mark.parametrize("driver", ["planted", "a=b"])
+def test_no_program_that_a_repository_names_is_run(tmp_path: Path, driver: str):
+    def git(*words: str) -> None:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.invalid", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", "-C", str(package), *identity, *words], check=True, capture_output=True)
+
+    package, ran = tmp_path / "package", tmp_path / "ran"
+    package.mkdir()
+    program = tmp_path / "program"
+    program.write_text(f"#!/bin/sh\necho $0 >> {ran}\ncat\n")
+    program.chmod(0o755)
+    source = package / "provenance.py"
+    source.write_text("x = 1\n")
+    (package / ".gitattributes").write_text(f"*.py filter={driver}\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "a package")
+    git("config", "core.fsmonitor", str(program))
+    for name in ("clean", "smudge", "process"):
+        git("config", f"filter.{driver}.{name}", str(program))
+    git("config", f"filter.{driver}.required", "true")
+    (package / ".git" / "hooks").mkdir(exist_ok=True)
+    for hook in ("post-index-change", "fsmonitor-watchman", "post-checkout"):
+        shutil.copy(program, package / ".git" / "hooks" / hook)
+    # the same text, newer: git reads it through its filters to see whether it changed
+    source.write_text("x = 1\n")
+    found = provenance.commit(package)
+    assert not ran.exists(), ran.read_text()
+    if driver == "planted":
+        assert found is not None and len(found) == 40
+        source.write_text("x = 2\n")
+        assert provenance.commit(package) == found + "+" and not ran.exists()
+    else:
+        assert found is None
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no git here")
+def test_the_commit_is_not_that_of_the_repository_whose_hook_runs_mdnum(tmp_path, monkeypatch):
+    subprocess.run(["git", "init", "--quiet", str(tmp_path)], check=True)
+    here = provenance.commit(Path(provenance.__file__).parent)
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / ".git"))
+    assert provenance.commit(Path(provenance.__file__).parent) == here

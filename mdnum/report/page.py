@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
@@ -101,11 +103,21 @@ def _render(template: str, **content: Any) -> str:
         "static": STATIC_ROWS,
         "style": Markup(_text("report.css")),
         "script": Markup(_text("report.js")),
+        "policy": _policy(),
         "light": drawing.LIGHT,
         "dark": drawing.DARK,
         "font": Markup(drawing.FONT),
     }
     return environment.get_template(template).render(**content)
+
+
+def _policy() -> str:
+    """What a browser lets a page do: show itself and run its one script, whatever else got into it."""
+    digest = base64.b64encode(hashlib.sha256(_text("report.js").encode()).digest()).decode()
+    return (
+        "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; style-src 'unsafe-inline'; "
+        f"script-src 'sha256-{digest}'"
+    )
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:

@@ -5,11 +5,14 @@ The folders are made without a rollout: pairs oscillate about the cutoff, and an
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import re
 import shutil
 import subprocess
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -479,6 +482,47 @@ document.body.append(result);
 """
 
 
+def hashed(script: str) -> str:
+    """How a page's policy names a script."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def shown_by_browser(page: Path, folder: Path) -> str:
+    """The elements of a page once a browser has shown it."""
+    return subprocess.run(
+        [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
+         "--disable-background-networking", "--disable-component-update", "--window-size=390,800",
+         f"--user-data-dir={folder / 'profile'}", "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, timeout=240,
+    ).stdout  # fmt: skip
+
+
+def test_a_page_may_show_itself_and_run_its_own_script_alone(tmp_path):
+    page = frame.finish(make_run(tmp_path / "run", steps=30)).folder / "report.html"
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]+)">', text)
+    # before anything that it is to hold for
+    assert found is not None and text.index("<style") > found.start() < text.index("<title")
+    policy = dict(part.split(maxsplit=1) for part in unescape(found[1]).split(";"))
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    assert policy.pop("script-src") == f"'{hashed(script)}'"
+    assert policy == {
+        "default-src": "'none'", "base-uri": "'none'", "form-action": "'none'", "img-src": "data:",
+        "style-src": "'unsafe-inline'",
+    }  # fmt: skip
+    assert not re.search(r"<[^>]+\son\w+\s*=", text), "a handler in an attribute would not be called"
+    if BROWSER is None:
+        return
+    planted = "<p id=planted>as written</p><img src=x onerror=\"planted.textContent = 'run'\">"
+    planted += "<script>planted.textContent = 'run'</script>"
+    assert "data-needs-script hidden" in text
+    page.write_text(text.replace("</main>", planted + "</main>"), encoding="utf-8")
+    shown = shown_by_browser(page, tmp_path)
+    assert "as written</p>" in shown
+    # its own has run: what needs it is there
+    assert re.search(r"data-needs-script(?![^>]*hidden)", shown)
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no browser installed")
 def test_sort_search_and_pages(tmp_path):
     folder = make_run(tmp_path / "run", steps=120, candidates=300)
@@ -486,15 +530,15 @@ def test_sort_search_and_pages(tmp_path):
     page = frame.finish(folder).folder / "report.html"
     i, j = int(run.flips.nearest["i"][0]), int(run.flips.nearest["j"][0])
     script = SCRIPT.replace("PAIR", f'"{j}-{i}"').replace("ATOM", f'"{i}"')
-    page.write_text(page.read_text(encoding="utf-8").replace("</body>", script + "</body>"), encoding="utf-8")
-    done = subprocess.run(
-        [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
-         "--disable-background-networking", "--disable-component-update", "--window-size=390,800",
-         f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert found, done.stderr[-2000:]
+    text = page.read_text(encoding="utf-8").replace("</body>", script + "</body>")
+    # the page's policy runs no script but its own: this one is added to it
+    inner = re.search(r"<script>(.*?)</script>", script, re.DOTALL)
+    assert inner is not None
+    text = text.replace("script-src ", f"script-src '{hashed(inner[1])}' ")
+    page.write_text(text, encoding="utf-8")
+    shown = shown_by_browser(page, tmp_path)
+    found = re.search(r'<pre id="result">(.*?)</pre>', shown, re.DOTALL)
+    assert found, shown[-2000:]
     seen = json.loads(found[1].replace("&gt;", ">").replace("&lt;", "<").replace("&amp;", "&"))
 
     total = run.flips.total
