@@ -7,6 +7,7 @@ lines, or none. `reading` turns each into one line with the file and the frame.
 from __future__ import annotations
 
 import io
+import os
 import re
 import sys
 import warnings
@@ -16,7 +17,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -25,6 +26,10 @@ from mdnum.errors import InputError, MdnumError
 if TYPE_CHECKING:
     from ase import Atoms
 
+#: Bytes beyond which no system file and no summary is read: nobody wrote that by hand, nor mdnum.
+MOST_TEXT = 1 << 28
+# characters of a line of a file of structures
+_LONGEST_LINE = 1 << 24
 #: what to do about a file that nobody can read
 CHECK = "Check that the file is whole and of the kind its name says"
 #: what to do about a structure that nobody can read
@@ -162,6 +167,22 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
         raise InputError(said, remedy=CHECK, where=str(path))
 
 
+def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
+    """The text of a file that is held in memory whole, UTF-8.
+
+    Raises:
+        InputError: it is too large for that. OSError, UnicodeDecodeError: as `open` and `read`.
+    """
+    if isinstance(file, str | Path):
+        with open(file, "rb") as opened:
+            return whole_text(opened, where)
+    size = os.fstat(file.fileno()).st_size
+    if size > MOST_TEXT:
+        said = f"holds {size:,} bytes, where no text of its kind is larger than {MOST_TEXT:,}"
+        raise InputError(said, remedy=CHECK, where=str(where))
+    return file.read().decode("utf-8")
+
+
 def first_line(error: BaseException) -> str:
     """The message of an error in a line."""
     cause: BaseException | None = error
@@ -190,7 +211,9 @@ class _Lines(io.TextIOWrapper):
     _at_end = 0
 
     def readline(self, size: int = -1, /) -> str:
-        line = super().readline(size)
+        line = super().readline(_LONGEST_LINE if size < 0 else size)
+        if len(line) == _LONGEST_LINE and size < 0:
+            raise ValueError(f"a line is longer than {_LONGEST_LINE:,} characters")
         self._at_end = 0 if line else self._at_end + 1
         if self._at_end > _PATIENCE:
             raise ValueError("the file ends before what its head announces")

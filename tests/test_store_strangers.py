@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import json
 import os
+import re
 import runpy
+import shutil
 import sys
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +22,25 @@ from ase.build import bulk
 from pydantic_core import to_json
 from test_store import frame, no_waiting, series_rows, state_at, write_run  # noqa: F401
 
+import mdnum
+from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
-from mdnum.store import RunFolder, checkpoint
+from mdnum.store import COLUMNS, RunFolder, checkpoint, tables
 from mdnum.store import files as atomic
 from mdnum.store import files as manifest
+
+
+def called(*words: str) -> tuple[int | None, str, str]:
+    """(exit code, stdout, stderr) of a command; None where it ended in a traceback, which stderr then is."""
+    out, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            main(list(words))
+        except SystemExit as done:
+            return int(done.code or 0), out.getvalue(), errors.getvalue()
+        except Exception:
+            return None, out.getvalue(), traceback.format_exc()
+
 
 PRECIOUS = b"somebody's only copy"
 
@@ -457,6 +477,132 @@ def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, sta
         (folder.path / state).write_text("{}")
     with pytest.raises(InputError, match=f"is the folder of `mdnum {world}`, and no run. {advice}"):
         run(None, resume=folder.path)
+
+
+@pytest.mark.parametrize("name", ["summary.json", "provenance.json", "system.toml", "manifest.json"])
+def test_a_text_larger_than_memory_is_not_read(finished, name):
+    if name != "manifest.json":
+        # before its digest is made of all of it
+        (finished / "manifest.json").unlink()
+    os.truncate(finished / name, 6 << 30)
+    code, _, err = called("report", str(finished))
+    assert code == 2 and err.splitlines()[-1].startswith("mdnum: ") and "6,442,450,944 bytes" in err
+    assert "Traceback" not in err
+
+
+def test_a_structure_of_one_endless_line_is_not_read(tmp_path):
+    system = tmp_path / "system.toml"
+    mdnum.load("argon/crystal-108").write(tmp_path)
+    os.truncate(tmp_path / "structure.extxyz", 0)
+    os.truncate(tmp_path / "structure.extxyz", 6 << 30)
+    code, _, err = called("run", str(system), "-o", str(tmp_path / "run"))
+    assert code == 2 and err.count("\n") == 1 and "structure.extxyz" in err
+    assert not (tmp_path / "run").exists()
+
+
+def zeros(folder: Path) -> None:
+    """A table of a million rows in a few kilobytes."""
+    columns = {name: np.zeros(1_000_000, kind.to_pandas_dtype()) for name, kind in COLUMNS["series"].items()}
+    pq.write_table(pa.table(columns), folder / "series.parquet", compression="zstd")
+    (folder / "manifest.json").unlink()
+    assert (folder / "series.parquet").stat().st_size < 100_000
+
+
+def test_a_table_that_unpacks_to_more_than_any_is_refused_from_its_head(finished, monkeypatch):
+    zeros(finished)
+    monkeypatch.setattr(tables, "_MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", None)
+    with pytest.raises(FolderError, match=r"bytes claim to hold 120,000,000, which no table"):
+        RunFolder.open(finished).read("series")
+
+
+def test_a_table_of_zeros_is_read(finished):
+    """Two runs that never differ have such ones."""
+    zeros(finished)
+    assert RunFolder.open(finished).rows("series") == 1_000_000
+    # sixty million in four megabytes are too many for the limits that there are
+    assert 60e6 * len(COLUMNS["series"]) * 8 > tables._MOST_UNPACKED + tables._MOST_TIMES * 4e6
+
+
+def test_what_a_kill_left_is_swept_from_every_folder_when_a_run_is_resumed(killed, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (killed / "structures").mkdir()
+    (killed / "figures").symlink_to(tmp_path / "elsewhere")
+    left = [killed / one / ".0123456789abcdef.part" for one in (".", "parts", "structures")]
+    kept = tmp_path / "elsewhere" / ".0123456789abcdef.part"
+    for file in (*left, kept):
+        file.write_bytes(PRECIOUS)
+    folder = RunFolder.open(killed)
+    folder.resume()
+    folder.close()
+    assert not any(file.exists() for file in left) and kept.read_bytes() == PRECIOUS
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("small") / "run"
+    mdnum.run("argon/crystal-108", steps=4, out=folder, check=False, report=False)
+    return folder
+
+
+SIGNS = "\x1b[31mred\u202e\u2066 hidden\u200b"
+
+
+def test_signs_that_turn_or_hide_text_reach_neither_page_nor_terminal(small, tmp_path):
+    folder = RunFolder.open(shutil.copytree(small, tmp_path / "a\x1b[31m\u202eb"))
+    folder._owner = True
+    folder.write_provenance(folder.provenance | {"command": SIGNS, "folder": SIGNS})
+    folder.write_summary(folder.summary | {"about": SIGNS, "system": SIGNS})
+    with open(folder.path / "log.txt", "a") as log:
+        log.write("changed")
+    code, out, err = called("report", str(folder.path))
+    page = (folder.path / "report.html").read_text(encoding="utf-8")
+    assert code in (0, 1) and "red" in page and "log.txt" in err
+    for text in (out, err, page):
+        assert not set(text) & set("\x1b\u202e\u2066\u200b")
+
+
+def one_line(code: int | None, err: str) -> bool:
+    """Whether a command answered, or said in one line why not."""
+    lines = [line for line in err.splitlines() if not re.search(r"\(\d+ s\)$", line)]
+    return code in (0, 1) or (code == 2 and len(lines) == 1 and lines[0].startswith("mdnum: "))
+
+
+ODD = [
+    {"findings": 5}, {"findings": [{}]}, {"verdict": []}, {"potential": "?"}, {"steps": {}}, {"ase": 7},
+    {"atoms": None}, {"flips_entered": "many"}, {"system": [1]}, {"cutoff": {"radius": "x"}}, {"time": "x"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", [("report",), ("run", "--resume")], ids=" ".join)
+def test_an_odd_inside_with_right_digests_is_one_line(small, tmp_path, words):
+    for number, odd in enumerate(ODD):
+        folder = RunFolder.open(shutil.copytree(small, tmp_path / str(number)))
+        folder._owner = True
+        folder.write_summary(folder.summary | odd)
+        code, _, err = called(*words, str(folder.path), "--no-report" if words[0] == "run" else "--json")
+        assert one_line(code, err), (odd, err)
+
+
+@pytest.mark.parametrize("odd", ["nan", "huge", "negative", "empty"])
+def test_odd_values_in_tables_with_right_digests_are_no_traceback(small, tmp_path, odd):
+    for table in ("series", "flips", "epochs"):
+        folder = RunFolder.open(shutil.copytree(small, tmp_path / table))
+        held = pq.read_table(folder.path / f"{table}.parquet")
+        if odd == "empty":
+            held = held.slice(0, 0)
+        for at, column in enumerate(held.schema):
+            if held.num_rows and (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+                kind = np.dtype(column.type.to_pandas_dtype())
+                limits = np.finfo(kind) if kind.kind == "f" else np.iinfo(kind)
+                value = {"huge": limits.max, "negative": max(limits.min, -7), "nan": 0}[odd]
+                value = np.nan if (odd, kind.kind) == ("nan", "f") else value
+                held = held.set_column(at, column, pa.array(np.full(held.num_rows, value, kind)))
+        name = f"{table}.parquet"
+        pq.write_table(held, folder.path / name)
+        manifest.update(folder.path, {name: [manifest.digest(folder.path / name)]})
+        code, _, err = called("report", str(folder.path))
+        assert one_line(code, err), (table, err)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
+from mdnum.errors import json_escape, printable
 from mdnum.report.browse import STATIC_ROWS, Browse
 from mdnum.report.section import Figure, Plot, cell
 from mdnum.report.words import heading, many, typeset
@@ -42,7 +43,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     pictures, notes = {}, {}
     for part in parts:
         if isinstance(part, Figure | Plot):
-            image = page.pictures.get(part.name) or drawing.markup(drawing.draw(part), part.name)
+            image = printable(page.pictures.get(part.name) or drawing.markup(drawing.draw(part), part.name))
             write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", drawing.standalone(image))
             pictures[part.name] = Markup(drawing.inline(image, typeset(part.alt)))
             notes[part.name] = drawing.notes(part)
@@ -63,7 +64,8 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
         scripted=any(isinstance(part, Browse) and part.rows for part in parts),
         provenance=list(flat(page.provenance)),
     )
-    write_text(path, text)
+    # what came from a file may turn or hide text around it; escaped as in JSON, which is in there too
+    write_text(path, printable(text, json_escape))
     return path
 
 

@@ -18,6 +18,7 @@ from typing import BinaryIO, Literal
 
 from mdnum import __version__
 from mdnum.errors import FolderError
+from mdnum.reading import whole_text
 
 #: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
 SUBFOLDERS = ("parts", "figures", "structures")
@@ -150,11 +151,11 @@ def read_text(path: Path) -> str:
     """The text of a file of a folder; empty where it is not there.
 
     Raises:
-        FolderError: it is a link, or not UTF-8.
+        InputError: it is a link, not UTF-8, or larger than any text of a folder.
     """
     try:
         with opened(path) as file:
-            return file.read().decode("utf-8")
+            return whole_text(file, path)
     except (FileNotFoundError, NotADirectoryError):
         return ""
     except UnicodeDecodeError as error:

@@ -10,6 +10,7 @@ import re
 import sys
 import time
 import tomllib
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -471,21 +472,23 @@ class RunFolder:
         """Whatever goes wrong in here because the folder is not what was written is told in one line.
 
         Raises:
-            FolderError: the folder is damaged, or unfinished, or has no manifest. What goes wrong with one
-                whose files are all as they were written is a mistake of mdnum and remains what it is.
+            FolderError: the folder is damaged, or unfinished, or has no manifest; or its digests are those of
+                files that mdnum would not write, for which the place in its code is named. What goes wrong
+                with a whole folder that this object wrote is a mistake of mdnum and remains what it is.
         """
         try:
             yield
         except (MdnumError, OSError):
             raise
         except Exception as error:
-            made = manifest.load(self.path)
             wrong = self.damaged()
-            if made is not None and made.finished and not wrong and "summary.json" in made.files:
+            if self._owner and not wrong:
                 raise
             seen = " ".join(str(error).split())[:200]
-            names = f" (damaged: {', '.join(wrong)})" if wrong else ""
-            message = f"what it holds is not what mdnum writes{names}: {type(error).__name__} {seen}".rstrip()
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"in {last.name}, {Path(last.filename).name}:{last.lineno}"
+            names = f"damaged: {', '.join(wrong)}" if wrong else place
+            message = f"holds what mdnum does not write ({names}): {type(error).__name__} {seen}".rstrip()
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
@@ -530,9 +533,10 @@ class RunFolder:
 
     def _sweep(self, *patterns: str) -> None:
         """Removes what a kill left of files that were being replaced, and files of these patterns."""
-        for pattern in (*patterns, ".*.part", "parts/.*.part"):
+        for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
-                file.unlink()
+                if not (file.parent.is_symlink() and file.parent != self.path):
+                    file.unlink()
 
     def _listed(self) -> dict[str, list[str]]:
         path = self.path / manifest.NAME

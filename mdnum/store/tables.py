@@ -5,6 +5,7 @@ That of a folder which nobody resumes needs no parts: a thread writes its file a
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -65,6 +66,10 @@ _RESUMED = frozenset({"md"})
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
 _GROUP_ROWS = 262_144
+# how many times the bytes of its file a table may hold, and bytes that any may hold: columns of zeros, such
+# as the separation of two equal runs, are packed to next to nothing
+_MOST_TIMES, _MOST_UNPACKED = 100, 1 << 30
+_RESTORE = "Restore it from a copy, or run again in a new folder"
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
 _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before", "radial_speed"})
 
@@ -377,13 +382,18 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     """A parquet file whose pages are compared with their checksums as they are read."""
     try:
         with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
+            head, size = file.metadata, os.fstat(raw.fileno()).st_size
+            held = 8 * head.num_rows * head.num_columns
+            if held > _MOST_UNPACKED + _MOST_TIMES * size:
+                said = f"{size:,} bytes claim to hold {held:,}, which no table of mdnum unpacks to"
+                raise FolderError(said, where=str(path), remedy=_RESTORE)
             yield file
     except (OSError, pa.ArrowException, MemoryError) as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
             f"is damaged: not a readable parquet file ({seen})",
             where=str(path),
-            remedy="Restore it from a copy, or run again in a new folder",
+            remedy=_RESTORE,
         ) from error
 
 

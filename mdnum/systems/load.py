@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError, expect_path
+from mdnum.reading import whole_text
 from mdnum.registry import nearest
 from mdnum.store.files import disk_errors, replacing, write_text
 from mdnum.systems import pairs, schema, structures, toml
@@ -64,7 +65,7 @@ def world_of(name: Any) -> str:
 
 
 def _world(path: Path) -> str:
-    return tomllib.loads(path.read_text(encoding="utf-8")).get("world", "md")
+    return tomllib.loads(whole_text(path, path)).get("world", "md")
 
 
 def find(name: str | Path) -> tuple[str, Path]:
@@ -382,7 +383,7 @@ def load(
     found, path = find(name)
     where = shown(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = whole_text(path, where)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot be read ({error})", where=where, remedy="A system file is UTF-8 text"

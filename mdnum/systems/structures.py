@@ -307,6 +307,7 @@ _HEAD = re.compile(
     r'(\d+)\n(?:Lattice="([^"]*)" )?Properties=species:S:1:pos:R:3(:momenta:R:3)?(:masses:R:1)? '
     r'pbc="([TF]) ([TF]) ([TF])"\n'
 )
+_LONGEST_HEAD = 1000
 
 
 def _from_extxyz(path: Path) -> Atoms | None:
@@ -318,7 +319,7 @@ def _from_extxyz(path: Path) -> Atoms | None:
 
     try:
         with path.open(encoding="ascii", newline="") as file:
-            head = _HEAD.fullmatch(file.readline() + file.readline())
+            head = _HEAD.fullmatch(file.readline(_LONGEST_HEAD) + file.readline(_LONGEST_HEAD))
         if head is None:
             return None
         count, lattice, momenta, masses, *faces = head.groups()

@@ -31,7 +31,7 @@ from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, ignored_velocities, reading, with_elements
+from mdnum.reading import ase_images, ignored_velocities, reading, whole_text, with_elements
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable, topology_universe
 from mdnum.trajectories.trajectory import Trajectory
@@ -139,7 +139,7 @@ def _units(path: Path) -> Units:
     system = path.parent / "system.toml"
     if path.name != "trajectory.traj" or not system.exists():
         return METAL
-    return units_named(str(tomllib.loads(system.read_text()).get("units", "metal")))
+    return units_named(str(tomllib.loads(whole_text(system, system)).get("units", "metal")))
 
 
 # ---- text

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.errors import InputError, expect_path
+from mdnum.reading import whole_text
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
@@ -213,7 +214,8 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
     """The cutoff with which mdnum made the file, from the system.toml beside it."""
     radius = None
     try:
-        system = tomllib.loads((trajectory.path.parent / "system.toml").read_text(encoding="utf-8"))
+        file = trajectory.path.parent / "system.toml"
+        system = tomllib.loads(whole_text(file, file))
         radius = system.get("cutoff", {}).get("radius")
     except (OSError, tomllib.TOMLDecodeError, AttributeError):
         # no run of mdnum's

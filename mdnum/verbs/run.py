@@ -125,15 +125,16 @@ def run(
             say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
         # after the comparison
         drawn = thread.submit(draw_first, view) if report else None
+        energies = compared[0].result() if check else ()
         with folder.explained():
             # which are followed pair by pair beside both
             _ = view.flips.alternates
             if drawn is not None:
                 drawn.result()
-        if check:
-            _keep(view, *compared[0].result())
-            _beside_float64(view, result)
-        view.summary["time_step"] = view.time_step
+            if check:
+                _keep(view, *energies)
+                _beside_float64(view, result)
+            view.summary["time_step"] = view.time_step
     return finish(folder, report=report, result=result, progress=progress, view=view)
 
 
