@@ -125,7 +125,7 @@ def run(
             say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
         # after the comparison
         drawn = thread.submit(draw_first, view) if report else None
-        energies = compared[0].result() if check else ()
+        energies = compared[0].result() if check else (None, None)
         with folder.explained():
             # which are followed pair by pair beside both
             _ = view.flips.alternates
