@@ -74,9 +74,8 @@ def _set_up() -> None:
     # where it cannot keep its list of fonts, it says so in two lines
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # what an encoding lacks is written as JSON writes it, which is right in JSON and can be read elsewhere
-    codecs.register_error(
-        "mdnum", lambda error: (json_escape(error.object[error.start : error.end]), error.end)
-    )
+    escape: Any = lambda bad: (json_escape(bad.object[bad.start : bad.end]), bad.end)  # noqa: E731
+    codecs.register_error("mdnum", escape)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             stream.reconfigure(errors="mdnum")  # pyright: ignore
