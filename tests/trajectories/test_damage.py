@@ -194,16 +194,16 @@ def test_a_file_that_was_cut_or_damaged_is_read_up_to_there(tmp_path, small, kin
 def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
     path = getattr(datafiles, name)
     head = netcdf_of(path)
-    assert head is not None and not head.cut and head.rest == 0
+    assert head is not None and head.whole == head.told and head.rest == 0
     data, whole = Path(path).read_bytes(), list(open_trajectory(path).frames())
-    assert len(whole) == head.records
+    assert len(whole) == head.told
     cut = tmp_path / "cut.ncdf"
     for kept in (1, len(whole) - 1):
         begin = len(data) - (head.whole - kept) * head.record
         cut.write_bytes(data[: begin + head.record // 2])
         opened = open_trajectory(cut)
         assert opened.reader == "mdnum" and opened.count == kept + 1
-        found = ends(cut, kept, f"its head tells of {head.records} frames")
+        found = ends(cut, kept, f"its head tells of {head.told} frames")
         for one, good in zip(found, whole[:kept], strict=True):
             assert (one.index, one.time) == (good.index, good.time)
             np.testing.assert_array_equal(one.positions, good.positions)

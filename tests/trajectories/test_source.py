@@ -124,6 +124,7 @@ ITEM: BOX BOUNDS xy xz yz pp pp ff
 ITEM: ATOMS id element {columns}
 {rows}
 """
+RIGHT = "0 9 0\n0 9 0\n0 9 0"
 
 
 # in each of them another corner of the box is the first along x, and another the last
@@ -169,7 +170,7 @@ def test_a_lammps_dump_agrees_with_ase():
 
 def test_lammps_atoms_without_ids_are_refused(tmp_path):
     text = DUMP.format(
-        time=0, step=0, bounds="0 9 0\n0 9 0\n0 9 0", columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2"
+        time=0, step=0, bounds=RIGHT, columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2"
     ).replace("id ", "")
     (tmp_path / "run.dump").write_text(text)
     with pytest.raises(InputError, match="no ids"):
@@ -219,7 +220,9 @@ def test_slices_are_those_of_python(tmp_path, name, words):
     ase.io.write(tmp_path / "run.extxyz", argon())
     if name.endswith("lammpstrj"):
         rows = "1 O 1 2 3\n2 H 1 2 3\n3 H 2 2 2"
-        text = "".join(DUMP.format(time=k, step=k, columns="x y z", rows=rows) for k in range(6))
+        text = "".join(
+            DUMP.format(time=k, step=k, bounds=RIGHT, columns="x y z", rows=rows) for k in range(6)
+        )
         (tmp_path / name).write_text(text)
     else:
         ase.io.write(tmp_path / name, argon())
