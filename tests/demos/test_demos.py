@@ -113,6 +113,15 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         "minimizer_shift_at_0.1": 0.0318,
     }),
     "determinism": ("slow", 0.0, {"fingerprints": 1, "processes": 3, "first_contact": 48}),
+    # a drift of 10 for 0.4 time units over rows of atoms that are 1.11 apart turns the phase 3.6 times
+    "complex-order": ("nightly", 2e-3, {
+        "crossings": 4, "steps": [14, 42, 70, 98], "turns": 4 / 1.11, "psi6": 0.97257,
+        "error_conjugate": 1.0837, "smallest_margin": 0.02782,
+    }),
+    "two-residuals": ("", 1e-12, {
+        "left": [9.96e-4, 7.53e-4], "grad_k": [0.0, -5.02e-4], "iterations": [0, 1], "jump": 2.43e-4,
+        "contact_lasts": [2, 1], "next_contact": [2610, 2611],
+    }),
 }  # fmt: skip
 
 
@@ -299,6 +308,16 @@ def test_the_limit_is_where_an_eigenvalue_leaves_the_unit_circle(zeta: float):
     assert own.bounce_growth("semi-implicit-euler", 1.0) < 1e-6
     assert own.bounce_growth("semi-implicit-euler", 0.9) > 1.0
     assert own.bounce_growth("semi-implicit-euler", 0.1, zeta=3.0) == np.inf
+
+
+def test_the_jumps_at_the_branch_cut_make_a_phase_continuous_either_way():
+    # over pi, back, over it again, and twice over 0, which is no cut
+    angle = np.array([3.0, 3.2, 3.1, 3.5, 6.0, 6.6, 6.1, np.pi + 1e-9, np.pi - 1e-9])
+    ledger = script("complex-order").cuts(np.exp(1j * angle), 1e-8)
+    assert ledger.step.tolist() == [1, 2, 3, 8] and ledger.entered.tolist() == [False, True, False, True]
+    assert ledger.ambiguous.tolist() == [False, False, False, True]
+    np.testing.assert_allclose(ledger.margin, np.sin(angle[ledger.step]), atol=1e-15)
+    np.testing.assert_allclose(np.angle(np.exp(1j * angle)) + ledger.jumps(8).cumsum(), angle, atol=1e-12)
 
 
 @pytest.mark.parametrize("bits", [12, 32])
