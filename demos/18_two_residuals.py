@@ -50,9 +50,9 @@ def run() -> Demo:
     return Demo(
         title="Two residuals on either side of a tolerance",
         question="S is 9.96e-4 in one run, 1.004e-3 in another, the tolerance 1e-3. What does each do next?",
-        result="S = 9.96e-4 stops, S = 1.004e-3 makes one more iteration: the run that was lower by 8e-6 m ends "
-        f"higher by {jump:.3g} m, its contact lasts {lasts[1]} step instead of {lasts[0]}, and its next one "
-        f"begins at step {again[1]} instead of {again[0]}.",
+        result="S = 9.96e-4 stops, S = 1.004e-3 makes one more iteration: the run that was lower by 8e-6 m "
+        f"ends higher by {jump:.3g} m, its contact lasts {lasts[1]} step instead of {lasts[0]}, and its next "
+        f"one begins at step {again[1]} instead of {again[0]}.",
         answer=f"The run that stops leaves {left[0]:.3g} m, and what it leaves does not depend on k: its "
         f"derivative is exactly {slopes[0]:g}. The other leaves {left[1]:.3g} m with a derivative of "
         f"{slopes[1]:.3g}. A residual that differs by 0.8 % makes a state that differs by a quarter of the "

@@ -122,6 +122,18 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         "left": [9.96e-4, 7.53e-4], "grad_k": [0.0, -5.02e-4], "iterations": [0, 1], "jump": 2.43e-4,
         "contact_lasts": [2, 1], "next_contact": [2610, 2611],
     }),
+    # x = p^(1/3); iterations of x - x^3 fall as 1 / sqrt(2 n), and their derivative grows as 2 n / 5
+    "singular-fixed-point": ("", 1e-2, {
+        "derivative": [p ** (-2 / 3) / 3 for p in (1e-3, 8e-6, 1e-9, 1e-12)], "half": 0.5,
+        "at_zero": {"1e-06": 1e6, "0.0012": 1 / 0.0012, "0.01": 100.0}, "left_after_iterations": 2000**-0.5,
+        "slope_of_iterations": 400.0, "refused": [False] * 4 + [True],
+    }),
+    "visibility": ("", 1e-2, {
+        "best": (2 * G + (G / 4) ** 2) ** 0.5, "derivative": 10 / (G * (25 - 2 * G) ** 0.5),
+        "derivative_by_crossings": 10 / (G * (25 - 2 * G) ** 0.5), "slope_counted": [0.0, 0.0],
+        "events": [274, 745], "margins": [0.00040825, -0.00105185],
+        "optimum_moves": {"0.03": 0.01192, "0.1": 0.06192, "0.3": 0.14192},
+    }),
 }  # fmt: skip
 
 
