@@ -134,6 +134,17 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         "events": [274, 745], "margins": [0.00040825, -0.00105185],
         "optimum_moves": {"0.03": 0.01192, "0.1": 0.06192, "0.3": 0.14192},
     }),
+    # standard errors are m / sqrt(3 n), and half of all decisions near the tolerance differ
+    "sampling": ("", 0.05, {
+        "samples_needed": 30_603, "rounding_exceeds_sampling_at": 4096,
+        "flips_by_order": [2, 6, 18, 59, 0], "flips_by_key": [536, 482, 507, 447, 0],
+        "sampling": [1.01e-3 / (3 * n) ** 0.5 for n in (16, 64, 256, 1024, 4096)],
+    }),
+    "five-errors": ("", 1e-2, {
+        "precision": 2.0**-24, "rounding": 1.9967e-5, "discretization": 1.9003e-5, "stability": 0.05,
+        "condition": 2.34795, "error": 9.6425e-7, "unstable_error": 3.1327,
+        "condition_near_the_floor": 67.105,
+    }),
 }  # fmt: skip
 
 
