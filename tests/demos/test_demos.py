@@ -84,7 +84,9 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
     }),
     "coalesce": ("", 0.0, {f"distinct_{kind}": 1 for kind in ("sorted_by_value", "exact", "fixed_point")}),
     "saltation": ("nightly", 0.03, {
-        "exact": 0.42661, "by_steps": dict.fromkeys(("0.01", "0.001", "0.0001"), 0.0),
+        "exact": 0.42661, "discretize_then_differentiate": dict.fromkeys(("0.01", "0.001", "0.0001"), 0.0),
+        "differentiate_then_discretize": {"0.01": 0.81792, "0.001": 0.416687, "0.0001": 0.427983},
+        "apart_without_impact": 0.0,
         "saltation_error": {"0.01": 0.39, "0.001": 9.9e-3, "0.0001": 1.4e-3},
     }),
     "euler-choice": ("slow", 1e-5, {
