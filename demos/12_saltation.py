@@ -106,9 +106,9 @@ def run() -> Demo:
         ),
         answer=(
             f"By {exact[0]:.5f} m per m. Discretize, then differentiate: the derivative of the steps is "
-            "exactly 0 at every step size, because a step that puts the ball on the floor forgets where it came "
-            "from. Differentiate, then discretize: the tangent of the motion, with the saltation matrix at "
-            f"each impact, is {by_saltation[-1][0]:.4f} at the smallest step, and its error shrinks with "
+            "exactly 0 at every step size, because a step that puts the ball on the floor forgets where it "
+            "came from. Differentiate, then discretize: the tangent of the motion, with the saltation matrix "
+            f"at each impact, is {by_saltation[-1][0]:.4f} at the smallest step, and its error shrinks with "
             f"order {order:.2f}. Without an impact the two are the same number. Locating the impact inside "
             f"the step makes them agree: that leaves {abs(error[0]):.0e}."
         ),

@@ -72,8 +72,8 @@ class Problem:
             remedy = "A count has no gradient: make a float of it that varies smoothly"
             if np.issubdtype(made.dtype, np.complexfloating):
                 remedy = (
-                    "A gradient is one of a real number: take jnp.real(z), jnp.imag(z) or jnp.abs(z); dz is the "
-                    "gradient of the first plus i times that of the second"
+                    "Take its real part, its imaginary part or its modulus (jnp.real, jnp.imag, jnp.abs); "
+                    "dz is the gradient of the first plus i times that of the second"
                 )
             raise InputError(f"the loss is of dtype {made.dtype}; expected a real number", remedy=remedy)
 
