@@ -26,9 +26,9 @@ def layer() -> tuple[Simulation, tuple[Array, ...]]:
     """A layer of 64 Lennard-Jones atoms drifting along x; its neighbors, their images, two wave vectors."""
     atoms = fcc111("Ar", (8, 8, 1), a=A * np.sqrt(2), vacuum=6.0, orthogonal=True, periodic=True)
     first, second, image = neighbor_list("ijS", atoms, 1.2 * A)
-    atoms.set_masses(np.ones(64))
-    thermal = 0.4 * np.random.default_rng(3).standard_normal((64, 3))
-    atoms.set_velocities(thermal - thermal.mean(0) + [SPEED, 0, 0])
+    atoms.set_array("masses", np.ones(64))
+    heat = 0.4 * np.random.default_rng(3).standard_normal((64, 3))
+    atoms.set_velocities(heat - heat.mean(0) + [SPEED, 0, 0])
     spec = SystemSpec.model_validate({
         "units": "lj", "structure": {"file": "none"}, "cutoff": {"kind": "switched", "radius": 2.5},
         "potential": {"kind": "lennard-jones", "sigma": 1.0, "epsilon": 1.0}, "neighbors": {"skin": 0.3},
@@ -62,8 +62,8 @@ def cuts(z: np.ndarray, bound: float) -> Ledger:
     """Crossings of the branch cut of arg z between steps: flips of the sign of Im z where Re z < 0."""
     turn = np.diff(np.angle(z))
     step = np.flatnonzero(np.abs(turn) > np.pi) + 1
-    above, bounds = Threshold(0.0).decide(-z.imag[step]), np.full(len(step), bound)
-    return Ledger("branch", step, step[:, None] * 0, above, z.imag[step], bounds,
+    above, bounds = Threshold(0.0).decide(-np.imag(z)[step]), np.full(len(step), bound)
+    return Ledger("branch", step, step[:, None] * 0, above, np.imag(z)[step], bounds,
                   -2 * np.pi * np.sign(turn[step - 1]))  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def run() -> Demo:
     simulation, lattice = layer()
     parts = [Order(w=w, lattice=lattice, first=STEPS) for w in jnp.eye(6).reshape(6, 2, 3)]
     problems = [Problem(simulation, part, STEPS) for part in parts]
-    found = [value_and_grad(problem, [EPSILON], "symmetric")() for problem in problems]
+    found = [value_and_grad(problem, [EPSILON], "symmetric")({}) for problem in problems]
     seen = [[value for value, _ in found], [float(slope[EPSILON]) for _, slope in found]]
     seen += [[p.value({EPSILON: 1 + h}) for p in problems] for h in (1e-5, -1e-5)]
     z, dz, high, low = (np.array(one[:3]) + 1j * np.array(one[3:]) for one in seen)
@@ -84,8 +84,8 @@ def run() -> Demo:
     ledger = cuts(peak, float(gamma(1000, np.dtype(float))))
     phase, step = np.angle(peak) + ledger.jumps(STEPS).cumsum(), np.arange(STEPS + 1)
     turned, turns = float(phase[-1] - phase[0]) / (2 * np.pi), SPEED * DT * STEPS / A
-    slopes = [jax.grad(one) for one in (jnp.abs, jnp.angle, lambda z: z.real / jnp.abs(z))]
-    near = [(r, *(abs(complex(f(r * (0.6 + 0.8j)))) for f in slopes)) for r in (1, 1e-8, 1e-200, 0.0)]
+    slopes = [jax.grad(f) for f in (jnp.abs, jnp.angle, lambda z: z.real / jnp.abs(z))]
+    near = [(abs(r), *(f"{abs(complex(f(r))):.3g}" for f in slopes)) for r in (1j, 1e-8j, 1e-200j, 0j)]
     rows = list(zip(NAMES, *np.abs([z, g]).tolist(), (g * dz).real.tolist(), real.tolist(), strict=True))
     return Demo(
         title="Order parameters are complex numbers",
@@ -116,5 +116,5 @@ def run() -> Demo:
             Series("arg S", step, np.angle(peak), "points", "muted"),
             Series("with the jumps of the ledger", step, phase),
         ), caption="arg S jumps at its branch cut; each jump is a flip.")],
-        in_md="This one is molecular dynamics: a Lennard-Jones layer, differentiated through its steps.",
+        in_md="These are atoms already: a Lennard-Jones layer, differentiated through its steps.",
     )  # fmt: skip

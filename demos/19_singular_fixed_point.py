@@ -35,6 +35,11 @@ def rest(p: float, spring: float) -> float:
     return float(x)
 
 
+def told(value: float | bool) -> float | bool | str:
+    """A number of a table, infinity in words: a table of plain values has no place for it."""
+    return "infinite" if value == np.inf else value
+
+
 def run() -> Demo:
     """Loads ever closer to the singular one; then the same with a stiffness added, in two ways."""
     at = [float(np.cbrt(p)) for p in LOADS]
@@ -52,13 +57,15 @@ def run() -> Demo:
         # the iterations at the singular load, and their derivative carried along
         x, slope = x - x**3, slope * (1 - 3 * x * x) + 1
     ends = [solved[spring][-1], moved[spring][-1]]
+    known = (conditions, refused, exact, plain)
     half = solved[spring][1] / exact[1]
     kink = float(jax.grad(lambda p: jnp.maximum(p, 0.0))(0.0))
     return Demo(
         title="A fixed point whose derivative does not exist",
         question="A bead rests at x = p^(1/3) under a load p. What is dx/dp where the load vanishes?",
-        result=f"Infinite, and {plain[1]:.2f} at p = 8e-6. A regularization of {spring:g} in the linear "
-        f"solve gives half of that, and {solved[spring][-1]:.2f} at p = 0: one over the number chosen.",
+        result=f"dx/dp is infinite at p = 0 and {plain[1]:.2f} at 8e-6. A regularization of {spring:g} in "
+        f"the linear solve gives half of that, and {solved[spring][-1]:.2f} at p = 0: one over the number "
+        "chosen.",
         answer="1 - dG/dx = 3 x^2 is what the linear system divides by. A stiffness added to that system "
         "alone gives a finite number that is the derivative of nothing. Added to the energy it gives the "
         "true derivative of another problem, whose bead rests elsewhere. At p = 0 both are one over the "
@@ -82,7 +89,7 @@ def run() -> Demo:
         ],
         tables=[table("dx/dp", ("p", "condition number", "refused", "exact", "implicit", *(
             f"{a:g} in the {what}" for what in ("solve", "energy") for a in ADDED)), list(zip(
-                LOADS, conditions, refused, exact, plain, *solved.values(), *moved.values(), strict=True)))],
+                LOADS, *(map(told, one) for one in known), *solved.values(), *moved.values(), strict=True)))],
         plots=[Plot("regularized", "The derivative and its regularizations", "p", "dx/dp", (
             Series("exact", np.array(LOADS[:-1]), np.array(exact[:-1]), "line+points", "ink"),
             *(Series(f"{a:g} in the solve", np.array(LOADS[:-1]), np.array(solved[a][:-1]), "line", role)

@@ -20,7 +20,7 @@ SPEEDS = np.linspace(4.0, 6.0, 401)
 def heights(v0: Array) -> Array:
     """Heights of balls thrown up from the floor at each step, as the semi-implicit Euler method has them."""
     n = np.arange(1.0, STEPS + 1)[:, None]
-    return n * H * v0 - G * H * H * n * (n + 1) / 2
+    return jnp.asarray(n * H) * v0 - G * H * H * n * (n + 1) / 2
 
 
 @jax.jit
@@ -68,7 +68,8 @@ def run() -> Demo:
     return Demo(
         title="Seen or not is an event",
         question="How fast must a ball be thrown up behind an edge of 1 m to be seen for half a second?",
-        result=f"At {best:.4f} m/s. Counted in steps the time seen has the derivative 0 everywhere (exact: "
+        result=f"Thrown at {best:.4f} m/s the ball is seen for half a second. Counted in steps the time "
+        "seen has the derivative 0 everywhere (exact: "
         f"{exact:.4f} s per m/s); softened over {wide:g} m it leads to {found[wide]:.3f} m/s, the answer to "
         "another question.",
         answer="A step in which the ball is above the edge counts, one below does not: no derivative passes "
