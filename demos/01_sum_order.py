@@ -49,6 +49,10 @@ def run() -> Demo:
     return Demo(
         title="The order of a sum decides whether a solver stops",
         question="Five float16 penetrations add up to exactly the tolerance. Is their sum below it?",
+        result=(
+            f"Largest first, the sum is {seen[0]:.10f} and the solver stops; smallest first, it is "
+            f"{seen[1]:.10f} and the solver goes on."
+        ),
         answer=(
             "Large first, each small term is a quarter of the accumulator's last place and is rounded away: "
             f"{seen[0]:.13f} is below the tolerance and the solver stops. Small first, they add up to one "

@@ -218,6 +218,10 @@ def run() -> Demo:
     return Demo(
         title="The dtype of a sum decides whether the solver runs",
         question="A batch penetrates the floor by the tolerance in all. Does the solver start?",
+        result=(
+            "Summed in bfloat16 or float16, the residual is one ulp too small, the solver makes no "
+            f"iteration, and dloss/dk is exactly 0 instead of {truth['bfloat16']:.2g}."
+        ),
         answer=(
             "In float32 it makes one iteration and the loss depends on k. Summed in bfloat16 or float16, "
             "largest term first, the small terms are absorbed, the sum stays one ulp below the tolerance, "

@@ -76,6 +76,10 @@ def run() -> Demo:
     return Demo(
         title="One ulp, another step of contact",
         question="Two balls start at neighboring floats. Do they touch the floor in the same step?",
+        result=(
+            f"One ulp higher at the start, and the ball touches the floor at step {contact[1]} instead of "
+            f"{contact[0]}: the two are {after:.2g} m apart afterwards, {before:.1g} m before."
+        ),
         answer=(
             f"Started at {low!r} m and at the next float, one ball touches in step {contact[0]} and the "
             f"other in step {contact[1]}: at the end of step {at} they are at {height[0]:.2g} m and "

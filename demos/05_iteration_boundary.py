@@ -124,6 +124,10 @@ def run() -> Demo:
     return Demo(
         title="Between two floats the solver makes one iteration fewer",
         question="How does what a projection leaves depend on its gain, down to the last bit?",
+        result=(
+            f"Between two adjacent floats of k the solver makes {below.iterations} or {above.iterations} "
+            f"iterations, and the loss jumps from {below.loss:.3g} to {above.loss:.3g}."
+        ),
         answer=(
             f"At k = {below.at!r} the solver makes {below.iterations} iterations, at the next float "
             f"{above.iterations}: the residual after {one.iteration} is {margin[0]:.1g} on one side of "

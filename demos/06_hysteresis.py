@@ -82,6 +82,10 @@ def run() -> Demo:
     return Demo(
         title="Two thresholds instead of one",
         question="A decision wavers about its threshold. What does a gap between two thresholds change?",
+        result=(
+            f"A gap between two thresholds turns {low} contact flips into {high}, and {starts[two]} flips of "
+            f"a stopping decision into {starts[one]}."
+        ),
         answer=(
             f"Balls shaken on a spring cross the floor {low} times; if a contact that began below 0 ends "
             f"only above {LIFTS[2]:g} m, {high} times. A solver that starts when a float16 sum reaches tol "

@@ -85,6 +85,10 @@ def run() -> Demo:
     return Demo(
         title="A sum over the batch couples balls that never meet",
         question="A ball far from the others sinks below the floor. Do their solvers notice?",
+        result=(
+            f"One more ball in the batch turns {total['before'][0]} iterations of every other ball into "
+            f"{total['after'][0]} under one sum, and changes none under a rule for each ball."
+        ),
         answer=(
             f"Under one sum for the batch all of them do: {total['before'][0]} iterations become "
             f"{total['after'][0]} and the derivative of their loss by the gain goes from "

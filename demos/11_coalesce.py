@@ -67,6 +67,10 @@ def run() -> Demo:
             f"{CONTACTS} contacts load {PANELS} panels. In how many ways can the same entries be added, and "
             "does any panel change its mind?"
         ),
+        result=(
+            f"{ORDERS} storage orders of the same sparse entries give {loose} different sums; summed "
+            "exactly, they give one."
+        ),
         answer=(
             f"In {ORDERS} storage orders a scattered addition gives {loose} different vectors, and in "
             f"{yields['scatter-add, storage order']} of them some panel that carries exactly its limit is "

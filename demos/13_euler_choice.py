@@ -114,6 +114,10 @@ def run() -> Demo:
     return Demo(
         title="Two Eulers, two gradients",
         question="Does it matter whether a step moves with the old velocity or with the new one?",
+        result=(
+            f"Two lines in another order, and the derivative after 2 s is {explicit[1]:+.3f} or "
+            f"{semi[1]:+.3f} (exact: {float(end.gradient['y0']):+.3f})."
+        ),
         answer=(
             f"The two programs differ in the order of two lines. After 2 s with h = {h:g} s they have the "
             f"ball at {explicit[0]:.3f} and {semi[0]:.3f} m (exact: {float(end.value):.3f}), with "

@@ -58,6 +58,10 @@ def run() -> Demo:
     return Demo(
         title="Infinitely many bounces",
         question="When does a bouncing ball come to rest, and which program knows?",
+        result=(
+            f"The ball is at rest after {limit:.6f} s and infinitely many bounces. Located impacts find that "
+            f"time within {off:.0e} s; fixed steps never come to rest."
+        ),
         answer=(
             f"At {limit:.6f} s, after infinitely many bounces, in closed form. The program that locates "
             f"impacts calls a rebound of {REST_SPEED:g} m/s rest, which is bounce {last}; whatever its step, "

@@ -70,6 +70,10 @@ def run() -> Demo:
     return Demo(
         title="How soft a floor",
         question="Which width of a softplus contact makes the loss usable, and at what price?",
+        result=(
+            f"A contact {single:g} m wide leaves one of {found[0.0].minima} minima; at 0.1 m that minimum "
+            f"has moved by {bias[0.1]:.3f} m."
+        ),
         answer=(
             f"With a hard contact the loss has {found[0.0].minima} minima and its derivative is off by "
             f"{found[0.0].rough:.0f}, where the exact one is about 2. From a width of {single:g} m on, "

@@ -87,6 +87,10 @@ def run() -> Demo:
     return Demo(
         title="The same bits every time, and what that is worth",
         question="Does a rollout give the same bits in a new process, compiled otherwise, in a batch?",
+        result=(
+            f"{len(found)} processes give the same bits, and a start one ulp higher ends {ulp:.1g} m away, "
+            "just as repeatably."
+        ),
         answer=(
             f"mdnum's program, whose products are rounded before they are added, has one fingerprint in "
             f"{len(found)} processes, under an older instruction set, without a compiler and in a batch: "

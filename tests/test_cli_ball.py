@@ -96,6 +96,7 @@ def make(ok: bool = True) -> Demo:
     return Demo(
         title="A title",
         question="Why?",
+        result="It is -1.5 and no less.",
         answer="Because it is <b>bold</b>.",
         numbers={"large_first": 0.0009760856628, "runs": [1, 2]},
         checks=[Claim("it holds", 1.5, "1.5", ok)],
@@ -118,11 +119,16 @@ def demo(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Demo]:
 def test_a_demonstration_for_people(demo: dict[str, Demo], capsys: pytest.CaptureFixture[str]):
     assert call("ball", "--demo", "fork", "-o", "page") == 0
     lines = printed(capsys)
+    # the result comes first, and it is the headline
+    assert lines[0] == "It is −1.5 and no less."
     for line in ("Why?", "large first 0.0009760856628", "ok it holds 1.5 1.5", "1 1.0000001"):
         assert line in lines
     assert any("18 more" in line for line in lines)
     assert lines[-1] == "wrote page/report.html"
     page = Path("page/report.html").read_text(encoding="utf-8")
+    first, rest = page.split('<figure id="figure-fork-line">')
+    assert first.index('<p class="headline">It is −1.5') < first.index("1 check held") < first.index("Why?")
+    assert "&lt;b&gt;" in rest and "large first" in rest and "<table" not in first
     assert "&lt;b&gt;" in page and "In molecular dynamics: The same." in page
     names = {path.name for path in Path("page").rglob("*")}
     assert {"fork-line.svg", "fork-map.svg", "curves.parquet", "summary.json"} <= names

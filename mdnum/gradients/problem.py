@@ -69,10 +69,13 @@ class Problem:
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
             raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
         if not np.issubdtype(made.dtype, np.floating):
-            raise InputError(
-                f"the loss is of dtype {made.dtype}; expected a real number",
-                remedy="A count or a complex number has no gradient: make a float of it that varies smoothly",
-            )
+            remedy = "A count has no gradient: make a float of it that varies smoothly"
+            if np.issubdtype(made.dtype, np.complexfloating):
+                remedy = (
+                    "Take its real part, its imaginary part or its modulus (jnp.real, jnp.imag, jnp.abs); "
+                    "dz is the gradient of the first plus i times that of the second"
+                )
+            raise InputError(f"the loss is of dtype {made.dtype}; expected a real number", remedy=remedy)
 
     def at(self, values: Values) -> Problem:
         """The same loss of a rollout with other parameters."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mdnum.ball.limits import RANGES, first_outside
 from mdnum.report.analysis import margins_in_bounds
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
@@ -82,6 +83,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
         Section("Heights and contacts", [*described, *_heights(view), *_nearest(view)]),
         Section("Impacts per step" if view.located else "Iterations per step", list(_solver_plot(view))),
         Section("Margins of decisions", [*_stops(view), *_flips(view)]),
+        Section("Range of numbers", list(_ranges(view))),
         Section("Gradient", list(_gradient(view)), terminal=True),
         Section("Against the closed form", list(_exact(view)), terminal=True),
         Section("Variants", list(_variants(view)), terminal=True),
@@ -157,6 +159,32 @@ def _nearest(view: BallView) -> Iterator[Plot]:
     doubtful = (series["ambiguous"] > 0, "a decision within rounding", "bad")
     nearest = Series("nearest height", series["time"], margin)
     yield TEXTS.plot("nearest", (nearest, *_groups(series["time"], margin, doubtful)))
+
+
+def _ranges(view: BallView) -> Iterator[Any]:
+    """What each quantity asks of a format, and the steps at which narrower ones would not hold it."""
+    series = view.table("steps")
+    held = [name for name in RANGES if f"largest_{name}" in series]
+    if not held:
+        return
+    rows = []
+    for name in held:
+        most, least = series[f"largest_{name}"], series[f"smallest_{name}"]
+        cells = []
+        for form in ("float32", "bfloat16", "float16"):
+            over, lost = first_outside(most, least, form)
+            told = [
+                f"{word} at step {count(at)}"
+                for word, at in (("overflows", over), ("lost", lost))
+                if at is not None
+            ]
+            cells.append(", ".join(told) or "held")
+        smallest = least[np.isfinite(least)]
+        rows.append(
+            (RANGES[name], float(np.max(most)), float(smallest.min()) if len(smallest) else None, *cells)
+        )
+    yield Table(("quantity", "largest", "smallest that is not 0", "float32", "bfloat16", "float16"), rows)
+    yield TEXTS("ranges")
 
 
 def _solver_plot(view: BallView) -> Iterator[Plot]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball.exact import ExactImpact, ExactPenalty
+from mdnum.ball.limits import extremes
 from mdnum.ball.rollout import BallDifference, BallRun, residual_bound
 from mdnum.ball.step import Penalty, Projection
 from mdnum.ball.stopping import FixedCount, Reason
@@ -53,6 +54,24 @@ def steps(run: BallRun) -> dict[str, np.ndarray]:
         "ambiguous": ambiguous,
         "mean_height": y.mean(axis=1),
         "energy": run.energy.mean(axis=1) if kept else np.full(rows, np.nan),
+        **ranges(run),
+    }
+
+
+def ranges(run: BallRun) -> dict[str, np.ndarray]:
+    """Largest and smallest magnitude in each step of the state, of the penetration and of its penalty."""
+    if not run.kept:
+        return {}
+    y, v = run.y.astype(np.float64), run.v.astype(np.float64)
+    depth = np.vstack([np.maximum(-y[:1], 0.0), np.maximum(-run.height.astype(np.float64), 0.0)])
+    quantities = {"y": y, "v": v, "depth": depth}
+    if isinstance(run.world.contact, Penalty):
+        quantities["push"] = float(run.world.contact.k) * np.maximum(-y, 0.0)
+    found = {name: extremes(values) for name, values in quantities.items()}
+    return {
+        f"{which}_{name}": part
+        for name, both in found.items()
+        for which, part in zip(("largest", "smallest"), both, strict=True)
     }
 
 

@@ -49,6 +49,7 @@ class Demo:
 
     title: str  # a short heading
     question: str  # what it asks, one sentence
+    result: str  # what it shows, in one or two sentences with the numbers that matter: the headline
     answer: str  # what it shows, one to three sentences, with its numbers in words
     numbers: Mapping[str, Any]  # the numbers it must show, plain values by name; the first is the headline
     checks: Sequence[Claim]  # statements tested while it ran
@@ -200,20 +201,21 @@ def judge(view: View) -> Verdict:
         failed = [claim["what"] for claim in demo["checks"] if not claim["ok"]]
         if failed:
             values = {"name": demo["name"], "failed": len(failed), "checks": len(demo["checks"])}
-            section = demo["title"]
+            section = _heading(demo, demos)
             found.append(TEXTS.finding("DEMO_FAILED", section=section, which="; ".join(failed), **values))
     checks = [claim["ok"] for demo in demos for claim in demo["checks"]]
-    headline = "some" if found else "one" if len(demos) == 1 else "all"
-    return conclude(
-        found,
-        [TEXTS("held", held=sum(checks), checks=len(checks))],
-        headline=TEXTS(headline, demos=len(demos), right=len(demos) - len(found)),
-        best="good",
-    )
+    counts = {"demos": len(demos), "right": len(demos) - len(found)}
+    told, headline = [TEXTS("held", held=sum(checks), checks=len(checks))], TEXTS("some", **counts)
+    if len(demos) > 1:
+        results = (f"{demo['name']}: {_result(demo)}" for demo in demos)
+        told, headline = [*results, *told], headline if found else TEXTS("all", **counts)
+    elif not found:
+        headline = _result(demos[0])
+    return conclude(found, told, headline=headline, best="good")
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Question, answer, numbers, checks, tables and figures of each demonstration."""
+    """Of each demonstration its result and first figure; then the answer at length, numbers and the rest."""
     demos, curves = _demos(view), view.table("curves")
     sections: list[Section] = []
     for demo in demos:
@@ -225,10 +227,12 @@ def page(view: View, verdict: Verdict) -> Page:
             [(key.replace("_", " "), shown(value, digits)) for key, value in demo["numbers"].items()]
         )
         checks = Table(("", "check", "seen", "expected"), rows, shown=1000, bad=bad)
-        told = [demo["question"], typeset(demo["answer"]), numbers, checks]
-        sections.append(Section(demo["title"], told, terminal=True))
+        figures = list(_plots(demo, curves))
+        asked = [demo["question"], *([_result(demo)] if len(demos) > 1 else [])]
+        told = [*asked, *figures[:1], typeset(demo["answer"]), numbers, checks]
+        sections.append(Section(_heading(demo, demos), told, terminal=True))
         more: list[Any] = [_table(one) for one in demo["tables"]]
-        more += [*_plots(demo, curves), *([TEXTS("in_md", text=demo["in_md"])] if demo["in_md"] else [])]
+        more += [*figures[1:], *([TEXTS("in_md", text=demo["in_md"])] if demo["in_md"] else [])]
         # of all of them the command prints no tables: they would hide the answers
         sections.append(Section(TEXTS("more", name=demo["name"]), more, terminal=len(demos) == 1, level=3))
     title = demos[0]["title"] if len(demos) == 1 else TEXTS("title")
@@ -237,6 +241,16 @@ def page(view: View, verdict: Verdict) -> Page:
 
 def _demos(view: View) -> Sequence[Mapping[str, Any]]:
     return view.summary.get("demos", [view.summary])
+
+
+def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
+    """Of a demonstration's section; on a page of its own its title stands above already."""
+    return demo["title"] if len(demos) > 1 else TEXTS("detail")
+
+
+def _result(demo: Mapping[str, Any]) -> str:
+    """What a demonstration shows; folders of earlier versions have the long answer alone."""
+    return typeset(demo.get("result") or demo["answer"])
 
 
 def _table(stored: Mapping[str, Any]) -> Table:

@@ -68,6 +68,7 @@ def test_what_is_no_loss_or_cannot_be_traced_or_named_is_refused(problem):
     loss, simulation = differentiable(problem, ("sigma",), "symmetric"), problem.simulation
     vector = Custom(see=lambda frame, origin, around: jnp.sum(frame.x, axis=1))
     count = Custom(see=lambda frame, origin, around: frame.step, conclude=lambda total, frames: total)
+    wave = Custom(see=lambda frame, origin, around: jnp.sum(jax.lax.complex(frame.x[0], frame.x[1])))
     for ask, text in (
         (lambda: jax.jit(loss)({"sigma": jnp.asarray(1.0)}), "outside of jit"),
         (lambda: loss({"epsilon": 1.0}), "not asked for"),
@@ -75,7 +76,8 @@ def test_what_is_no_loss_or_cannot_be_traced_or_named_is_refused(problem):
         (lambda: value_and_grad(problem, ("seed",)), "seed"),
         (lambda: loss({"sigma": jnp.asarray(np.nan)}), "expected finite numbers"),
         (lambda: Problem(simulation, vector, STEPS), "shape \\(3,\\)"),
-        (lambda: Problem(simulation, count, STEPS), "int"),
+        (lambda: Problem(simulation, count, STEPS), "int.*of it that varies"),
+        (lambda: Problem(simulation, wave, STEPS), "complex128.*jnp.real.*jnp.abs"),
     ):
         with pytest.raises(InputError, match=text):
             ask()

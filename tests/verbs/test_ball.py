@@ -71,6 +71,12 @@ def test_tables_and_summary_are_those_of_the_run(three: Outcome):
     assert np.array_equal(heights["y"].reshape(121, 3), made.y)
     assert heights["ball"].reshape(121, 3)[5].tolist() == [0, 1, 2]
     assert np.array_equal(steps["mean_height"], np.mean(made.y, axis=1))
+    for name, values in (("y", made.y), ("v", made.v)):
+        assert np.array_equal(steps[f"largest_{name}"], np.abs(values).max(axis=1))
+    deepest = np.maximum(-made.height, 0).max(axis=1)
+    assert steps["largest_depth"].tolist() == [0, *deepest] and deepest.max() > 0
+    rest = [min((size for size in row if size), default=np.nan) for row in np.abs(made.v)]
+    np.testing.assert_array_equal(steps["smallest_v"], rest)
     busy = np.flatnonzero(made.contact.any(axis=1)).tolist()
     rows = [(at + 1, n, made.history[at, n]) for at in busy for n in range(made.iterations[at] + 1)]
     assert list(zip(*(solver[name] for name in ("step", "iteration", "residual")), strict=True)) == rows
@@ -362,3 +368,23 @@ def test_the_page_shows_what_the_folder_holds(
     assert [row[0] for row in rows] == ["unrolled", "implicit", "smoothed"]
     assert rows[1][2] == "0 (does not depend)" and rows[2][2] == "does not apply"
     assert VERBS["ball"].judge is judge
+
+
+def test_a_page_says_at_which_step_a_narrower_format_would_not_do(tmp_path: Path):
+    # the floor pushes with at most v sqrt(k), which is 88,000 at 4.4 m/s, beyond the largest float16
+    file = tmp_path / "hard.toml"
+    text = PROJECTION.replace(
+        'kind = "projection"\nk = 0.5\nalpha = 0.5\nrestitution = 0.8', 'kind = "penalty"\nk = 4e8'
+    )
+    file.write_text(text.replace('[stop]\nrule = "sum"\ntol = 1e-4\nmax_iter = 100\n', ""))
+    made = bounce(
+        file, overrides={"integrator.timestep": 2e-5, "integrator.steps": 25_000}, out=tmp_path / "out"
+    )
+    push = 4e8 * np.maximum(-made.result.y, 0).max(axis=1)
+    step = int(np.argmax(push >= 65520))
+    assert push[step] >= 65520
+    folder = RunFolder.open(made.folder)
+    view = BallView(folder, folder.summary)
+    (table, _) = next(s for s in page(view, judge(view)).sections if s.title == "Range of numbers").parts
+    (row,) = [row for row in table.rows if row[0].startswith("force")]
+    assert row[1] == push.max() and row[3:] == ("held", "held", f"overflows at step {step:,}")

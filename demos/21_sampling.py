@@ -1,0 +1,101 @@
+"""Sampling and rounding flip the same decision: which of the two was it, and how many samples would tell."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.numerics import Threshold
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
+
+#: Mean residual of a rough floor, uniform from 0 to twice that, and the tolerance that it is compared with.
+MEAN, TOL, PAIRS, SAMPLES = 1.01e-3, 1e-3, 1000, (16, 64, 256, 1024, 4096)
+RULE = Threshold(TOL, "<", "residual")
+
+
+def residuals(seed: int, count: int) -> Float[np.ndarray, "repeats samples"]:
+    """Penetrations of a rough floor at random places, float16, each repeat from a key of its own."""
+    random = np.random.default_rng((seed, count))
+    return random.uniform(0, 2 * MEAN, (PAIRS, count)).astype(np.float16)
+
+
+def mean(samples: np.ndarray) -> Float[np.ndarray, "repeats"]:
+    """Means by a running sum in float16, in the order of the samples; divided exactly."""
+    # numpy rounds every partial sum of accumulate to float16
+    return np.add.accumulate(samples, axis=1)[:, -1].astype(float) / samples.shape[1]
+
+
+def exact(samples: np.ndarray) -> Float[np.ndarray, "repeats"]:
+    """Means of the same samples without rounding: float16 is summed exactly in float64."""
+    return samples.astype(float).sum(axis=1) / samples.shape[1]
+
+
+def run() -> Demo:
+    """Pairs of runs with the key, the order or both changed; then which of the two a flip is due to."""
+    rows = []
+    for count in SAMPLES:
+        a, b, other = residuals(1, count), residuals(2, count), np.random.default_rng(count)
+        turned = a[:, other.permutation(count)], b[:, other.permutation(count)]
+        first, order, key, both = (RULE.decide(mean(one)) for one in (a, turned[0], b, turned[1]))
+        flips = first != both
+        due = [
+            int(np.sum(flips & one))
+            for one in (
+                (first != key) & (first == order),
+                (first == key) & (first != order),
+                (first != key) == (first != order),
+            )
+        ]
+        sampling, error = float(np.std(exact(a))), mean(a) - exact(a)
+        rows.append(
+            (
+                count,
+                int(np.sum(first != order)),
+                int(np.sum(first != key)),
+                int(np.sum(flips)),
+                *due,
+                sampling,
+                float(np.sqrt(np.mean(error**2))),
+                float(np.mean(first)),
+            )
+        )
+    by_order, by_key = ([row[k] for row in rows] for k in (1, 2))
+    sampling, rounding, stopped = (np.array([row[k] for row in rows]) for k in (7, 8, 9))
+    # uniform numbers from 0 to 2 m scatter by m / sqrt(3): so many put the margin at three errors
+    needed = round((3 * MEAN / np.sqrt(3) / (MEAN - TOL)) ** 2)
+    crossing = SAMPLES[int(np.argmax(rounding > sampling))]
+    return Demo(
+        title="Which was it, the samples or the rounding?",
+        question="A residual is a mean of random samples, summed in float16. Who flips the stopping "
+        "decision?",
+        result=f"With 1024 samples another key flips {by_key[3]} of {PAIRS} decisions, another order of the "
+        f"sum {by_order[3]}. With {crossing} rounding is the larger error: every run stops, and every one is "
+        "wrong.",
+        answer="Run twice more, each time with one of the two changed, and the flip says whose it was. "
+        f"Sampling falls as one over the root of the number: {needed:,} samples put the margin of "
+        f"{MEAN - TOL:.0e} three standard errors away. Rounding grows with the number, because a running "
+        "sum that has become large absorbs what is added; no number of float16 samples decides this.",
+        numbers={
+            "flips_by_order": by_order, "flips_by_key": by_key, "rounding_exceeds_sampling_at": crossing,
+            "samples_needed": needed, "sampling": sampling.tolist(), "rounding": rounding.tolist(),
+            "stopped": stopped.tolist(),
+        },
+        checks=[
+            Claim("sampling falls as the root of the number", float(sampling[0] / sampling[-1]), "16 ± 1",
+                  bool(abs(sampling[0] / sampling[-1] - 16) < 1)),
+            Claim("with few samples nearly every flip is the key's", by_order[0], "below 1 %",
+                  by_order[0] < 0.01 * PAIRS),
+            Claim("with many all runs agree and are wrong", float(stopped[-1]), "1", bool(stopped[-1] == 1)),
+        ],
+        tables=[table(f"of {PAIRS} pairs of runs", (
+            "samples", "order flips", "key flips", "both flip", "by the key", "by the order", "by either "
+            "or both",
+            "sampling error", "rounding error", "share that stops"), rows)],
+        plots=[Plot("errors", "Error of the residual against the number of samples", "samples", "error (m)", (
+            Series("sampling", np.array(SAMPLES, float), sampling, "line+points"),
+            Series("rounding", np.array(SAMPLES, float), rounding, "line+points", "bad"),
+        ), x_scale="log", y_scale="log", horizontals=((MEAN - TOL, "margin"),),
+            caption="Where the curves cross, more samples stop helping.")],
+        in_md="The noise of a thermostat and the order of a force sum both move the step at which a list is "
+        "rebuilt; a run with the same noise in another order tells them apart.",
+    )  # fmt: skip
