@@ -32,9 +32,9 @@ LOOK = 0.02
 #: Rows that share one choice of pairs.
 _BLOCK = 8
 #: How many times shorter the steps are that tell where pairs turn around, and how far from there the exact
-#: motion may take them, by how far that is from the run's own: a seventh of it where the error of flips goes
-#: with the time step, and twice that is allowed for.
-FINER, REACH = 8, 0.3
+#: motion may take them, by how far that is from the run's own: a fifteenth of it where the error of flips
+#: goes with the time step, and three times that is allowed for.
+FINER, REACH = 16, 0.2
 #: Turning points, in the order of their steps, over which the typical move of a distance is taken.
 _NEIGHBORS = 20
 

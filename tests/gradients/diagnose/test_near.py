@@ -15,7 +15,7 @@ from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import growth, trust
-from mdnum.gradients.diagnose.near import Near, Turns
+from mdnum.gradients.diagnose.near import FINER, REACH, Near, Turns
 from mdnum.gradients.diagnose.trust import GROWN, grew, shorter, spread
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
 from mdnum.gradients.recorded import EventAware, passed
@@ -99,7 +99,7 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted(planted, judge
     (row,) = found.turns.heaviest(found.columns)
     assert (row["i"], row["j"]) == (1, 2)
     # what it is beyond the cutoff by, in shorter steps, is known from the steps alone
-    assert row["gap"] == pytest.approx((FARTHEST - farthest(timestep / 8)) / 2 - 0.5 * short, rel=0.05)
+    assert row["gap"] == pytest.approx((FARTHEST - farthest(timestep / FINER)) / 2 - 0.5 * short, rel=0.05)
     # with a time step at which it does enter, the derivative is of the size that was told
     finer = EventAware()(problem(-0.5 * short, timestep / 16), ("r_cut", "dt"))
     true = float(finer.gradient["cutoff.radius"])
@@ -116,13 +116,13 @@ def test_the_term_of_a_near_miss_is_the_mean_over_the_depths_it_may_have():
     table = {"step": np.arange(5), "shift": shift, "bend": bend, "weight": np.full(5, weight), "moved": moved}
     # within reach on either side; out of reach; beyond the cutoff between two steps alone, far within; beyond
     # it in all steps, and further in the shorter ones
-    table |= {"gap": np.array([1e-3, -2e-4, 0.02, -0.01, -0.01]), "unseen": np.arange(5) == 3}
-    table |= {"side": np.array([-1, 1, 1, 1, -1]), "finer": np.array([9e-4, 0.0, 0.0, 0.0, 0.03])}
+    table |= {"gap": np.array([1e-3, -1.5e-4, 0.02, -0.01, -0.01]), "unseen": np.arange(5) == 3}
+    table |= {"side": np.array([-1, 1, 1, 1, -1]), "finer": np.array([9.5e-4, 0.0, 0.0, 0.0, 0.03])}
     turns = Turns(table)
-    np.testing.assert_allclose(turns.gap, [1e-4, -2e-4, 0.02, -0.01, -0.04], rtol=1e-12)
+    np.testing.assert_allclose(turns.gap, [5e-5, -1.5e-4, 0.02, -0.01, -0.04], rtol=1e-9)
     # the typical shift is that of all five; what moves further than others reaches further
     typical = np.sqrt(np.mean(shift**2))
-    np.testing.assert_allclose(turns.reach, 0.3 * np.maximum(shift, typical), rtol=1e-12)
+    np.testing.assert_allclose(turns.reach, REACH * np.maximum(shift, typical), rtol=1e-12)
     assert turns.within.tolist() == [True, True, False, True, False]
     for k in (0, 1):
         total, _ = quad(lambda d, a=bend[k]: 2 * weight / np.sqrt(2 * a * d), 0, turns.reach[k])
