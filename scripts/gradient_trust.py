@@ -4,13 +4,13 @@
 truth comes from central differences of free runs, over shifts of the parameter between 1e-5 and 1e-8 of it:
 
     hard, shifted   of runs in which pairs cross the cutoff at the time at which they do (scripts/_located.py,
-                    which shares no code with mdnum), at a quarter of the time step
-    switched        of mdnum's own runs at a quarter of the time step: no force jumps there
+                    which shares no code with mdnum), at an eighth of the time step
+    switched        of mdnum's own runs at an eighth of the time step: no force jumps there
 
 Where differences do not agree within 2 % over the last factor of a hundred in shift, there is no derivative
 that anyone could use, and "trusted" is wrong. Starts are the shipped structures with new velocities, run for
 a while first. Every start is kept in a file of its own as soon as it is done (--store): the study goes on
-where it was stopped. Seeds below 3000 are those that constants were chosen on.
+where it was stopped. Seeds below 4000 are those that constants were chosen on.
 
     nice python scripts/gradient_trust.py
     python scripts/gradient_trust.py --only "crystal-108, hard" --seeds 2 --steps 60
@@ -42,13 +42,13 @@ from mdnum.systems import Simulation, build
 NAMES = ("potential.epsilon", "potential.sigma", "cutoff.radius")
 #: Shifts as shares of a parameter; differences over the last three must agree within this.
 SHIFTS, AGREE = (1e-5, 1e-6, 1e-7, 1e-8), 0.02
-SUBSTEPS = 4
+SUBSTEPS = 8
 #: Losses of each start.
 EACH = 3
 #: What counts as wrong, and as right.
 WRONG, RIGHT = 0.05, (0.01, 0.02)
 #: The first seed of the starts that are reported.
-FIRST = 3000
+FIRST = 4000
 MARK = "<!-- written by scripts/gradient_trust.py -->"
 
 

@@ -33,8 +33,9 @@ LOOK = 0.02
 _BLOCK = 8
 #: How many times shorter the steps are that tell where pairs turn around, and how far from there the exact
 #: motion may take them, by how far that is from the run's own: a fifteenth of it where the error of flips
-#: goes with the time step, and three times that is allowed for.
-FINER, REACH = 16, 0.2
+#: goes with the time step, and three times that is allowed for. A crossing adds the more the less deep it is,
+#: without limit: of those within reach what counts is what one adds at this share of the reach.
+FINER, REACH, SHALLOW = 16, 0.2, 0.01
 #: Turning points, in the order of their steps, over which the typical move of a distance is taken.
 _NEIGHBORS = 20
 
@@ -95,8 +96,8 @@ class Turns:
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """What the two crossings add, magnitude: in the mean over depths up to the reach; of those out of
-        reach the difference between what they add in the run and in the shorter steps."""
+        """What the two crossings add, magnitude: where they are shallow, one in a hundred within reach; of
+        those out of reach the difference between what they add in the run and in the shorter steps."""
         bend, reach = self.table["bend"], self.reach
 
         def added(gap):
@@ -104,7 +105,7 @@ class Turns:
                 return np.where(gap < 0, 1 / np.sqrt(2 * bend * np.abs(gap)), 0.0)
 
         own = np.where(self.table["unseen"], 0.0, added(self.table["gap"]))
-        times = np.where(np.abs(self.gap) <= reach, 2 * added(-reach), np.abs(own - added(self.gap)))
+        times = np.where(np.abs(self.gap) <= reach, added(-SHALLOW * reach), np.abs(own - added(self.gap)))
         terms = np.abs(2 * self.table["weight"][:, None] * self.table["moved"])
         # what is not known weighs, but not where nothing is to be known
         return np.where(times[:, None] == 0, 0.0, terms * times[:, None])

@@ -103,14 +103,14 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted(planted, judge
     # with a time step at which it does enter, the derivative is of the size that was told
     finer = EventAware()(problem(-0.5 * short, timestep / 16), ("r_cut", "dt"))
     true = float(finer.gradient["cutoff.radius"])
-    assert true != 0 and 0.2 < abs(row["term"]["cutoff.radius"] / true) < 5
+    assert true != 0 and 1 < abs(row["term"]["cutoff.radius"] / true) < 25
     # at a fixed number of steps, twice as many of half the length move with it as far as one of them
     by_time = float(own.gradient["dynamics.timestep"])
     assert found.half["dynamics.timestep"][0] == pytest.approx(by_time, rel=0.02)
 
 
-def test_the_term_of_a_near_miss_is_the_mean_over_the_depths_it_may_have():
-    """Two crossings at a depth d add 2 w / sqrt(2 a d): the mean by quadrature, or that of a known depth."""
+def test_the_term_of_a_near_miss_is_that_of_the_least_depth_that_is_likely():
+    """Two crossings at a depth d add 2 w / sqrt(2 a d): those of a shallow one, or their change."""
     shift, bend, weight = np.array([3e-4, 1e-3, 5e-5, 2e-4, 1e-4]), np.array([4.0, 0.3, 7.0, 2.0, 5.0]), 0.8
     moved = np.array([[1.0, -0.2], [0.5, 3.0], [-2.0, 0.1], [0.7, 0.0], [0.9, -1.0]])
     table = {"step": np.arange(5), "shift": shift, "bend": bend, "weight": np.full(5, weight), "moved": moved}
@@ -125,8 +125,11 @@ def test_the_term_of_a_near_miss_is_the_mean_over_the_depths_it_may_have():
     np.testing.assert_allclose(turns.reach, REACH * np.maximum(shift, typical), rtol=1e-12)
     assert turns.within.tolist() == [True, True, False, True, False]
     for k in (0, 1):
-        total, _ = quad(lambda d, a=bend[k]: 2 * weight / np.sqrt(2 * a * d), 0, turns.reach[k])
-        np.testing.assert_allclose(turns.term[k], np.abs(moved[k]) * total / turns.reach[k], rtol=1e-6)
+        # of depths that are all alike likely one in a hundred is less deep
+        shallow = 2 * weight / np.sqrt(2 * bend[k] * turns.reach[k] / 100)
+        np.testing.assert_allclose(turns.term[k], np.abs(moved[k]) * shallow, rtol=1e-12)
+        mean, _ = quad(lambda d, a=bend[k]: 2 * weight / np.sqrt(2 * a * d), 0, turns.reach[k])
+        assert shallow == pytest.approx(5 * mean / turns.reach[k], rel=1e-6)
     assert not turns.term[2].any()
     np.testing.assert_allclose(turns.term[3], np.abs(moved[3]) * 2 * weight / np.sqrt(2 * 2.0 * 0.01))
     differ = 1 / np.sqrt(2 * 5.0 * 0.01) - 1 / np.sqrt(2 * 5.0 * 0.04)
@@ -143,7 +146,7 @@ def test_a_near_miss_counts_against_the_derivatives_that_it_adds_to(planted, jud
         name: next(one.values["share"] for one in judged.by[name].limits if one.what == "near miss")
         for name in judged.by
     }
-    assert shares["cutoff.radius"] > 1 > 0.01 > 100 * shares["potential.epsilon"]
+    assert shares["cutoff.radius"] > 1 > 0.01 > 10 * shares["potential.epsilon"]
     # all parameters together are as good as the worst
     assert (judged.verdict, judged.limited_by, judged.horizon) == ("limited", "near miss", 35)
     # differences of runs at a sixteenth of the time step
