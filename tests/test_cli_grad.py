@@ -348,6 +348,32 @@ def test_trusted_is_the_word_where_all_of_it_was_examined_alone(tmp_path, trust,
     assert verdict.tone == tone and words in verdict.headline
 
 
+def test_every_parameter_has_a_verdict_of_its_own(tmp_path):
+    """A near miss that is most of the derivative by the cutoff, and nothing of that by epsilon."""
+    near = {name: TRUST[name] for name in ("verdict", "horizon", "limited_by", "unknown", "limits")}
+    (limit,) = TRUST["limits"]
+    free = {**limit, "horizon": STEPS, "reached": False, "values": {**limit["values"], "share": 0.0014}}
+    good = {"verdict": "trusted", "horizon": STEPS, "limited_by": "", "unknown": [], "limits": [free]}
+    open_ = {**good, "verdict": "undecided", "unknown": ["parameters of many entries"], "limits": []}
+    trust = {**TRUST, "by": {EPSILON: good, RADIUS: near, START: open_}}
+    outcome = write(tmp_path / "run", report=True, trust=trust)
+    found = {one.code: one for one in outcome.verdict.findings}
+    beyond = found["BEYOND_TRUST"]
+    assert beyond.values["names"] == [RADIUS] and beyond.values["horizon"] == 300
+    assert found["UNDECIDED"].values["names"] == [START]
+    words = outcome.verdict.headline.partition("d msd / d epsilon")[2].partition("d msd / d radius")
+    assert "(trusted)" in words[0] and "(not trusted: near miss" in words[2]
+    assert RADIUS in beyond.title and EPSILON not in beyond.title
+    (section,) = (one for one in outcome.page.sections if one.title == "How far it is trusted")
+    tables = [part for part in section.parts if hasattr(part, "rows")]
+    assert [len(one.rows) for one in tables[:3]] == [1, 1, 0]
+    assert "0.1 %" in tables[0].rows[0][3]
+    assert "90 %" in tables[1].rows[0][3]
+    # where all share a verdict none is named
+    shared = codes(tmp_path / "all", trust={**TRUST, "by": dict.fromkeys((EPSILON, RADIUS), near)})
+    assert shared["BEYOND_TRUST"].values["names"] == []
+
+
 def test_two_digits_are_shown_where_nobody_knows_how_many_hold(tmp_path):
     methods = [{**one, "gradient": {**one["gradient"], EPSILON: -0.0086653366}} for one in (PLAIN, AWARE)]
     outcome = write(

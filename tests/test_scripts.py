@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
@@ -326,3 +328,27 @@ def test_calculators_side_by_side(tmp_path: Path) -> None:
     cells = row(told, "EMT")
     assert cells[2:5] == ["not asked", "not asked", "-"] and float(cells[5]) < 1e-6
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_runs_that_locate_crossings_have_the_derivative_of_the_motion(monkeypatch) -> None:
+    """A pair that leaves its well through a hard cutoff: its last speed follows from its energy."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    located = importlib.import_module("_located")
+    x = np.array([[5.0, 5, 5], [6.8, 5, 5]])
+    v = np.array([[-0.5, 0, 0], [0.5, 0, 0]])
+
+    def u(r: float) -> float:
+        return 4 * (r**-12 - r**-6)
+
+    def speed(radius: float) -> float:
+        made = located.losses(
+            x, v, np.full(2, 2.0), np.full(3, 20.0), 1.0, 1.0, radius, False, 0.002, 1000, 4
+        )
+        # the mean over the two atoms of v(0) · v(t), each half as fast as they part
+        return 4 * made[located.LOSSES.index("vacf")]
+
+    right = np.sqrt(1 + 2 * u(1.8) - 2 * u(2.5))
+    assert speed(2.5) == pytest.approx(right, rel=1e-5)
+    slope = (speed(2.5 + 1e-6) - speed(2.5 - 1e-6)) / 2e-6
+    steep = 24 * (2.5**-7 - 2 * 2.5**-13)
+    assert slope == pytest.approx(-steep / right, rel=1e-4)

@@ -155,7 +155,7 @@ class EventAware(Method):
     def of(self, problem: Problem, made: ReversePass) -> Gradient:
         """The gradient, of a pass that was made."""
         notes = independent(problem, made.gradient, saltation=True)
-        unseen = bool(np.any(problem.simulation.jumps())) and made.tape.jumps_unseen
+        unseen = any(made.tape.jumps_unseen)
         if unseen:
             notes |= dict.fromkeys(made.gradient, _SINGLE_FRAMES)
         details = {"guard": made.guard, "loss jumps": unseen, **weights(made.crossings)}

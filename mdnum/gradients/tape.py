@@ -194,18 +194,22 @@ class RunTape:
         return sum(isinstance(one, tuple) for one in self._made)
 
     @property
-    def jumps_unseen(self) -> bool:
-        """Whether the loss looks at energy or virial in single frames: where they jump with a flip, so does
-        the loss, and no slope has that. In frames at equal times it is part of the average."""
+    def jumps_unseen(self) -> tuple[float, float]:
+        """Derivatives of the loss by an energy and a virial that jump with a flip, where it looks in single
+        frames: the loss jumps with them, and no slope has that. 0 in frames at equal times, where it is part
+        of the average."""
         if int(self.pace.between) > 0:
-            return False
+            return 0.0, 0.0
 
         def at(potential, virial):
             frame = self.origin._replace(potential=potential, virial=virial)
             return self.loss.value(self.loss.observe(frame, frame, self.around), 1)
 
         one = jnp.ones((), jnp.float64)
-        return any(float(slope) != 0 for slope in jax.grad(at, argnums=(0, 1))(one, one))
+        potential, virial = jax.grad(at, argnums=(0, 1))(one, one)
+        energy, force = (bool(np.any(jump)) for jump in self.simulation.jumps())
+        # the virial jumps where the force does
+        return float(potential) * energy, float(virial) * force
 
     def __len__(self) -> int:
         return len(self._made)

@@ -469,13 +469,16 @@ def judge(view: View) -> Verdict:
 def _headline(view: View) -> str:
     summary, trust = view.summary, view.summary.get("trust") or {}
     reference = by(summary, summary["reference"])
-    parts = []
+    parts, judgments = [], grad_page.judgments(summary)
     for one in summary["parameters"][:3]:
         value = f"{slope(summary, reference, one['name'], 4)} {grad_page.slope_unit(summary, one)}".rstrip()
-        note = digits_note(summary, one["name"])
+        names = next((names for names in judgments if one["name"] in names), ())
+        verdict = TEXTS("note_{verdict}".format_map(judgments[names]), **judgments[names]) if names else ""
+        note = ", ".join(filter(None, (verdict, digits_note(summary, one["name"]))))
         short = one["name"].rpartition(".")[2]
         parts.append(f"d {summary['loss']['word']} / d {short} = {value}{f' ({note})' if note else ''}")
-    name = trust.get("verdict") or "unasked"
+    # verdicts that differ stand behind their derivatives
+    name = "unasked" if len(judgments) > 1 else trust.get("verdict") or "unasked"
     if name == "limited" and not trust["horizon"]:
         name = "limited_anywhere"
     starts = TEXTS("starts_unknown") if "other starts" in trust.get("unknown", ()) else ""
@@ -490,7 +493,7 @@ def _evidence(view: View) -> Iterator[str]:
     reference = by(summary, summary["reference"])
     if reference is not None:
         yield TEXTS("by_method", method=reference["method"], description=reference["description"].rstrip("."))
-    yield from grad_page.trust_sentences(summary) or grad_page.growth_sentences(view)
+    yield from list(grad_page.trust_sentences(summary)) or grad_page.growth_sentences(view)
     for name, parts in ((summary.get("flips") or {}).get("share") or {}).items():
         if None not in parts.values() and digits_of(summary, name.partition("[")[0]) != 0:
             share = percent(round(abs(parts["pair enters"] + parts["pair leaves"]), 6))
@@ -548,19 +551,21 @@ def _of_methods(view: View) -> Iterator[Finding]:
 
 
 def _of_trust(view: View) -> Iterator[Finding]:
-    """A gradient that is not trusted as far as it was asked for."""
-    trust, section = view.summary.get("trust") or {}, "How far it is trusted"
-    if trust.get("verdict") == "limited":
-        limit = trust["limited_by"]
-        variants = [limit.replace(" ", "_"), *["anywhere"] * (not trust["horizon"])]
-        seen = next(one for one in trust["limits"] if one["what"] == limit)
-        yield TEXTS.finding(
-            "BEYOND_TRUST", *variants, section=section, horizon=trust["horizon"], limit=limit,
-            seen=grad_page.limit_sentence(view.summary, seen),
-        )  # fmt: skip
-    elif trust.get("verdict") == "undecided":
-        variants = list(_unknown(view, trust))
-        yield TEXTS.finding("UNDECIDED", *variants, section=section, unknown=listed(trust["unknown"]))
+    """Derivatives that are not trusted as far as they were asked for."""
+    for names, one in grad_page.judgments(view.summary).items():
+        whose = TEXTS("whose", names=listed(names)) if names else ""
+        values: dict[str, Any] = {"names": list(names), "whose": whose, "section": "How far it is trusted"}
+        if one["verdict"] == "limited":
+            limit = one["limited_by"]
+            variants = [limit.replace(" ", "_"), *["anywhere"] * (not one["horizon"])]
+            seen = next(row for row in one["limits"] if row["what"] == limit)
+            yield TEXTS.finding(
+                "BEYOND_TRUST", *variants, horizon=one["horizon"], limit=limit,
+                seen=grad_page.limit_sentence(view.summary, seen), **values,
+            )  # fmt: skip
+        elif one["verdict"] == "undecided":
+            variants = list(_unknown(view, one))
+            yield TEXTS.finding("UNDECIDED", *variants, unknown=listed(one["unknown"]), **values)
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import ROLES, Code, Key, Page, Section, Series, Table, curves, pairs, table_of
-from mdnum.report.words import MINUS, count, heading, many, number, percent, power
+from mdnum.report.words import MINUS, count, heading, listed, many, number, percent, power
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
@@ -126,19 +126,36 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
     return TEXTS(code, **{**values, "flips": flips})
 
 
-def trust_sentences(summary: Mapping[str, Any]) -> list[str]:
-    """The verdict on trust, and what it is limited by."""
+def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
+    """Judgments on trust by the parameters that share them; by no name where all share one."""
     trust = summary.get("trust")
     if not trust:
-        return []
-    limits = trust["limits"]
-    free = [one["what"] for one in limits if one["horizon"] is not None and not one["reached"]]
-    values = {"steps": summary["steps"], "horizon": trust["horizon"], "limit": trust["limited_by"]}
-    found = [TEXTS(f"trust_{trust['verdict']}", free=", ".join(free) or "nothing", **values)]
-    found += [limit_sentence(summary, one) for one in limits if one["reached"]]
-    if trust["unknown"]:
-        found.append(TEXTS("not_known", unknown=", ".join(trust["unknown"])))
-    return found
+        return {}
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    # a folder that was written before derivatives were judged one by one has none of them
+    for name, one in (trust.get("by") or {}).items():
+        shared = (one["verdict"], one["horizon"], one["limited_by"], *one["unknown"])
+        groups.setdefault(shared, []).append(name)
+    if len(groups) < 2:
+        return {(): trust}
+    return {tuple(names): trust["by"][names[0]] for names in groups.values()}
+
+
+def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapping[str, Any]) -> str:
+    """A verdict on trust."""
+    free = [limit["what"] for limit in one["limits"] if limit["horizon"] is not None and not limit["reached"]]
+    values = {"steps": summary["steps"], "horizon": one["horizon"], "limit": one["limited_by"]}
+    text = TEXTS(f"trust_{one['verdict']}", free=", ".join(free) or "nothing", **values)
+    return TEXTS("trust_by", names=listed(names), text=text) if names else text
+
+
+def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
+    """The verdicts on trust, and what they are limited by."""
+    for names, one in judgments(summary).items():
+        yield trust_sentence(summary, names, one)
+        yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
+        if one["unknown"]:
+            yield TEXTS("not_known", unknown=", ".join(one["unknown"]))
 
 
 def growth_sentences(view: View) -> list[str]:
@@ -260,24 +277,25 @@ def _horizons(view: View) -> Iterator[Any]:
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
     """Where trust in the gradient ends."""
-    trust = view.summary.get("trust") or {}
-    if trust.get("limited_by"):
-        yield trust["horizon"], f"limit: {trust['limited_by']}"
+    for names, one in judgments(view.summary).items():
+        if one["limited_by"]:
+            yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])
 
 
 def _trust(view: View) -> Iterator[Any]:
     trust = view.summary.get("trust")
     if not trust:
         return
-    yield trust_sentences(view.summary)[0]
 
     def until(one: Mapping[str, Any]) -> str:
         return "not examined" if one["horizon"] is None else "up to step" if one["reached"] else "not by step"
 
-    yield table_of(trust["limits"], {
-        "limit": "what", "": until, "step": "horizon",
-        "what was seen": lambda one: limit_sentence(view.summary, one),
-    })  # fmt: skip
+    for names, judged in judgments(view.summary).items():
+        yield trust_sentence(view.summary, names, judged)
+        yield table_of(judged["limits"], {
+            "limit": "what", "": until, "step": "horizon",
+            "what was seen": lambda one: limit_sentence(view.summary, one),
+        })  # fmt: skip
     near, unit = (trust.get("near") or {}).get("heaviest"), view.units.length
     if near:
         yield TEXTS("near_table")

@@ -127,7 +127,7 @@ def test_a_single_frame_that_jumps_is_told(well):
     found = EventAware()(late, ("potential.sigma",))
     assert found.details["loss jumps"] and "single frames" in found.notes["potential.sigma"]
     often, speed = Custom(see=energy, every=2), Custom(see=lambda f, *_: f.v[0, 0], first=20)
-    assert not any(tape_of(replace(late, loss=loss), False).jumps_unseen for loss in (often, speed))
+    assert not any(any(tape_of(replace(late, loss=loss), False).jumps_unseen) for loss in (often, speed))
 
 
 # --- tangents ----------------------------------------------------------------------------------------

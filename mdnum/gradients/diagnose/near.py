@@ -31,16 +31,19 @@ from mdnum.systems.build import Simulation
 LOOK = 0.02
 #: Rows that share one choice of pairs.
 _BLOCK = 8
-#: How much further than seen a distance is taken to move: two runs at one time step and its half are apart by
-#: 3/4 of the error of the longer one.
-REACH = 2.0
+#: How many times shorter the steps are that tell where pairs turn around, and how far from there the exact
+#: motion may take them, by how far that is from the run's own: a fifteenth of it where the error of flips
+#: goes with the time step, and three times that is allowed for. A crossing adds the more the less deep it is,
+#: without limit: of those within reach what counts is what one adds at this share of the reach.
+FINER, REACH, SHALLOW = 16, 0.2, 0.01
 #: Turning points, in the order of their steps, over which the typical move of a distance is taken.
 _NEIGHBORS = 20
 
 
-#: Columns of the table of turning points: integers, vectors, and numbers.
+#: Columns of the table of turning points: integers, vectors, and numbers, the last of which come later.
 _WHOLE, _VECTORS = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
-_NUMBERS = ("gap", "bend", "unseen", "part", "before", "after", "weight", "shift")
+_LATER = ("weight", "shift", "finer")
+_NUMBERS = ("gap", "bend", "side", "unseen", "part", "before", "after", *_LATER)
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,14 @@ class Turns:
             step: it lies between this step and the one before. row: of that step in its stretch.
             i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
             gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
+            side: 1 where the distance is smallest there, -1 where it is largest.
             bend: magnitude of the second derivative of the distance there, length per internal time².
             unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
             weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
             moved: how far the cutoff moves ahead of the pair, by number that is differentiated by; NaN before
             the tangents have been there.
             shift: how far the distance is from that of other runs (another time step, another rounding), the
-            largest of them, length; 0 before any was compared.
+            largest of them, length; 0 before any. finer: how much longer it is in the shorter steps.
             normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
             part: where between the two steps, 0 to 1. before, after: distances at the two steps.
     """
@@ -67,6 +71,11 @@ class Turns:
 
     def __len__(self) -> int:
         return len(self.table["step"])
+
+    @property
+    def gap(self) -> Float[np.ndarray, "turns"]:
+        """How far it is short of the cutoff in the shorter steps; negative where the pair is beyond it."""
+        return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
@@ -83,30 +92,34 @@ class Turns:
     @property
     def within(self) -> np.ndarray:
         """Which of them may be on the other side of their cutoff, or are and left no flip."""
-        return (np.abs(self.table["gap"]) <= self.reach) | self.table["unseen"]
+        return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """What the two crossings add, magnitude: in the mean over depths up to the reach, or at the depth of
-        those that no step saw; 0 out of reach."""
-        bend, gap, reach = self.table["bend"], np.abs(self.table["gap"]), self.reach
-        with np.errstate(divide="ignore", invalid="ignore"):
-            mean = 2 / np.sqrt(2 * bend * reach)
-            there = 1 / np.sqrt(2 * bend * gap)
-            times = np.where(self.table["unseen"] & ~(gap <= reach), there, mean)
-            terms = np.abs(2 * self.table["weight"][:, None] * self.table["moved"]) * times[:, None]
-        return np.where(self.within[:, None], terms, 0.0)
+        """What the two crossings add, magnitude: where they are shallow, one in a hundred within reach; of
+        those out of reach the difference between what they add in the run and in the shorter steps."""
+        bend, reach = self.table["bend"], self.reach
+
+        def added(gap):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.where(gap < 0, 1 / np.sqrt(2 * bend * np.abs(gap)), 0.0)
+
+        own = np.where(self.table["unseen"], 0.0, added(self.table["gap"]))
+        times = np.where(np.abs(self.gap) <= reach, added(-SHALLOW * reach), np.abs(own - added(self.gap)))
+        terms = np.abs(2 * self.table["weight"][:, None] * self.table["moved"])
+        # what is not known weighs, but not where nothing is to be known
+        return np.where(times[:, None] == 0, 0.0, terms * times[:, None])
 
     def heaviest(self, words: tuple[str, ...], most: int = 10) -> list[dict[str, Any]]:
-        """Those within reach as plain rows, terms by word, those with the largest first."""
-        kept = np.flatnonzero(self.within)
-        term, reach, table = self.term, self.reach, self.table
+        """Those with a term as plain rows, terms by word, those with the largest first."""
+        kept = np.flatnonzero(self.term.any(axis=1))
+        term, reach, table, gap = self.term, self.reach, self.table, self.gap
         share = term[kept] / np.maximum(term.max(axis=0, initial=0.0), 1e-300)
         order = kept[np.argsort(-share.max(axis=1, initial=0.0), kind="stable")][:most]
         return [
             {
                 "step": int(table["step"][k]), "i": int(table["i"][k]), "j": int(table["j"][k]),
-                "gap": float(table["gap"][k]), "reach": float(reach[k]),
+                "gap": float(gap[k]), "reach": float(reach[k]),
                 "term": {word: float(value) for word, value in zip(words, term[k], strict=True)},
             }
             for k in order
@@ -122,6 +135,8 @@ class Near:
     rows: int = 0  # of the longest stretch
     #: Tables by the first step of their stretch, last one first.
     _found: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
+    #: How far the cutoff moves ahead of the pair at each flip, by number; of each stretch, first one first.
+    moved: list[np.ndarray] = field(default_factory=list)
 
     @property
     def jumps(self) -> bool:
@@ -156,6 +171,8 @@ class Near:
     def tangents(self, part: StretchTangents) -> None:
         """One stretch of the tangents: how far each distance moves."""
         simulation, stretch = self.simulation, part.stretch
+        if part.dr is not None and part.dr_cut is not None:
+            self.moved.append(part.dr_cut - part.dr)
         found = self._found.get(stretch.first)
         if found is None:
             return
@@ -188,7 +205,11 @@ class Near:
                     stretch.x[row[here], :, place[found[label][here]]].astype(np.float64) for label in "ij"
                 )
                 r = np.linalg.norm(np.stack(cell.displacement(a, b), axis=1), axis=1)
-                found["shift"][here] = np.maximum(found["shift"][here], np.abs(r - found[name][here]))
+                further = r - found[name][here]
+                found["shift"][here] = np.maximum(found["shift"][here], np.abs(further))
+                if per == FINER:
+                    part = found["part"][here]
+                    found["finer"][here] += (1 - part if earlier else part) * further
 
     def turns(self, columns: int) -> Turns:
         """All of them, in the order of their steps."""
@@ -283,12 +304,12 @@ def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarra
                     side, ends = np.sign(bend), np.stack([r0[turned], r[turned]]) - cut[turned]
                     gap = side * (there - cut[turned])
                     raw = (stretch.x[row][:, b[turned]] - stretch.x[row][:, a[turned]]).T.astype(np.float64)
-                    names = {"step": stretch.first + row, "row": row, "weight": 0.0, "shift": 0.0}
+                    names = {"step": stretch.first + row, "row": row, **dict.fromkeys(_LATER, 0.0)}
                     rows.append(
                         {name: np.full(len(turned), value) for name, value in names.items()}
                         | {
                             "i": order[a[turned]], "j": order[b[turned]], "a": a[turned], "b": b[turned],
-                            "kind": which[turned], "gap": gap, "bend": np.abs(bend),
+                            "kind": which[turned], "gap": gap, "bend": np.abs(bend), "side": side,
                             "unseen": (gap < 0) & (side * ends > 0).all(axis=0),
                             "normal": middle / np.linalg.norm(middle, axis=1, keepdims=True),
                             "images": d[turned] - raw, "part": part, "before": r0[turned], "after": r[turned],

@@ -26,12 +26,12 @@ from jaxtyping import Array, Bool, Float, Int
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, GradientGrowth, GrowthWatch
-from mdnum.gradients.diagnose.near import Near, Turns
+from mdnum.gradients.diagnose.near import FINER, Near, Turns
 from mdnum.gradients.differences import replica
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.parameters import ParameterEntry, columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
-from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, radial_speed, weights
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, radial_speed
 from mdnum.gradients.tangents import StretchTangents, tangents
 from mdnum.gradients.tape import RunTape, TapeStretch, pace_of
 from mdnum.md.integrators import Langevin
@@ -42,8 +42,9 @@ from mdnum.systems.build import Simulation
 
 #: The parameter by which derivatives at half the time step are twice as large.
 TIMESTEP = "dynamics.timestep"
-#: Relative difference of two precisions above which a gradient is not trusted.
-TOLERANCE = 1e-2
+#: Relative difference of two precisions, or of two time steps, above which a derivative is not trusted, and
+#: the share of it that near misses may have. What is trusted has been within 5 % of the exact motion's.
+TOLERANCE = 2e-2
 #: Horizons that are compared.
 POINTS = 40
 ROUNDING, SCATTER, AMBIGUOUS = "rounding", "standard error", "ambiguous decision"
@@ -54,8 +55,6 @@ STARTS, SKIPPED = "other starts", "parameters of many entries"
 #: A gradient that grew this many times more than in proportion to the steps is one of a start among many, and
 #: whether others agree must be examined.
 GROWN = 10.0
-#: Share of the weight of all flips above which what the guard leaves out matters.
-LEFT_OUT = 0.01
 #: Bytes of tangents of one stretch that are looked through.
 _MEMORY = 2**30
 TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
@@ -221,15 +220,22 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Trust:
-    """How far a gradient can be trusted."""
+class Judgment:
+    """How far derivatives can be trusted: by one parameter, or by all of them together."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
     horizon: int  # the shortest of the limits that were examined, steps
     limited_by: str  # which it is; else empty
-    limits: tuple[Limit, ...]  # all of them
     unknown: tuple[str, ...]  # what was not examined and is needed
+    limits: tuple[Limit, ...]  # all of them
+
+
+@dataclass(frozen=True)
+class Trust(Judgment):
+    """How far a gradient can be trusted: its own verdict is that of all parameters together."""
+
+    by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
     # by `horizon`, for each parameter the relative difference of two precisions (`relative.`), of the time
     # step and its half (`step.`), and standard error over the mean (`error.`), where examined
@@ -333,28 +339,39 @@ def trust(
     finer = None
     if half_step and not noisy:
         finer = follow(problem, "half the time step", 2, beside(2))
+        if near is not None and len(near.turns(columns)):
+            fine, phase = shorter(problem, at[-1:], FINER), in_phase(progress, "shorter steps")
+            RunTape(fine.simulation, fine.loss, fine.steps, budget=0, each=beside(FINER), progress=phase)
     steps = {} if finer is None else relative(own, finer)
     turns = None if near is None or finer is None else near.turns(columns)
-    first = first_difference(own, other)
     unseen = ("half-step", {}) if finer is None else ("memory", {"bytes": needed})
-    roundings = {"narrow": " and ".join(narrow) or "float64", "first": first}
-    halving = Limit(STEP, None, False, "noise" if noisy else "not asked")
-    if finer is not None:
-        halving = _compared(STEP, last_agreeing(at, steps, tolerance), steps, tolerance, {})
-    limits = [
-        _compared(ROUNDING, last_below(at, differing, tolerance), differing, tolerance, roundings), halving,
-        _missed(problem, own, turns, unseen, made, tolerance, saltation), ambiguity(problem),
-    ]  # fmt: skip
+    roundings = {"narrow": " and ".join(narrow) or "float64", "first": first_difference(own, other)}
     scatter: dict[str, np.ndarray] = {}
     if replicas:
         starts = [replace(problem, simulation=replica(simulation, k)) for k in range(1, replicas)]
         scatter = standard_error([own, *(follow(one, f"start {k + 2}") for k, one in enumerate(starts))])
-        horizon, reached = last_below(at, scatter, 1.0)
-        limits.append(Limit(SCATTER, horizon, reached, "scatter", {"replicas": replicas}))
-    else:
-        limits.append(Limit(SCATTER, None, False, "not asked"))
-    chaotic = growth.word != WORDS[0] or growth.gain > GROWN * max(1.0, problem.steps / CLOCK_STEPS)
-    verdict, horizon, limited, unknown = verdict_of(limits, problem.steps, chaotic, len(kept) < len(full))
+    moved, ambiguous, chaotic = near and near.moved, ambiguity(problem), grew(growth)
+
+    def judged(*chosen: str) -> Judgment:
+        """By these parameters: what weighs in the derivative by one need not weigh in that by another."""
+        apart, halved, scattered = (
+            {name: one[name] for name in chosen if name in one} for one in (differing, steps, scatter)
+        )
+        limits = (
+            _compared(ROUNDING, last_below(at, apart, tolerance), apart, tolerance, roundings),
+            _compared(STEP, last_agreeing(at, halved, tolerance), halved, tolerance, {
+                "largest": max(float(np.max(one[-2:])) for one in halved.values())
+            }) if halved
+            else Limit(STEP, None, False, "noise" if noisy else "not asked"),
+            _missed(problem, own, turns, unseen, made, moved, tolerance, saltation, chosen), ambiguous,
+            Limit(SCATTER, *last_below(at, scattered, 1.0), "scatter", {"replicas": replicas}) if scattered
+            else Limit(SCATTER, None, False, "not asked"),
+        )  # fmt: skip
+        open_ = chosen == tuple(kept) and len(kept) < len(full)
+        return Judgment(*verdict_of(limits, problem.steps, chaotic, open_), limits)
+
+    whole, skipped = judged(*kept), Judgment(UNDECIDED, problem.steps, "", (SKIPPED,), ())
+    by = {name: judged(name) if name in kept else skipped for name in full}
     # the last two horizons, so that none agrees by chance
     digits = {name: _digits(*one[-2:], differing[name][-1]) for name, one in steps.items()}
     half = {} if finer is None else {name: part[-1] for name, part in finer.by_name().items()}
@@ -362,9 +379,18 @@ def trust(
     for key, values in (("relative", differing), ("step", steps), ("error", scatter)):
         table |= {f"{key}.{name}": column for name, column in values.items()}
     return Trust(
-        verdict, horizon, limited, tuple(limits), unknown, tolerance, table, half, digits, turns,
-        tuple(map(str, own.columns)),
+        **vars(whole), by=by, tolerance=tolerance, table=table, half=half, digits=digits, turns=turns,
+        columns=tuple(map(str, own.columns)),
     )  # fmt: skip
+
+
+def grew(growth: GradientGrowth) -> bool:
+    """Whether a gradient grew so much that it is one of a start among many."""
+    # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
+    size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
+    there = size[np.isfinite(size) & (size > 0)]
+    gain = there.max() / there[0] if len(there) else 1.0
+    return growth.word != WORDS[0] or bool(gain > GROWN * max(1.0, len(size) / CLOCK_STEPS))
 
 
 def no_half_step(simulation: Simulation) -> bool:
@@ -409,10 +435,10 @@ def _compared(what: str, agreed: tuple[int, bool], differing, tolerance: float, 
 
 
 def _missed(
-    problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, tolerance: float,
-    saltation: bool,
+    problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
+    saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Where a turning point within reach of the cutoff has a term that weighs."""
+    """Where something that is left out, or a turning point near the cutoff, weighs by these parameters."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -420,44 +446,59 @@ def _missed(
             return Limit(NEAR, None, False, "steps alone")
         first = int(own.flips[0, 0])
         return Limit(FLIPS, max(first - 1, 0), True, "steps alone", {"first": first})
-    left = _left_out(made)
+    chosen = np.array([column.name in names for column in own.columns])
+    whole = own.by_name()
+    size = np.array([np.linalg.norm(whole[column.name][-1]) for column in own.columns])[chosen]
+    left = _left_out(made, np.concatenate(moved)[:, chosen], size, tolerance) if moved else None
     if left is not None:
         return left
     if turns is None:
         return Limit(NEAR, None, False, *unseen)
-    count = int(turns.within.sum())
-    if not count:
+    if not np.any(turns.term):
         return Limit(NEAR, problem.steps, False, "none within reach", {"turns": len(turns)})
-    size = np.concatenate(
-        [np.full(part.shape[1], np.linalg.norm(part[-1])) for part in own.by_name().values()]
-    )
-    table, term = turns.table, turns.term
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # a term that is not known weighs
-        share = np.where(term == 0, 0.0, np.nan_to_num(term / size, nan=np.inf))
-        weighs = np.sqrt(np.cumsum(np.square(share), axis=0))
+    table, term = turns.table, turns.term[:, chosen]
+    share, weighs = _shares(term, size)
     over = np.flatnonzero(~(weighs <= tolerance).all(axis=1))
     k, column = np.unravel_index(int(np.argmax(share)), share.shape)
     values = {
-        "count": count, **{name: int(table[name][k]) for name in ("i", "j", "step")},
-        "gap": float(abs(table["gap"][k])), "reach": float(turns.reach[k]), "term": float(term[k, column]),
-        "share": float(share[k, column]), "column": str(own.columns[column]),
+        "count": int(turns.within.sum()), **{name: int(table[name][k]) for name in ("i", "j", "step")},
+        "gap": float(abs(turns.gap[k])), "reach": float(turns.reach[k]), "term": float(term[k, column]),
+        "share": float(share[k, column]), "column": str(own.columns[np.flatnonzero(chosen)[column]]),
     }  # fmt: skip
-    code = "short of" if table["gap"][k] > 0 else "between two steps" if table["unseen"][k] else "beyond"
+    code = "short of" if turns.gap[k] > 0 else "beyond"
+    if table["unseen"][k] or abs(turns.gap[k]) > turns.reach[k]:
+        code = "between two steps" if table["unseen"][k] else "elsewhere"
     horizon = max(int(table["step"][over[0]]) - 1, 0) if len(over) else problem.steps
     return Limit(NEAR, horizon, bool(len(over)), code, values)
 
 
-def _left_out(made: ReversePass) -> Limit | None:
-    """Flips slower than the guard, where they would have weighed."""
-    found = weights(made.crossings)
-    left, applied = found["weight left out"], found["weight applied"]
-    if not left > LEFT_OUT * (left + applied):
+def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
+    """Terms as shares of the derivatives, and those of all terms up to each, of either sign by chance."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # a term that is not known weighs
+        share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
+        return share, np.sqrt(np.cumsum(np.square(share), axis=0))
+
+
+def _left_out(
+    made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
+    tolerance: float,
+) -> Limit | None:  # fmt: skip
+    """Jumps of a loss of single frames, at their mean rate, or flips slower than the guard, that weigh."""
+    tape, met = made.tape, made.crossings[::-1]
+    energy, virial, speed, weight, slow = (
+        joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
+    )
+    jump = np.dot(tape.jumps_unseen, [energy, virial]) / speed @ moved
+    share = _shares(jump[None] / (tape.steps * float(tape.simulation.integrator.timestep)), size)[0].max()
+    if share > tolerance:
+        return Limit(FLIPS, 0, True, "single frames", {"flips": len(speed), "share": float(share)})
+    weighs = _shares(moved[slow] * weight[slow, None], size)[1].max(axis=1)
+    if not weighs.max(initial=0.0) > tolerance:
         return None
-    grazing = joined(made.crossings, "grazing")
-    first = int(joined(made.crossings, "step", ledger=True)[grazing].min())
-    values = {"count": found["grazing"], "first": first, "share": left / (left + applied)}
-    return Limit(FLIPS, max(first - 1, 0), True, "grazing", values)
+    step = joined(met, "step", ledger=True)[slow]
+    values = {"count": int(slow.sum()), "first": int(step[0]), "share": float(weighs[-1])}
+    return Limit(FLIPS, max(int(step[np.argmax(weighs > tolerance)]) - 1, 0), True, "grazing", values)
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
