@@ -332,10 +332,11 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
         raise InputError(message, remedy="Check the unit of the cutoff, and the box", where="cutoff")
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)
-    centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)
+    first, centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)
+    runs, most = _most_around(bins, away, start)
     return Binned(
-        lattice, who.species, bins, away, half, who.both, wrapped, home, start, order,
-        *centers, np.ascontiguousarray(wrapped[order].T), *_most_around(bins, away, start),
+        lattice, who.species, bins, away, half, who.both, wrapped, home, start, order, first, centers,
+        np.ascontiguousarray(wrapped[order].T), runs, most,
     )  # fmt: skip
 
 
