@@ -333,10 +333,10 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)
     first, centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)
-    runs, most = _most_around(bins, away, start)
+    most, runs = _most_around(bins, away, start)
     return Binned(
         lattice, who.species, bins, away, half, who.both, wrapped, home, start, order, first, centers,
-        np.ascontiguousarray(wrapped[order].T), runs, most,
+        np.ascontiguousarray(wrapped[order].T), most, runs,
     )  # fmt: skip
 
 
