@@ -24,7 +24,7 @@ from MDAnalysis.core.universe import Universe
 from mdnum.errors import InputError
 from mdnum.reading import FrameError, UnreadableFrame
 from mdnum.trajectories.collective import Collective
-from mdnum.trajectories.frame import Frame, FrameCheck
+from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.lattice import shortest
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
@@ -100,7 +100,8 @@ class NeighborFlips(AnalysisBase):
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
     finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
-    `results.repeats` which frames repeat earlier ones (see `repeats.RepeatedFrames`).
+    `results.repeats` which frames repeat earlier ones (see `repeats.RepeatedFrames`); `results.other_box` why
+    and as what the first frame's box may be read otherwise (see `Trajectory.other_box`), None for neither.
     `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
@@ -166,6 +167,7 @@ class NeighborFlips(AnalysisBase):
             raise InputError(message, remedy="Leave it out for what the resolution of the file gives")
         self._bound = bound
         self._resolution: Resolution | None = None
+        self._other_box: tuple[str, Box] | None = None
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
@@ -224,6 +226,8 @@ class NeighborFlips(AnalysisBase):
             raw.append(self.library.raw or sample[-1])
             changed = max(changed, _changed(raw[-1], sample[-1]))
         if sample:
+            first = int(self._numbers[0])
+            self._other_box = self.library.boxes.other(self.library.timestep(first), first)
             self._resolution = infer(raw, 32, formats_of(self._trajectory)[0])
             self._check.pbc = sample[0].box.pbc
             if self._bound is None and (self.library.replaced or changed > self._bound_of(sample[-1])):
@@ -325,6 +329,7 @@ class NeighborFlips(AnalysisBase):
         for number, digested in zip(self.frames, chain(*results.digests[:kept]), strict=True):
             repeats.see(int(number), digested)
         results.repeats = repeats.stretches
+        results.other_box = self._other_box
         for name in ("parts", "bounds", "digests", "failures"):
             del results[name]
         results.failure = failures[failed[0]] if failed else self._behind_the_last()

@@ -315,6 +315,10 @@ def test_where_nothing_tells_the_head_decides_or_both_counts_are_given(tmp_path,
     expected = {"matrix": len(all_inside(x, matrix, 3.7)), "cosines": len(all_inside(x, cosines, 3.7))}
     assert expected["matrix"] != expected["cosines"]
     undecided = [one for one in found["findings"] if one["code"] == "BOX_UNDECIDED"]
+    universe = MDAnalysis.Universe.empty(3, trajectory=True)
+    universe.load_new(str(path))
+    other = NeighborFlips(universe, 3.7).run().results.other_box
+    assert (other is not None and other[0] == "BOX_UNDECIDED") == (version == 24)
     if version == 24:
         assert counts == [expected["cosines"], [expected["matrix"]]]
         (said,) = undecided
