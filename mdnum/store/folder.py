@@ -489,6 +489,10 @@ class RunFolder:
             place = f"in {last.name}, {Path(last.filename).name}:{last.lineno}"
             names = f"damaged: {', '.join(wrong)}" if wrong else place
             message = f"holds what mdnum does not write ({names}): {type(error).__name__} {seen}".rstrip()
+            if isinstance(error, KeyError) and not wrong:
+                message = (
+                    f"lacks {seen}, which this version of mdnum reads ({place}): another version wrote it"
+                )
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
