@@ -419,7 +419,7 @@ class KeptRounds(Kept):
         ("rounds", "", "warning"),
         ("rounds_and_measures", "", "warning"),
         ("rounds_half", "minimum-image", "warning"),
-        ("KeptRounds", "all-axes,orthorhombic", "warning"),
+        pytest.param("KeptRounds", "all-axes,orthorhombic", "warning", marks=pytest.mark.nightly),
         # it says so; nothing is rounded; half precision is no single one
         ("declared", "", None),
         ("rounds_nothing", "", None),
@@ -593,8 +593,8 @@ def test_time_that_is_up_ends_it(mine: Path, name: str, code: int, status: str):
 @pytest.mark.parametrize(
     ("name", "calls", "reproduced"),
     [
-        ("ends_at_the_12th", 11, True),
-        ("ends_after_a_crowd", 1, True),
+        pytest.param("ends_at_the_12th", 11, True, marks=pytest.mark.nightly),
+        pytest.param("ends_after_a_crowd", 1, True, marks=pytest.mark.nightly),
         ("EndsAtAnUpdate", 0, True),
         ("ends_by_chance", 0, False),
     ],

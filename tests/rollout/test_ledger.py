@@ -344,7 +344,10 @@ def recorded(simulation, rows, steps=60, most=None):
     return ledger, np.concatenate(counts), last, engine.program.most
 
 
-@pytest.mark.parametrize("name", ["fluid", "binary/kob-andersen-1000", "argon/langevin-500"])
+@pytest.mark.parametrize(
+    "name",
+    ["fluid", pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly), "argon/langevin-500"],
+)
 @pytest.mark.parametrize("on", ["host", "device"])
 def test_changes_noted_in_the_loop_are_those_of_its_rows(fluid, monkeypatch, name, on):
     system = shaken(fluid, 3, 2.5) if name == "fluid" else load(name)
