@@ -83,7 +83,14 @@ def lennard_jones():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [planted.Good, planted.ByAppearance, lennard_jones])
+@pytest.mark.parametrize(
+    "make",
+    [
+        planted.Good,
+        pytest.param(planted.ByAppearance, marks=pytest.mark.nightly),
+        pytest.param(lennard_jones, marks=pytest.mark.nightly),
+    ],
+)
 def test_calls_that_a_check_does_not_need_are_for_those_after_it(make, tmp_path):
     """Clean small potentials are asked everything, within the sum of the limits."""
     calls = []
