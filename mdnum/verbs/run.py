@@ -329,7 +329,7 @@ def _ase(run: RunView) -> Iterator[Finding]:
 
 
 def _decisions(run: RunView) -> Iterator[Finding]:
-    margin, key, own = abs(float(run.series["min_margin"][0])), run.cutoff_key, ["own"] * (not run.cutoff_key)
+    margin, key, own = abs(float(run.series["min_margin"][0])), run.cutoff_key, run.own_end
     if not margin or run.series["ambiguous"][0]:
         yield TEXTS.finding("TIE_AT_CUTOFF", *own, margin=margin, key=key)
     ambiguous = run.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
@@ -382,17 +382,15 @@ def _drift(run: RunView) -> Iterator[Finding]:
         low, high = min(float(moves.min()), 0.0), max(float(moves.max()), 0.0)
         share = (high - low) / (atoms * thermal)
         if share >= DRIFT_SHARE:
-            own = ["own"] * (not run.cutoff_key)
-            yield TEXTS.finding(
-                "WANDER", *own, low=low, high=high, share=share, unit=units.energy, key=run.cutoff_key
-            )
+            values = {"low": low, "high": high, "share": share, "unit": units.energy}
+            yield TEXTS.finding("WANDER", *run.own_end, key=run.cutoff_key, **values)
 
 
 def _cutoff(run: RunView) -> Iterator[Finding]:
     kind, force = run.cutoff.get("kind"), abs(float(run.cutoff.get("force_jump") or 0.0))
     jump, length = abs(run.jump), float(run.cutoff.get("radius") or 1.0)
     values = {"kind": kind, "force": force, "energy": run.units.energy, "length": run.units.length}
-    own = ["own"] * (not run.cutoff_key)
+    own = run.own_end
     # rounding where a potential ends is no jump
     if kind and jump > NO_JUMP * run.thermal:
         share = jump / run.thermal if run.thermal > 0 else None

@@ -79,6 +79,11 @@ class RunView(View):
         given = self.system.get("cutoff") or {}
         return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
 
+    @property
+    def own_end(self) -> list[str]:
+        """The variant of a finding's remedy where no key of the system file moves the cutoff."""
+        return [] if self.cutoff_key else ["own"]
+
     @cached_property
     def thermal(self) -> float:
         """k_B T of the run's mean temperature, energy."""
