@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from mdnum.ranges import first_outside
+from mdnum.report.section import Table
+from mdnum.report.words import count, number
 
 Flips = Mapping[str, np.ndarray]
 
@@ -261,3 +265,23 @@ class Conservation:
         return cls(
             float(np.std(noise)) / moving, _BLOCKS * float(line[0]), _BLOCKS * float(covariance[0, 0]) ** 0.5
         )
+
+
+def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
+    """What quantities ask of a format, and the first steps at which narrower ones would not hold them.
+
+    Args:
+        label: of a quantity by its name.
+        tables: `step`, and at each of them the extremes of quantities (`ranges.columns`).
+    """
+    rows, forms = [], ("float32", "bfloat16", "float16")
+    held = ((table, key) for table in tables for key in table if "largest_" in key and np.any(table[key]))
+    for table, key in held:
+        step, most, least = table["step"], table[key], table[key.replace("largest", "smallest")]
+        cells = []
+        for form in forms:
+            found = first_outside(most, least, form).items()
+            told = (f"{how} at step {count(step[at])} ({number(value, 3)})" for how, (at, value) in found)
+            cells.append(", ".join(told) or "held")
+        rows.append((label(key.removeprefix("largest_")), np.max(most), np.nanmin(least), *cells))
+    return Table(("quantity", "largest", "smallest that is not 0", *forms), rows)

@@ -14,7 +14,7 @@ import numpy as np
 from ase import Atoms
 from ase.calculators.singlepoint import SinglePointCalculator
 
-from mdnum import provenance
+from mdnum import provenance, ranges
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.md import foreign
 from mdnum.numerics import Ledger
@@ -200,13 +200,20 @@ class Rollout:
 
     def _close_budget(self, segment: Segment, ledger: Ledger, interval: int) -> None:
         budget = self.done.budget
-        potential = segment.rows_of("potential")
         if budget.start is None:
-            budget.check(segment.first, segment.unsorted("x", 0), float(potential[0]))
+            self._examine(segment, 0, segment.start.v)
         budget.jumps += float(np.sum(ledger.jump))
         due = segment.first // interval != (segment.last + 1) // interval or segment.closes == "end"
-        if due:
-            budget.check(segment.last, segment.unsorted("x", segment.rows - 1), float(potential[-1]))
+        if due and segment.last:
+            # a step after which nothing is finite has the velocities of its row
+            v = segment.state.v if segment.closes != "blow-up" else segment.unsorted("v", segment.rows - 1)
+            self._examine(segment, segment.rows - 1, v)
+
+    def _examine(self, segment: Segment, row: int, v: Any) -> None:
+        step, x = segment.first + row, segment.unsorted("x", row)
+        numbers = self.done.budget.check(step, x, float(segment.rows_of("potential")[row]))
+        flat = {name: np.reshape(one, (1, -1)) for name, one in {"x": x, "v": v, **numbers}.items()}
+        self.folder.append("ranges", {"step": np.array([step]), **ranges.columns(flat)})
 
     def _save_frames(self, segment: Segment) -> None:
         if not self.save_every:

@@ -269,15 +269,16 @@ class EnergyBudget:
         jumps = bool(np.any(self.simulation.jumps()[0] != 0))
         return self.simulation.continuous if jumps else self.simulation
 
-    def check(self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float) -> float:
-        """Close the budget at one step; returns the deviation there.
+    def check(self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float) -> dict:
+        """Close the budget at one step; returns the numbers behind the energy there (`Simulation.numbers`).
 
         Args:
             step: the step.
             positions: wrapped positions at it, shape (atoms, 3).
             potential: potential energy that the run computed there.
         """
-        difference = potential - self._reference.energy(positions)
+        energy, numbers = self._reference.numbers(positions)
+        difference = potential - energy
         # a reference that is the system itself has the jumps, too
         jumps = 0.0 if self._reference is self.simulation else self.jumps
         if self.start is None:
@@ -286,7 +287,7 @@ class EnergyBudget:
         if abs(deviation) >= abs(self.residual):
             self.residual, self.step = deviation, step
         self.checks += 1
-        return deviation
+        return numbers
 
     @property
     def tolerance(self) -> float:
@@ -295,7 +296,7 @@ class EnergyBudget:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
         eps = 2 * unit_roundoff(self.simulation.policy.dtype("force"))
-        return 1e3 * eps * max(1.0, abs(self._reference.energy()))
+        return 1e3 * eps * max(1.0, abs(self._reference.numbers()[0]))
 
     @property
     def closes(self) -> bool:

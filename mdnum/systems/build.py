@@ -227,14 +227,20 @@ class Simulation:
         """`Evaluator.__call__` for one configuration, with a list of its own."""
         return Evaluator(self, skin=0.0)(positions, cell, stress)
 
-    def energy(self, positions: Float[np.ndarray, "atoms 3"] | None = None) -> float:
-        """The potential energy of one configuration alone, with a list of its own.
+    def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
+        """The potential energy of one configuration alone, with a list of its own, and the numbers behind it.
 
         Args:
-            positions: length; default the structure's.
+            positions: shape (atoms, 3), length; default the structure's.
+
+        Returns:
+            energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
+            type and largest of all, length², `pair`: bare energies at the smallest; 0 for none.
         """
         _, _, _, tables, x = Evaluator(self, skin=0.0)._sorted(positions, None)
-        return float(_total(self.force, x, tables))
+        bare = self.potential if self.pairwise else None
+        energy, found = _numbers(self.force, bare, self.cell, self.pair_types, x, tables)
+        return float(energy), found
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
@@ -535,5 +541,19 @@ def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool)
 
 
 @eqx.filter_jit
-def _total(force: PairForce | ManyBodyForce, x, tables: Tables):
-    return jnp.sum(force(x, tables, decisions=False).energy, dtype=jnp.float64)
+def _numbers(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, x, tables: Tables):
+    made, cell = force(x, tables, decisions=False), cell.astype(x.dtype)
+
+    def wider(found, group):
+        index, kind = group
+        d = cell.minimum_image(*(x[:, index] - x[:, None]))
+        r2, there = sum(c.astype(jnp.float64) ** 2 for c in d), index < x.shape[1]
+        of_type = there & (jnp.arange(types, dtype=jnp.uint8)[:, None, None] == (0 if kind is None else kind))
+        least = jnp.min(jnp.where(of_type, r2, jnp.inf), (1, 2))
+        return (jnp.minimum(found[0], least), jnp.max(r2, where=there, initial=found[1])), None
+
+    closest, furthest = jax.lax.scan(wider, (jnp.full(types, jnp.inf), jnp.zeros(())), tables.groups())[0]
+    pair = jnp.zeros(types) if bare is None else bare.evaluate(closest)[0]
+    closest, pair = (jnp.where(jnp.isinf(closest), 0.0, one) for one in (closest, pair))
+    found = {"force": made.force, "r2": jnp.append(closest, furthest), "pair": pair}
+    return jnp.sum(made.energy, dtype=jnp.float64), found

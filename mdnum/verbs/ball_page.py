@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball.limits import RANGES, first_outside
-from mdnum.report.analysis import margins_in_bounds
+from mdnum.report.analysis import margins_in_bounds, range_table
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
@@ -163,28 +162,10 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 def _ranges(view: BallView) -> Iterator[Any]:
     """What each quantity asks of a format, and the steps at which narrower ones would not hold it."""
-    series = view.table("steps")
-    held = [name for name in RANGES if f"largest_{name}" in series]
-    if not held:
-        return
-    rows = []
-    for name in held:
-        most, least = series[f"largest_{name}"], series[f"smallest_{name}"]
-        cells = []
-        for form in ("float32", "bfloat16", "float16"):
-            over, lost = first_outside(most, least, form)
-            told = [
-                f"{word} at step {count(at)}"
-                for word, at in (("overflows", over), ("lost", lost))
-                if at is not None
-            ]
-            cells.append(", ".join(told) or "held")
-        smallest = least[np.isfinite(least)]
-        rows.append(
-            (RANGES[name], float(np.max(most)), float(smallest.min()) if len(smallest) else None, *cells)
-        )
-    yield Table(("quantity", "largest", "smallest that is not 0", "float32", "bfloat16", "float16"), rows)
-    yield TEXTS("ranges")
+    table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
+    if table.rows:
+        yield table
+        yield TEXTS("ranges")
 
 
 def _solver_plot(view: BallView) -> Iterator[Plot]:

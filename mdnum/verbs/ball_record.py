@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball.exact import ExactImpact, ExactPenalty
-from mdnum.ball.limits import extremes
 from mdnum.ball.rollout import BallDifference, BallRun, residual_bound
 from mdnum.ball.step import Penalty, Projection
 from mdnum.ball.stopping import FixedCount, Reason
+from mdnum.ranges import columns
 from mdnum.systems import ball
 from mdnum.systems.build_ball import BallSimulation, BallVariant
 from mdnum.systems.load import BallSystem
@@ -67,12 +67,7 @@ def ranges(run: BallRun) -> dict[str, np.ndarray]:
     quantities = {"y": y, "v": v, "depth": depth}
     if isinstance(run.world.contact, Penalty):
         quantities["push"] = float(run.world.contact.k) * np.maximum(-y, 0.0)
-    found = {name: extremes(values) for name, values in quantities.items()}
-    return {
-        f"{which}_{name}": part
-        for name, both in found.items()
-        for which, part in zip(("largest", "smallest"), both, strict=True)
-    }
+    return columns(quantities)
 
 
 def contacts(run: BallRun) -> dict[str, np.ndarray]:

@@ -430,7 +430,8 @@ def _evidence(run: RunView) -> Iterator[str]:
     if beyond := summary.get("beyond_cutoff"):
         mean = float(np.mean(run.series["potential"])) / summary["atoms"]
         share = abs(beyond["energy"] / mean) if mean else None
-        yield TEXTS("beyond_cutoff", **beyond, share=share, unit=units.energy, pressure_unit=units.pressure)
+        said = {**beyond, "share": share, "unit": units.energy, "pressure_unit": units.pressure}
+        yield TEXTS("beyond_cutoff" if share else "beyond_cutoff_alone", **said)
 
 
 VERBS = {"md": Verb(judge, page, RunView, unfinished=True)}

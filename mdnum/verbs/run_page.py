@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import FolderError
+from mdnum.ranges import columns
 from mdnum.report import analysis
 from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
@@ -172,6 +173,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
         Section("Chatter and residence", list(_chatter(run))),
         Section("List health", list(_lists(run))),
         Section("Flips", list(_nearest(run))),
+        Section("Range of numbers", list(_ranges(run))),
         Section("Agreement with ASE", list(_ase(run))),
     ]
     return run.page(run.name, ", ".join(about), _keys(run), sections)
@@ -438,6 +440,15 @@ def _nearest(run: RunView) -> Iterator[Any]:
             Column("margin", flips["ratio"], "ratio", "÷ bound", digits=2),
         ),
     )  # fmt: skip
+
+
+def _ranges(run: RunView) -> Iterator[Any]:
+    """What the numbers ask of a format, and the steps at which narrower ones would not hold them."""
+    examined, series, units = run.table("ranges"), run.series, vars(run.units)
+    sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
+    sums["step"] = series["step"]
+    yield analysis.range_table(lambda name: TEXTS(f"range_{name}", **units), examined, sums)
+    yield TEXTS("ranges", examined=len(examined["step"]), steps=len(series["step"]))
 
 
 def _ase(run: RunView) -> Iterator[Any]:

@@ -51,7 +51,7 @@ def whole(path, tmp_path_factory):
 
 def assert_same(whole, other):
     """Everything that a run leaves, but for clocks."""
-    for name, but in (("series", ()), ("flips", ()), ("epochs", ("build_ms",))):
+    for name, but in (("series", ()), ("flips", ()), ("epochs", ("build_ms",)), ("ranges", ())):
         tables_equal(whole[1], other[1], name, but=but)
     a, b = whole[1].load_checkpoint(), other[1].load_checkpoint()
     for name in a:

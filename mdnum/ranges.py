@@ -1,0 +1,46 @@
+"""The range of numbers, and what narrower formats make of them; without jax."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+
+DTYPES = {name: np.dtype(name) for name in ("float16", "bfloat16", "float32", "float64")}
+
+
+def smallest(name: str) -> float:
+    """The smallest positive number that arithmetic keeps in a format."""
+    limits = ml_dtypes.finfo(DTYPES[name])
+    # XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32
+    return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
+
+
+def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Columns of a table from quantities by name, each of shape (rows, values).
+
+    `largest_NAME` is the largest magnitude of a row, `smallest_NAME` the smallest but 0 (NaN for none).
+    """
+    made = {}
+    for name, values in quantities.items():
+        size = np.abs(np.asarray(values, np.float64))
+        least = np.min(size, axis=1, initial=np.inf, where=size > 0)
+        made[f"largest_{name}"] = size.max(axis=1, initial=0.0)
+        made[f"smallest_{name}"] = np.where(np.isfinite(least), least, np.nan)
+    return made
+
+
+def first_outside(most: Any, least: Any, name: str) -> dict[str, tuple[int, float]]:
+    """The first rows whose numbers a format cannot hold, from the largest and the smallest of each row.
+
+    Returns:
+        row and number: the first that would be infinite ("overflows"), have fewer digits ("subnormal") or be
+        0 ("lost"); those that there are.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        high, low = (np.asarray(one).astype(DTYPES[name]).astype(np.float64) for one in (most, least))
+    lost, few = low < smallest(name), low < float(ml_dtypes.finfo(DTYPES[name]).smallest_normal)
+    hits = {"overflows": (most, np.isinf(high)), "subnormal": (least, few & ~lost), "lost": (least, lost)}
+    return {how: ((at := int(hit.argmax())), float(of[at])) for how, (of, hit) in hits.items() if hit.any()}
