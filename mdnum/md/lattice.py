@@ -45,6 +45,8 @@ from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_n
 
 #: Listed distances are below 2^30 spacings: three of their squares fit a 64-bit integer.
 REACH_BITS = 30
+# beyond all their squares, and with one of them subtracted still a 64-bit integer
+_NOWHERE = 2**62
 # steps of a thermal momentum, of a force of the scale of energy over the cutoff, and of that scale itself in
 # a system of at least so many atoms
 _MOMENTUM_BITS, _FORCE_BITS, _ENERGY_BITS = 44, 36, 48
@@ -420,8 +422,8 @@ class LatticeJudge(SlotJudge):
             whole = whole.astype(jnp.int32).astype(jnp.int64)
             squares.append(whole * whole)
         r2 = squares[0] + squares[1] + squares[2]
-        limit = of_type(self.value, types)
-        return d, r2, (r2 < limit) & (j < self.atoms), limit
+        limit = jnp.where(j < self.atoms, of_type(self.value, types), -_NOWHERE)
+        return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
         """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
@@ -437,7 +439,8 @@ class LatticeJudge(SlotJudge):
         """The pass's decisions, two groups to a byte."""
         unit = self.lattice.spacing * self.lattice.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
-        return Decisions(packed(halves), (closest.astype(jnp.float64) - 0.5) * unit)
+        margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)
+        return Decisions(packed(halves), margin)
 
 
 class LatticeForce(PairForce):

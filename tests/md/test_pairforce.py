@@ -336,7 +336,9 @@ def test_an_unknown_convention_is_refused():
         PairDecider((1.0,), "r3 <")
 
 
-@pytest.mark.parametrize("precision", [{}, dict.fromkeys(("state", "force", "decision"), "float32")])
+@pytest.mark.parametrize(
+    "precision", [{}, dict.fromkeys(("state", "force", "decision"), "float32"), {"state": "lattice"}]
+)
 def test_a_list_of_no_pair_has_no_nearest_one(precision):
     """The slots that fill a table up are near to no threshold, with forces and without."""
     atoms = Atoms("Ar3", [[0, 0, 0], [5, 0, 0], [0, 6, 0]], cell=[20] * 3, pbc=True)
