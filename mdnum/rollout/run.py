@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from ase import Atoms
 from ase.calculators.singlepoint import SinglePointCalculator
+from ase.stress import full_3x3_to_voigt_6_stress
 
 from mdnum import provenance, ranges
 from mdnum.errors import FolderError, InputError, NumericalError
@@ -31,7 +32,7 @@ from mdnum.rollout.summary import (
 )
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import Simulation, build, evaluate_listed
 from mdnum.systems.load import System, load
 
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -41,6 +42,7 @@ Shown = Callable[[Simulation, np.ndarray], None]
 # as long as several steps: there the steps in between are at least as many as these
 _BUDGET_CHECKS, _LARGE, _STEPS_OF_A_LARGE = 20, 10_000, 100
 _LOG_LINES = 50
+_LOG_HEADER = "    step       time      potential        kinetic          total  temperature     pairs  flips"
 # about the life of two lists: where frames are nearer, steps would be made twice for them too often
 _FRAMES_APART = 25
 
@@ -66,11 +68,7 @@ class _Progress:
     last: Any = None  # shape (3, atoms), on the device until somebody asks
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "tally": self.tally.to_dict(),
-            "health": self.health.to_dict(),
-            "budget": self.budget.to_dict(),
-        }
+        return {name: getattr(self, name).to_dict() for name in ("tally", "health", "budget")}
 
 
 @dataclass
@@ -218,22 +216,28 @@ class Rollout:
     def _save_frames(self, segment: Segment) -> None:
         if not self.save_every:
             return
-        energies = segment.rows_of("potential")
-        for row in range(segment.rows):
-            step = segment.first + row
-            if step % self.save_every == 0:
-                self.folder.append_frame(self._frame(segment, row, step, float(energies[row])))
+        rows = [row for row in range(segment.rows) if (segment.first + row) % self.save_every == 0]
+        tables = self.simulation.tables(segment.table) if rows else None
+        for row in rows:
+            self.folder.append_frame(self._frame(segment, row, tables))
 
-    def _frame(self, segment: Segment, row: int, step: int, energy: float) -> Atoms:
-        atoms: Atoms = self.simulation.system.atoms.copy()
+    def _frame(self, segment: Segment, row: int, tables: Any) -> Atoms:
+        step, simulation = segment.first + row, self.simulation
+        atoms: Atoms = simulation.system.atoms.copy()
         atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
         atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
         # ASE's trajectories drop arrays that they do not know
         atoms.info["images"] = segment.unsorted("images", row)
         atoms.info["step"] = step
-        atoms.info["time"] = step * self.simulation.system.spec.dynamics.timestep
-        # forces and stress are not among what the loop records
-        atoms.calc = SinglePointCalculator(atoms, energy=energy)
+        atoms.info["time"] = step * simulation.system.spec.dynamics.timestep
+        # the loop records no forces: they are worked out again, with its list and hence its decisions
+        made, _, virial = evaluate_listed(simulation.force, segment.rows_of("x")[row], tables, True)
+        forces = np.empty((len(atoms), 3))
+        forces[segment.table.order] = np.asarray(made.force).T
+        known = {"energy": float(segment.rows_of("potential")[row]), "forces": forces}
+        if atoms.cell.rank == 3 and atoms.pbc.any():
+            known["stress"] = full_3x3_to_voigt_6_stress(-np.asarray(virial) / simulation.cell.volume)
+        atoms.calc = SinglePointCalculator(atoms, **known)
         return atoms
 
     def _checkpoint(self, segment: Segment, *, force: bool) -> None:
@@ -260,13 +264,10 @@ class Rollout:
         so_far = np.cumsum(np.bincount(ledger.step - segment.first, minlength=segment.rows))
         flips = self.done.tally.entered + self.done.tally.left - len(ledger)
         every = max(1, self.steps // _LOG_LINES)
-        header = (
-            "    step       time      potential        kinetic          total  temperature     pairs  flips"
-        )
         for row in range(segment.rows):
             step = segment.first + row
             if step == 0:
-                self.folder.log(header)
+                self.folder.log(_LOG_HEADER)
             if step % every == 0 or step == self.steps:
                 self.folder.log(
                     log_line(self.simulation, segment, row, int(pairs[row]), flips + int(so_far[row]))

@@ -490,7 +490,7 @@ class Evaluator:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
         here, wrapped, table, tables, x = self._sorted(positions, cell)
-        result, bits, virial = _evaluate(here.force, x, tables, stress)
+        result, bits, virial = evaluate_listed(here.force, x, tables, stress)
         forces = np.empty((here.atoms, 3))
         forces[table.order] = np.asarray(result.force, np.float64).T
         energies = np.full(here.atoms, np.nan)
@@ -533,7 +533,7 @@ class Evaluator:
 
 
 @eqx.filter_jit
-def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool):
+def evaluate_listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool):
     """Forces, decisions, and the virial tensor sum r_ij ⊗ F_ij where the stress is needed."""
     result = force(x, tables, decisions=True)
     assert result.decisions is not None
