@@ -40,10 +40,10 @@ def layer() -> tuple[Simulation, tuple[Array, ...]]:
 
 
 class Order(Loss):
-    """Re(sum of conj(w) z) at the last step: with w = 1 and w = i, each part of a complex z."""
+    """Sum of w z at the last step, a complex number."""
 
     name = "order"
-    w: Array = eqx.field(kw_only=True)  # shape (2, 3): real and imaginary parts
+    w: Array = eqx.field(kw_only=True)  # shape (3,): which of the order parameters
     lattice: tuple[Array, ...] = eqx.field(kw_only=True)  # pairs, images, wave vectors
 
     def z(self, x: Array) -> Array:
@@ -54,8 +54,7 @@ class Order(Loss):
         return jnp.stack([jax.lax.complex(jnp.mean(jnp.cos(a)), jnp.mean(jnp.sin(a))) for a in angles])
 
     def observe(self, frame, origin, around):
-        z = self.z(frame.x)
-        return jnp.sum(self.w * jnp.stack([z.real, z.imag]))
+        return jnp.sum(self.w * self.z(frame.x))
 
 
 def cuts(z: np.ndarray, bound: float) -> Ledger:
@@ -70,17 +69,16 @@ def cuts(z: np.ndarray, bound: float) -> Ledger:
 def run() -> Demo:
     """Differentiate psi6 and S by epsilon in the dynamics; then |z| and arg z by themselves."""
     simulation, lattice = layer()
-    parts = [Order(w=w, lattice=lattice, first=STEPS) for w in jnp.eye(6).reshape(6, 2, 3)]
-    problems = [Problem(simulation, part, STEPS) for part in parts]
+    losses = [Order(w=w, lattice=lattice, first=STEPS) for w in jnp.eye(3, dtype=complex)]
+    problems = [Problem(simulation, loss, STEPS) for loss in losses]
     found = [value_and_grad(problem, [EPSILON], "symmetric")({}) for problem in problems]
-    seen = [[value for value, _ in found], [float(slope[EPSILON]) for _, slope in found]]
-    seen += [[p.value({EPSILON: 1 + h}) for p in problems] for h in (1e-5, -1e-5)]
-    z, dz, high, low = (np.array(one[:3]) + 1j * np.array(one[3:]) for one in seen)
+    z, dz = np.array([value for value, _ in found]), np.array([slope[EPSILON] for _, slope in found])
+    high, low = (np.array([p.value({EPSILON: 1 + h}) for p in problems]) for h in (1e-5, -1e-5))
     g = np.array([jax.grad(jnp.abs)(one) for one in jnp.asarray(z)])
     real = (np.abs(high) - np.abs(low)) / 2e-5
     off, wrong = (float(np.max(np.abs((one * dz).real / real - 1))) for one in (g, np.conj(g)))
     rows = [row for part in Engine(simulation, STEPS).segments() for row in np.array(part.rows_of("x"))]
-    peak = np.array([parts[0].z(row)[1] for row in np.array(rows)])
+    peak = np.array([losses[0].z(row)[1] for row in np.array(rows)])
     ledger = cuts(peak, float(gamma(1000, np.dtype(float))))
     phase, step = np.angle(peak) + ledger.jumps(STEPS).cumsum(), np.arange(STEPS + 1)
     turned, turns = float(phase[-1] - phase[0]) / (2 * np.pi), SPEED * DT * STEPS / A

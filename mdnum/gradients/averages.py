@@ -136,7 +136,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
             scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
             start = origin._replace(x=origin.x * length.astype(dtype), v=origin.v * length.astype(dtype))
             made = loss.observe(scaled, start, here)
-            parts = jax.tree.map(lambda a, b: jnp.sum(a * b), onto_total, made)
+            parts = jax.tree.map(lambda a, b: jnp.real(jnp.sum(a * b)), onto_total, made)
             return sum(jax.tree.leaves(parts), start=zero)
 
         value, (by_potential, by_virial, by_length) = jax.value_and_grad(term, argnums=(0, 1, 2))(

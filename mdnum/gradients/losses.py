@@ -17,13 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Inexact, Int
 
 from mdnum.errors import InputError
 from mdnum.registry import Registry
 
 if TYPE_CHECKING:
     from mdnum.systems.build import Simulation
+
+# why a complex loss is refused where a real one is needed, and what to do
+NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_grad, jnp.real or jnp.abs")
 
 
 class LossFrame(NamedTuple):
@@ -83,7 +86,7 @@ class Loss(eqx.Module):
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
         """What one frame adds: a pytree of arrays, differentiable in both frames; `origin` is step 0."""
 
-    def value(self, total: Any, frames: Int[Array, ""] | int) -> Float[Array, ""]:
+    def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
         """The number, from the sum of what was observed and the number of frames: the mean."""
         return total / frames
 
@@ -127,6 +130,20 @@ class Custom(Loss):
     @property
     def of_single_frames(self) -> bool:  # type: ignore[override]
         return self.single
+
+
+class ComplexPart(Loss):
+    """The real part of a factor times a complex loss: with -i its imaginary part."""
+
+    name = "part of a complex loss"
+    inner: Loss = eqx.field(kw_only=True)
+    factor: Complex[Array, ""] = eqx.field(kw_only=True)  # an array: one program for both parts
+    looks_at = property(lambda self: self.inner.looks_at)  # type: ignore[assignment]
+    observe = property(lambda self: self.inner.observe)  # type: ignore[assignment]
+
+    def value(self, total, frames):
+        made = self.inner.value(total, frames)
+        return jnp.real(self.factor.astype(made.dtype) * made)
 
 
 class FinalProjection(_OfLast):

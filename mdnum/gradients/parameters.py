@@ -384,16 +384,16 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
     """The simulation with other values of some parameters.
 
     Raises:
-        InputError: a value that is not finite, or of another shape.
+        InputError: a value that is not finite, complex, or of another shape.
     """
     for name, given in values.items():
-        one, new = parameter(simulation, name), np.asarray(given, np.float64)
-        if new.shape != one.value().shape or not np.isfinite(new).all():
+        one, new = parameter(simulation, name), np.asarray(given)
+        if new.shape != one.value().shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
-                f"{name}: shape {new.shape}, finite: {bool(np.isfinite(new).all())}; expected finite numbers "
-                f"of shape {one.value().shape}"
+                f"{name}: shape {new.shape}, {new.dtype}, finite: {bool(np.isfinite(new).all())}; expected "
+                f"finite numbers of shape {one.value().shape}, and none that is complex"
             )
-        simulation = one.changed(new)
+        simulation = one.changed(new.astype(np.float64))
     return simulation
 
 

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float
+from jaxtyping import Inexact
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.gradients import parameters
-from mdnum.gradients.losses import Loss, LossFrame
+from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
@@ -39,11 +39,13 @@ class Problem:
         simulation: the system as objects, its start included.
         loss: what is made of the trajectory.
         steps: last step.
+        parts: of a complex loss the problems of its real and imaginary parts; else empty.
     """
 
     simulation: Simulation
     loss: Loss
     steps: int
+    parts: tuple[Problem, ...] = field(default=(), init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if self.steps < 1:
@@ -57,34 +59,32 @@ class Problem:
         why = self.loss.reason_unavailable(around)
         if why is not None:
             raise InputError(f"the loss {self.loss.name} has no meaning here: {why}")
-        # a loss that is no real number is refused before anything is run
-        vector = jax.ShapeDtypeStruct((3, self.simulation.atoms), self.simulation.policy.dtype("state"))
-        number = jax.ShapeDtypeStruct((), np.float64)
-        shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
-        frame = LossFrame(*shapes)
+        # a loss that is no number is refused before anything is run
+        shape: Any = jax.ShapeDtypeStruct
+        vector = shape((3, self.simulation.atoms), self.simulation.policy.dtype("state"))
+        frame = LossFrame(shape((), np.int64), vector, vector, *[shape((), np.float64)] * 2)
         made = jax.eval_shape(
             lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), frame
         )
         if jax.tree.structure(made) != jax.tree.structure(0.0) or made.shape != ():
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
             raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
-        if not np.issubdtype(made.dtype, np.floating):
+        if not np.issubdtype(made.dtype, np.inexact):
             remedy = "A count has no gradient: make a float of it that varies smoothly"
-            if np.issubdtype(made.dtype, np.complexfloating):
-                remedy = (
-                    "Take its real part, its imaginary part or its modulus (jnp.real, jnp.imag, jnp.abs); "
-                    "dz is the gradient of the first plus i times that of the second"
-                )
-            raise InputError(f"the loss is of dtype {made.dtype}; expected a real number", remedy=remedy)
+            raise InputError(f"the loss is of dtype {made.dtype}; expected a float", remedy=remedy)
+        if np.issubdtype(made.dtype, np.complexfloating):
+            parts = (ComplexPart(inner=self.loss, factor=jnp.asarray(one)) for one in (1 + 0j, -1j))
+            object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
 
     def at(self, values: Values) -> Problem:
         """The same loss of a rollout with other parameters."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
-    def value(self, values: Values | None = None) -> float:
-        """The loss, of the run that the rollout makes."""
+    def value(self, values: Values | None = None) -> Any:
+        """The loss, of the run that the rollout makes: a float, or of a complex loss complex."""
         made = self.at(values or {})
-        return RunTape(made.simulation, made.loss, made.steps, budget=0).value
+        runs = (RunTape(one.simulation, one.loss, one.steps, budget=0) for one in made.parts or (made,))
+        return sum(factor * run.value for factor, run in zip((1, 1j), runs, strict=False))
 
     @property
     def jumps(self) -> bool:
@@ -99,7 +99,7 @@ class Gradient:
     Attributes:
         method: name of the method. description: which derivative this is, one sentence.
         value: the loss of the program that was differentiated.
-        gradient: derivative by full name of the parameter, of the shape of its value.
+        gradient: derivative by full name of the parameter, of the shape of its value; complex like the loss.
         notes: what must be known about a parameter, by name: no dependence, a missing term.
         details: plain values of the method: counts, errors, tables.
         kind: what was differentiated. depends: whether the run used each parameter, where that is known.
@@ -107,8 +107,8 @@ class Gradient:
 
     method: str
     description: str
-    value: float
-    gradient: dict[str, Float[np.ndarray, "..."]]
+    value: Any
+    gradient: dict[str, Inexact[np.ndarray, "..."]]
     notes: dict[str, str] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
     kind: Kind = "steps"
@@ -134,12 +134,20 @@ class Method:
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """The derivative by the named parameters.
+        """The derivative by the named parameters; a complex loss takes a run for each of its parts.
 
         Raises:
             InputError: it does not exist for this problem, or there is no such parameter.
         """
-        return self.differentiate(problem, self.check(problem, names), progress)
+        full = self.check(problem, names)
+        if not getattr(problem, "parts", ()):
+            return self.differentiate(problem, full, progress)
+        real, imag = (self.differentiate(part, full, progress) for part in problem.parts)
+        gradient = {name: np.asarray(real.gradient[name] + 1j * imag.gradient[name]) for name in full}
+        # what holds of both: that one part is constant is no note on the other
+        notes = dict(real.notes.items() & imag.notes.items())
+        told = {"notes": notes, "details": {"real": real.details, "imaginary": imag.details}}
+        return replace(real, value=real.value + 1j * imag.value, gradient=gradient, **told)
 
     def known(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
         """Full names of the parameters, of which there is none of another name."""
@@ -253,10 +261,12 @@ def value_and_grad(
 
     Returns:
         values by name (any of the names; the others stay as the system file has them) to (value, gradient by
-        name), spelled as they were asked for.
+        name), spelled as they were asked for. Of a complex loss z both are complex, and the derivative by a
+        real parameter p is dz/dp = d Re z/dp + i d Im z/dp, without a conjugate: d|z|² = 2 Re(conj(z) dz),
+        d arg z = Im(dz/z). It is no direction of descent; `mdnum grad` and `trust` take real losses only.
 
     Raises:
-        InputError: no such parameter or method, or it does not apply; the loss is not a scalar.
+        InputError: no such parameter or method, or it does not apply; a value is not real.
 
     Warns:
         UserWarning: a derivative that is exactly zero, with the reason.
@@ -288,7 +298,8 @@ def differentiable(
         watch: called with the whole gradient each time that one is worked out.
 
     Returns:
-        values by name to the loss, a float64 scalar. It runs outside of `jit` and `vmap`.
+        values by name to the loss, a scalar; of a complex one `jax.grad` takes real functions, as jnp.abs.
+        It runs outside of `jit` and `vmap`.
     """
     chosen, full = _chosen(problem, names, method)
 
@@ -302,7 +313,7 @@ def differentiable(
 
     @jax.custom_vjp
     def loss(values: Values) -> jax.Array:
-        return jnp.asarray(at(values).value(), jnp.float64)
+        return jnp.asarray(at(values).value())
 
     def forward(values: Values):
         found = _differentiated(chosen, at(values), full)
@@ -311,11 +322,13 @@ def differentiable(
         by_name = {}
         for name, value in values.items():
             derivative = found.gradient[parameters.resolve(problem.simulation, [name])[0]]
-            by_name[name] = jnp.asarray(derivative).astype(jnp.result_type(value))
-        return jnp.asarray(found.value, jnp.float64), by_name
+            dtype = np.promote_types(jnp.result_type(value), np.complex64)
+            by_name[name] = jnp.asarray(derivative).astype(dtype)
+        return jnp.asarray(found.value), by_name
 
     def backward(gradient, onto):
-        return (jax.tree.map(lambda one: onto.astype(one.dtype) * one, gradient),)
+        # the cotangent of x + iy is that of x minus i times that of y
+        return (jax.tree.map(lambda one: jnp.real(onto.astype(one.dtype) * one), gradient),)
 
     loss.defvjp(forward, backward)
     return loss
@@ -343,7 +356,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
         why = ""
         with suppress(InputError):
-            blamed = detective(problem, names, saltation=False)
+            blamed = detective((problem.parts or (problem,))[0], names, saltation=False)
             inputs = ", ".join(f"{one:.3g}" for one in blamed.inputs)
             if blamed.operation:
                 why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
@@ -366,5 +379,5 @@ def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str,
                 f"a value for {word}, which the gradient was not asked for",
                 remedy=f"Name it among the parameters; they are {', '.join(full)}",
             )
-        out[name] = np.asarray(value, np.float64)
+        out[name] = np.asarray(value)
     return out

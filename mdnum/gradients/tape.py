@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from mdnum.errors import NumericalError
-from mdnum.gradients.losses import Loss, LossContext, LossFrame
+from mdnum.gradients.losses import NOT_REAL, Loss, LossContext, LossFrame
 from mdnum.md.lattice import LatticeLangevin
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger
@@ -149,6 +149,8 @@ class RunTape:
         self.pace = pace_of(loss, steps)
         self.origin = frame_of_start(self.start, simulation)
         self.total: Any = no_sums(loss, self.origin, self.around)
+        if jnp.iscomplexobj(jax.eval_shape(lambda total: loss.value(total, 1), self.total)):
+            raise loss.wrong(*NOT_REAL)
         self.frames = self.held = 0
         self._recorder = PairRecorder(simulation) if flips else None
         # stretches that are kept; of others what it takes to run them again

@@ -139,7 +139,7 @@ def _problem(
 ) -> tuple[Problem, tuple[str, ...]]:
     """The problem and full names of the parameters: what is not possible is refused here."""
     from mdnum.gradients import Problem, parameters
-    from mdnum.gradients.losses import LOSSES, parse
+    from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
     from mdnum.systems import build
 
     if of is None:
@@ -150,7 +150,9 @@ def _problem(
     if not names:
         remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"
         raise InputError("no parameter to differentiate by", where=system.name, remedy=remedy)
-    return Problem(simulation, loss, last), parameters.resolve(simulation, names)
+    if (problem := Problem(simulation, loss, last)).parts:
+        raise loss.wrong(*NOT_REAL)
+    return problem, parameters.resolve(simulation, names)
 
 
 def plan(
