@@ -307,6 +307,47 @@ def test_findings_follow_the_numbers(tmp_path, changes, code, severity, values):
     assert {name: found[code].values[name] for name in values} == pytest.approx(values)
 
 
+def limited(share: float | None) -> dict[str, Any]:
+    """A judgment on one parameter: whether flips that were left out weigh in the derivative by it."""
+    values = {"count": 2, "first": 41, "share": share}
+    weighs = {"what": "flips left out", "horizon": 40, "reached": True, "code": "grazing", "values": values}
+    free = {"what": "near miss", "horizon": STEPS, "reached": False, "code": "no jump", "values": {}}
+    weigh = share != 0.0
+    return {
+        "verdict": "limited" if weigh else "trusted", "horizon": 40 if weigh else STEPS, "unknown": [],
+        "limited_by": "flips left out" if weigh else "", "limits": [weighs if weigh else free],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shares", "found"),
+    [
+        # of all flips' weight those left out have a sixth, of the derivative by one parameter nothing
+        ((0.0, 0.3), {RADIUS: 0.3}),
+        ((0.04, 0.3), {EPSILON: 0.04, RADIUS: 0.3}),
+        # a share of a derivative that is zero
+        ((None, 0.0), {EPSILON: None}),
+        ((0.0, 0.0), None),
+    ],
+)
+def test_flips_left_out_weigh_by_parameter(tmp_path, shares, found):
+    by = {name: limited(share) for name, share in zip((EPSILON, RADIUS), shares, strict=True)}
+    aware = {**AWARE, "details": {**DETAILS, "grazing": 2, "weight left out": 0.5}}
+    told = codes(tmp_path / "a", methods=[aware], trust={**TRUST, **by[RADIUS], "by": by})
+    assert ("GRAZING" in told) == (found is not None)
+    if found is not None:
+        assert told["GRAZING"].values["shares"] == found
+    # of a parameter of many entries, which is not judged, their weight alone is known
+    by[START] = {
+        **by[RADIUS],
+        "verdict": "undecided",
+        "unknown": ["parameters of many entries"],
+        "limits": [],
+    }
+    told = codes(tmp_path / "b", methods=[aware], trust={**TRUST, **by[RADIUS], "by": by})
+    assert told["GRAZING"].values["share"] == pytest.approx(0.5 / 3.1)
+
+
 def codes(path: Path, **changes: Any) -> dict[str, Any]:
     """Findings in a folder by their codes."""
     return {one.code: one for one in write(path, **changes).verdict.findings}

@@ -53,10 +53,10 @@ def many(value: float | None, noun: str, plural: str | None = None) -> str:
     return f"{count(value)} {noun if value == 1 else plural}"
 
 
-def percent(share: float) -> str:
-    """A share in percent, without a false 0 % or 100 %."""
-    if 0 < share < 0.001:
-        return "under 0.1 %"
+def percent(share: float | None) -> str:
+    """A share in percent, without a false 0 % or 100 %; None is what an infinite one becomes in a folder."""
+    if share is None or 0 < share < 0.001:
+        return "under 0.1 %" if share else "an unbounded share"
     if 0.999 < share < 1:
         return "over 99.9 %"
     return f"{100 * share:.1f} %" if 0 < share < 0.1 else f"{100 * share:.0f} %"

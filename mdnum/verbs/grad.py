@@ -612,9 +612,16 @@ def _of_flips(view: View) -> Iterator[Finding]:
             )  # fmt: skip
     details = (by(view.summary, "event-aware") or {"details": {}})["details"]
     left, applied = details.get("weight left out"), details.get("weight applied")
-    if left and applied is not None and left > _LEFT_OUT * (left + applied):
-        yield TEXTS.finding("GRAZING", section=section, grazing=details["grazing"],
-                            share=left / (left + applied), guard=details["guard"])  # fmt: skip
+    by_name = (view.summary.get("trust") or {}).get("by") or {}
+    met = [(name, x["values"]) for name, y in by_name.items() for x in y["limits"] if x["code"] == "grazing"]
+    shares = {name: values["share"] for name, values in met}
+    # where a parameter was not judged, only the weights are known
+    judged = by_name and all(one["limits"] for one in by_name.values())
+    if left and applied is not None and (shares or (not judged and left > _LEFT_OUT * (left + applied))):
+        each = listed([TEXTS("grazing_share", name=name, share=one) for name, one in shares.items()] or [""])
+        yield TEXTS.finding("GRAZING", *["by"] * bool(met), section=section, each=each, shares=shares,
+                            grazing=details["grazing"], guard=details["guard"],
+                            share=left / (left + applied))  # fmt: skip
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
