@@ -266,7 +266,7 @@ def test_plain_makes_json_of_what_a_run_holds():
         "a": np.float64("inf"), "b": np.arange(3), "c": Path("x"), "d": (True, None), "e": np.bool_(True)
     }  # fmt: skip
     assert plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
-    with pytest.raises(TypeError, match="object has no plain form"):
+    with pytest.raises(TypeError, match=r"object .*no plain form"):
         plain(object())
 
 
@@ -282,9 +282,9 @@ def test_help_says_when_a_check_exits_with_1(capsys: pytest.CaptureFixture[str])
     assert call("systems", "check", "--help") == 0
     assert "a warning exits with 1" in " ".join(capsys.readouterr().out.split())
     assert call("flips", "--help") == 0
-    assert "--drop-repeats Leave out frames that repeat an earlier frame" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    path = Path(output.__file__).with_name("options.toml")
+    text = tomllib.loads(path.read_text(encoding="utf-8"))["flips"]["drop_repeats"]
+    assert f"--drop-repeats {text}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_systems_are_shown_checked_and_copied(crystal: str, capsys: pytest.CaptureFixture[str]):

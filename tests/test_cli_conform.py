@@ -114,12 +114,12 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
         (("mine.py",), "Give mine.py:nearest_image"),
         (("empty.py:pairs",), "It has no function"),
         (("broken.py:pairs",), "(broken.py, line 1)"),
-        (("mine.py:np",), "neither a function nor an object with allocate and update"),
-        (("mine.py:without_pbc",), "cannot be called with (positions, cell, pbc, r_cut)"),
+        (("mine.py:np",), "mine.py:np … with allocate and update"),
+        (("mine.py:without_pbc",), "mine.py:without_pbc … with (positions, cell, pbc, r_cut)"),
         (("mine.py:Half",), "a class without update"),
         (("mine.py:Sized",), "Sized(size) cannot be called with ()"),
         (("mine.py:Sized(1, 2)",), "making it failed: TypeError"),
-        (("mine.py:Short",), ".update(positions) cannot be called with (positions, cell)"),
+        (("mine.py:Short",), ".update(positions) … with (positions, cell)"),
         (("mine.py:mask",), "ndarray of shape (3, 3), not (i, j)"),
         (("mine.py:returns_nothing",), "it returned None"),
         (("mine.py:needs_a_package",), "Run python3 -m pip install nowhere_to_be_found"),
@@ -131,7 +131,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
 def test_mistakes_are_one_line(mine: Path, arguments, part: str, capsys: pytest.CaptureFixture[str]):
     assert call("conform", *arguments) == 2
     line = capsys.readouterr().err
-    assert part in line and line.count("\n") == 1
+    assert all(each in line for each in part.split(" … ")) and line.count("\n") == 1
     assert not (mine / "runs").exists()
 
 
@@ -299,7 +299,7 @@ def test_a_refusal_that_depends_on_what_it_should_not_is_a_finding():
     """The order of atoms, or what was asked before; not another unit of length, nor other images."""
     _, findings = _judged(_refusing(lambda x, _: len(x) > 1 and x[0, 0] < x[-1, 0]), [_TWO, _THREE])
     assert findings["UNEVEN_REFUSALS"].severity == "warning"
-    assert findings["UNEVEN_REFUSALS"].values["how"] == "with its atoms in reverse order"
+    assert findings["UNEVEN_REFUSALS"].values["how"].endswith("in reverse order")
     asked = []
 
     def second(x, _):
@@ -307,14 +307,14 @@ def test_a_refusal_that_depends_on_what_it_should_not_is_a_finding():
         return len(asked) == 3  # the first finds out its conventions
 
     _, findings = _judged(_refusing(second), [_TWO, _THREE])
-    assert findings["UNEVEN_REFUSALS"].values["how"].startswith("when it is asked anew")
+    assert findings["UNEVEN_REFUSALS"].values["how"].endswith("asked anew")
     outside = once("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
     _, findings = _judged(_refusing(lambda x, _: x.max() > 4.0), [_TWO, outside])
     assert set(findings) == {"REFUSES"}  # and nothing uneven
-    assert "with its atoms wrapped into the box" in findings["REFUSES"].values["also"]
+    assert "wrapped into the box" in findings["REFUSES"].values["also"]
     far = once("far", "few", 8 * _TWO.stills[0].positions, 40.0, r_cut=8.0)
     _, findings = _judged(_refusing(lambda _, r_cut: r_cut > 4.0), [_TWO, far])
-    assert "with all lengths multiplied by 0.12" in findings["REFUSES"].values["also"]
+    assert "lengths multiplied by 0.12" in findings["REFUSES"].values["also"]
 
 
 _ENDS = """
@@ -616,8 +616,10 @@ def test_a_script_is_run_before_it_is_named(
     assert failure["script"] in finding["text"]
     asked = sum(row["asked"] for row in summary["areas"])
     wrong = sum(row["failed"] for row in summary["areas"])
-    right = f"{asked - wrong} of {asked} cases right; {wrong} ended the process."
-    assert summary["headline"] == f"hangs:{name}: {right}"
+    # right, of how many, and how many crashed
+    assert summary["headline"].startswith(f"hangs:{name}: ")
+    counts = re.findall(r"\b\d+\b", summary["headline"].replace(f"hangs:{name}", ""))
+    assert counts == [str(asked - wrong), str(asked), str(wrong)]
     script = mine / "out" / failure["script"]
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
     assert (done.returncode < 0) == reproduced and ("the list is right" in done.stdout) == (not reproduced)

@@ -138,11 +138,11 @@ def test_an_interval_is_a_key_and_two_numbers():
     [
         (("argon/crystal-108", "--vary", "vmap"), "mdnum fork processes"),
         (("argon/crystal-108", "--vary", "presicion"), "Did you mean precision"),
-        (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. There are precision, reduction,"),
-        (("ball/drop", "--vary", "zzz"), "There are precision, reduction, order, stop, max_iter, contact,"),
+        (("argon/crystal-108", "--vary", "zzz"), "'zzz'. There are precision, reduction,"),
+        (("ball/drop", "--vary", "zzz"), " reduction, order, stop, max_iter, contact,"),
         (("argon/crystal-108", "--along", "sigma=1:2"), "`mdnum fork map SYSTEM KEY=LOW:HIGH`"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
-        (("forecast", "ball/drop", "1e-6"), "the margin that mdnum ball records"),
+        (("forecast", "ball/drop", "1e-6"), "that mdnum ball records"),
         (("processes", "ball/drop"), "mdnum ball --demo determinism"),
         (("benign", "ball/drop", "start"), "no ensemble"),
         (("map", "argon/crystal-108", "sigma"), "KEY=LOW:HIGH"),
@@ -150,7 +150,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("map", "ball/drop", "k=2:1"), "nothing between 2.0 and 1.0"),
         (("processes", "silicon/tersoff-512"), "many-body"),
         (("certify", "silicon/tersoff-512", "--steps", "2"), "Lennard-Jones"),
-        (("certify", "ball/zeno"), "more than sums and products"),
+        (("certify", "ball/zeno"), "sums and products"),
         (("ball/drop", "--vary", "start", "--minimal"), "contact=STEP:BALL"),
     ],
 )

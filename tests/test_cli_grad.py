@@ -36,17 +36,17 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
         ((WELL, "--of", "msd", "--wrt", "sigma,seed"), "nothing is differentiable by dynamics.seed"),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--methods", "symetric"), "Did you mean symmetric?"),
         ((WELL, "--of", "pressure", "--wrt", "sigma"), "has no meaning here"),
-        ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "looks at no step up to 8"),
+        ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "no step up to 8"),
         ((WELL, "--of", "potential:evry=2", "--wrt", "sigma"), "write for example potential:every=10"),
         ((WELL, "--of", "potential:every=x", "--wrt", "sigma"), "not a whole number"),
         (
             ("silicon/tersoff-512", "--of", "msd", "--wrt", "r_cut"),
             "no parameter 'r_cut'. There are potential.A,",
         ),
-        ((WELL, "--of", "msd", "--wrt", "sigma", "--also", "spektrum"), "There are spectrum, edges, scaling"),
+        ((WELL, "--of", "msd", "--wrt", "sigma", "--also", "spektrum"), "are spectrum, edges, scaling"),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--replicas", "1"), "takes at least 2"),
         (("ball/drop", "--replicas", "3"), "--methods randomized"),
-        (("ball/drop", "--also", "edges"), "this system is a ball"),
+        (("ball/drop", "--also", "edges"), "system is a ball"),
         (("ball/drop", "--of", "msd"), "There are final-height,"),
         (("ball/drop", "--wrt", "restitution"), "There are k, damping,"),
         (("ball/drop", "--methods", "symmetric"), "no gradient 'symmetric'"),
@@ -72,7 +72,7 @@ def test_names_of_losses_take_numbers():
     Problem(simulation, curve, 100)
     late: Any = parse("diffusion-green-kubo:every=7", simulation, 100)
     assert late.until == 98
-    with pytest.raises(InputError, match="no number of the loss msd"):
+    with pytest.raises(InputError, match=r"'bins=3' .*loss msd.*msd:every=10"):
         parse("msd:bins=3", simulation, 100)
     assert grad.words(["a,b", "b, c,"]) == ("a", "b", "c")
     units = {
@@ -378,15 +378,15 @@ def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("trust", "tone", "words"),
     [
-        (TRUST, "warning", "not trusted beyond step 300: near miss"),
-        (open_trust("time step", unknown=("other starts",)), "warning", "undecided, other starts not known"),
+        (TRUST, "warning", "not trusted … 300: near miss"),
+        (open_trust("time step", unknown=("other starts",)), "warning", "undecided, other starts"),
         ({**TRUST, "verdict": "trusted", "limited_by": ""}, "good", "; trusted."),
         (None, "info", "= 2.000 σ²/σ and"),
     ],
 )
 def test_trusted_is_the_word_where_all_of_it_was_examined_alone(tmp_path, trust, tone, words):
     verdict = write(tmp_path / "one", trust=trust).verdict
-    assert verdict.tone == tone and words in verdict.headline
+    assert verdict.tone == tone and all(part in verdict.headline for part in words.split(" … "))
 
 
 def test_every_parameter_has_a_verdict_of_its_own(tmp_path):

@@ -63,7 +63,7 @@ def write(folder: Path, text: str, **files: str) -> Path:
         ("steps = 4", "steps = " + "[" * 50_000 + "]" * 50_000, "nested more than 20 deep"),
         ("steps = 4", "steps = " + "9" * 5000, "not TOML"),
         ("steps = 4", "steps = 9223372036854775808", "at most 2^62"),
-        ("timestep = 0.002", "timestep = 1e-300", "timestep = 1e-300; expected 0 or a size from 1e-150"),
+        ("timestep = 0.002", "timestep = 1e-300", "timestep = 1e-300; expected 0 … from 1e-150"),
         ("sigma = 3.405", "sigma = 1e-300", "sigma = 1e-300"),
     ],
 )
@@ -72,7 +72,8 @@ def test_sizes_and_values_that_mean_nothing(campaign: Any, tmp_path: Path, old: 
     path = write(tmp_path, campaign.ATOMS.replace(old, new), atoms=campaign.STRUCTURE.replace(old, new))
     with pytest.raises(InputError) as refused:
         load(path)
-    assert words in str(refused.value) and len(str(refused.value)) < 1000
+    said = str(refused.value)
+    assert all(part in said for part in words.split(" … ")) and len(said) < 1000
 
 
 def test_a_small_sigma_and_a_wide_box_are_searched_for_overlaps(campaign: Any, tmp_path: Path):

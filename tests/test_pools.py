@@ -36,7 +36,7 @@ def work(name):
         if name == "ball":
             return mdnum.bounce("ball/drop", steps=5, out="ball", report=False).summary["status"]
         if name == "raises":
-            raise mdnum.errors.CapacityError("no room", remedy="Make some", where="here")
+            raise mdnum.errors.CapacityError("full", remedy="Wait", where="here")
         return mdnum.build("argon/crystal-108").evaluate().energy
     except MdnumError as error:
         if name == "raises":
@@ -88,7 +88,7 @@ def test_a_worker_of_its_own_computes_and_its_errors_arrive(tmp_path, start, pre
         pytest.skip("no fork on this system")
     energy, error = answers(tmp_path, start, prepared, "build", "raises")
     assert float(energy) < 0
-    assert error == "raised here: no room. Make some."
+    assert error == "raised here: full. Wait."
 
 
 KINDS = [errors.InputError, errors.FolderError, errors.CapacityError, errors.NumericalError]

@@ -419,7 +419,7 @@ def test_a_name_is_not_taken_from_a_file_or_a_link(tmp_path):
     (tmp_path / "x-1").write_text("")
     (tmp_path / "x-2").symlink_to("nowhere")
     assert files.default_folder("x", tmp_path).name == "x-3"
-    with pytest.raises(FolderError, match="a file of this name is there"):
+    with pytest.raises(FolderError, match=r"x-1.*file of this name"):
         files.default_folder("x", tmp_path / "x-1")
 
 
@@ -448,7 +448,7 @@ def test_changed_folder_is_not_resumed(tmp_path):
     with pytest.raises(FolderError, match=r"series-000000000010\.parquet: is missing"):
         RunFolder.open(folder.path).resume()
     (folder.path / "manifest.json").unlink()
-    with pytest.raises(FolderError, match="rows 10 to 19 of table 'series' are missing"):
+    with pytest.raises(FolderError, match=r"10 to 19 .*'series' are missing"):
         RunFolder.open(folder.path).resume()
 
 
@@ -459,7 +459,7 @@ def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
     assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
                                                                      "d": [True, None]}  # fmt: skip
     assert folder.provenance == {}
-    with pytest.raises(FolderError, match="no checkpoint to resume from"):
+    with pytest.raises(FolderError, match="run: has no checkpoint"):
         folder.load_checkpoint()
     (folder.path / "checkpoint.npz").write_bytes(b"PK nonsense")
     with pytest.raises(FolderError, match=r"checkpoint\.npz"):

@@ -80,7 +80,7 @@ def led_out(path: Path, link=os.symlink) -> Path:
 def test_what_is_written_in_place_is_not_written_through_a_link(killed, name, link):
     target = led_out(killed / name, link)
     before = target.read_bytes()
-    with pytest.raises(FolderError, match=rf"{name}: (is a link|has a second name)"):
+    with pytest.raises(FolderError, match=rf"{name}: .*(link|second name)"):
         RunFolder.open(killed).resume()
     assert target.read_bytes() == before
     # and nothing of the run was dropped for it
@@ -141,7 +141,7 @@ def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     state, store = checkpoint.read(killed / "checkpoint.npz")
     (killed / "manifest.json").unlink()
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
-    with pytest.raises(FolderError, match="counts what no folder of mdnum has"):
+    with pytest.raises(FolderError, match=r"checkpoint\.npz: counts what no folder"):
         RunFolder.open(killed).resume()
     assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
 
@@ -167,7 +167,7 @@ def test_a_flipped_bit_is_told_with_what_is_left(finished, name):
     (finished / name).write_bytes(data)
     folder = RunFolder.open(finished)
     assert list(folder.damaged()) == [name]
-    with pytest.raises(FolderError, match=rf"{name}: is damaged.*epochs\.parquet.* can still be read"):
+    with pytest.raises(FolderError, match=rf"{name}: is damaged.*; .*epochs\.parquet.* read"):
         folder.resume() if name == "checkpoint.npz" else folder.summary and folder.read(Path(name).stem)
     assert len(folder.read("epochs")["epoch"]) == 4
 
@@ -193,7 +193,7 @@ def test_what_is_gone_or_foreign_is_told(finished):
         RunFolder.open(finished).read("epochs")
     (finished / "manifest.json").unlink()
     pq.write_table(pa.table({"step": ["a", "b"]}), finished / "series.parquet")
-    with pytest.raises(FolderError, match=r"is not a table of series \(column 'step' holds string\)"):
+    with pytest.raises(FolderError, match=r"series\.parquet: .* series \(column 'step' .*string\)"):
         RunFolder.open(finished).read("series")
     for text in ("[]", "3", "[" * 50_000, "\x00"):
         (finished / "summary.json").write_text(text)
@@ -267,7 +267,7 @@ def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, 
     started.write_provenance({})
     started.log("compile")
     started.close()
-    with pytest.raises(FolderError, match="Nothing of it was kept: give the `mdnum run` command again"):
+    with pytest.raises(FolderError, match=r"Nothing .*`mdnum run` command again"):
         RunFolder.open(started.path).resume()
     (started.path / "mine.md").write_text("mine")
     with pytest.raises(FolderError, match="already holds a run"):
@@ -303,7 +303,7 @@ def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch, wo
         folder.append("series", series_rows(steps, steps + 10))
     with monkeypatch.context() as patch:
         patch.setattr(atomic.os, "fsync", full)
-        with pytest.raises(FolderError, match=f"the disk is full. Free some space, then {advice}"):
+        with pytest.raises(FolderError, match=f"disk is full.*, then {advice}"):
             folder.checkpoint(state_at(30), force=True)
     assert not list(folder.path.rglob("*.part"))
     folder.close()
@@ -462,7 +462,7 @@ def test_scripts_of_a_person_stay(tmp_path):
 @pytest.mark.parametrize(
     ("world", "state", "advice"),
     [
-        ("fork", None, "Nothing of it was kept: give the `mdnum fork` command again"),
+        ("fork", None, "Nothing .*`mdnum fork` command again"),
         ("audit", "answers.json", "Continue it with `mdnum audit --resume"),
         ("conform", "answers.json", "Continue it with `mdnum conform --resume"),
     ],
@@ -475,7 +475,7 @@ def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, sta
     folder.close()
     if state is not None:
         (folder.path / state).write_text("{}")
-    with pytest.raises(InputError, match=f"is the folder of `mdnum {world}`, and no run. {advice}"):
+    with pytest.raises(InputError, match=f"folder of `mdnum {world}`.* {advice}"):
         run(None, resume=folder.path)
 
 
@@ -512,7 +512,7 @@ def test_a_table_that_unpacks_to_more_than_any_is_refused_from_its_head(finished
     zeros(finished)
     monkeypatch.setattr(tables, "_MOST_UNPACKED", 1 << 20)
     monkeypatch.setattr(pq.ParquetFile, "read_row_group", None)
-    with pytest.raises(FolderError, match=r"bytes claim to hold 120,000,000, which no table"):
+    with pytest.raises(FolderError, match=r"series\.parquet: .*bytes claim to hold 120,000,000"):
         RunFolder.open(finished).read("series")
 
 

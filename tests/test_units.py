@@ -17,5 +17,5 @@ def test_metal_is_ase_and_reduced_units_are_all_one():
     a = ase.units._e / 1e-10 / ase.units._amu
     assert 0.5 * metal.time_factor**2 == pytest.approx(0.5 * a * 1e-24 / 1e-10, rel=1e-12)
     assert lj.time_factor == lj.pressure_factor == lj.k_B == 1.0
-    with pytest.raises(InputError, match="unknown units 'real'; known are metal, lj"):
+    with pytest.raises(InputError, match=r"units 'real'; .* metal, lj"):
         units.get("real")

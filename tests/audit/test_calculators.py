@@ -70,19 +70,19 @@ def test_a_system_brings_its_structure_and_temperature():
         ("", "no calculator named"),
         ("nonesuch.package:Thing", "No module named 'nonesuch'"),
         ("ase.calculators.emt:Emt", "Did you mean EMT"),
-        ("ase.calculators.emt.EMT", "put a colon before its name: ase.calculators.emt:EMT"),
+        ("ase.calculators.emt.EMT", "ase.calculators.emt:EMT"),
         ("ase.calculators.emt:EMT(a=open('x'))", "not a literal"),
         ("ase.calculators.lj:LennardJones(rc=-(-8.5))", "not a literal"),
         ("ase.calculators.emt:EMT(**{})", "cannot be used here"),
         ("ase.calculators.emt:EMT().results", "only a name"),
-        ("ase.calculators.emt:EMT(", "not a name with arguments"),
+        ("ase.calculators.emt:EMT(", "a name with arguments"),
         ("ase.calculators.lj:LennardJones(3)", "making it failed: TypeError"),
-        ("ase.calculators.tersoff:Tersoff", "Give the arguments it needs"),
+        ("ase.calculators.tersoff:Tersoff", "Class(argument=value)"),
         ("ase.build:molecule('H2O')", "not an ASE calculator"),
         ("argon/crystl-108", "Did you mean argon/crystal-108"),
         ("none.py", "no such file"),
         ("{folder}/fails.py", "ZeroDivisionError"),
-        ("{folder}/empty.py", "no calculator or calc or make"),
+        ("{folder}/empty.py", "or calc or make"),
     ],
 )
 def test_a_mistake_says_what_to_write(words: str, message: str, tmp_path: Path):
@@ -129,9 +129,9 @@ def test_the_last_bit_of_a_coordinate_is_a_new_question():
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        ({"energy": float("nan")}, "gave an energy of nan"),
+        ({"energy": float("nan")}, "energy of nan"),
         ({"energy": [1.0, 2.0]}, "not one number"),
-        ({"raises": ValueError("no such element")}, "raised ValueError.*no such element"),
+        ({"raises": ValueError("no such element")}, "ValueError.*no such element"),
         ({"forces": [[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]}, "on atom 1"),
         ({"forces": [[0.0, 0.0, 0.0]]}, r"shape \(1, 3\) for 2 atoms"),
     ],
@@ -229,9 +229,9 @@ def test_structures_from_files(tmp_path: Path):
     (tmp_path / "bad.extxyz").write_text("1\n\nAr 0 nan 0\n")
     for name, message in {
         "none.xyz": "no such", "bad.extxyz": "not finite",
-        "three.extxyz@9": r"@9: the file has no structure 9 \(it has 3\)",
-        "three.extxyz@-4": r"the file has no structure -4 \(it has 3\)",
-        "two.traj@2": r"the file has no structure 2 \(it has 2\)",
+        "three.extxyz@9": r"@9: .*no structure 9 .*3\)",
+        "three.extxyz@-4": r"no structure -4 .*3\)",
+        "two.traj@2": r"no structure 2 .*2\)",
     }.items():  # fmt: skip
         with pytest.raises(InputError, match=message):
             read_structure(tmp_path / name)

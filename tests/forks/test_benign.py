@@ -139,7 +139,7 @@ def test_what_cannot_be_judged_is_refused(hot):
         ("members = 5 are too few", lambda: calibrate(hot, members=5)),
         ("steps = 0", lambda: calibrate(hot, steps=0)),
         ("tries = 0", lambda: calibrate(hot, tries=0)),
-        ("no planted change must fail", lambda: calibrate(hot, steps=100, changes=harmless)),
+        ("no planted change", lambda: calibrate(hot, steps=100, changes=harmless)),
     ):
         with pytest.raises(InputError, match=message):
             call()
@@ -159,7 +159,7 @@ def test_the_latest_clear_window_is_chosen():
     faint, blind = window(600, 1.5, 0.5), window(1000, 0.7, 0.5)
     assert choose([early, good, late, faint, blind], "it") is late
     assert choose([early, faint, blind], "it") is faint
-    with pytest.raises(InputError, match="cannot be told from rounding after 100, 1000 steps"):
+    with pytest.raises(InputError, match=r"^it: .*rounding after 100, 1000 steps"):
         choose([early, blind], "it")
 
 

@@ -66,9 +66,9 @@ def test_every_shipped_choice_is_parsed_from_its_name(world: str):
         ("skn", "Did you mean skin"),
         ("nonsense", "lists all"),
         ("vmap", "fork processes"),
-        ("precision.mass", "no role 'mass'; there are state, force, decision, accumulate"),
+        ("precision.mass", "'mass'.* state, force, decision, accumulate"),
         ("precision=half", "known are float64, float32, float16, bfloat16"),
-        ("format=coo", "no format 'coo'; there are dense, sparse, ordered-sparse"),
+        ("format=coo", "'coo'.* dense, sparse, ordered-sparse"),
         ("reduction=karatsuba", "no reduction 'karatsuba'"),
         ("order@karatsuba", "no reduction 'karatsuba'"),
         ("order=", "no choice"),
@@ -78,7 +78,7 @@ def test_every_shipped_choice_is_parsed_from_its_name(world: str):
         ("start=3:5:1", "coordinate 5"),
         ("start=0:mass", "not a whole number"),
         ("start=1:2:3:4", "which:what:ulps"),
-        ("skin=-1", "expected a length of 0 or more"),
+        ("skin=-1", "skin = -1.*0 or more"),
         ("skin=wide", "not a number"),
         ("rebuild=never", "no rule 'never'"),
         ("rebuild=every:0", "every 0 steps"),
@@ -105,10 +105,10 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, message: s
 @pytest.mark.parametrize(
     ("name", "word", "reason"),
     [
-        (CRYSTAL, "noise", "no noise at constant energy"),
+        (CRYSTAL, "noise", "no noise"),
         (CRYSTAL, "contact=earlier", "a choice of a ball"),
         (CRYSTAL, "precision.arithmetic", "no role arithmetic"),
-        (CRYSTAL, "precision.state=bfloat16", "cannot be the state of molecular dynamics: a step moves"),
+        (CRYSTAL, "precision.state=bfloat16", "a step moves"),
         (CRYSTAL, "precision.decision=float16", "their grid would decide"),
         (CRYSTAL, "precision.accumulate=bfloat16", "small ones are lost"),
         ("silicon/tersoff-512", "reduction=exact", "one order"),
@@ -129,7 +129,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, message: s
         ("silicon/tersoff-512", "energy-shift", "carries its own cutoff"),
         (BATH, "relabel", "belongs to labels"),
         (BATH, "rotate", "belongs to axes"),
-        (TILTED, "rotate=yzx", "not the same with axes yzx in place of xyz"),
+        (TILTED, "rotate=yzx", "axes yzx"),
     ],
 )
 def test_a_choice_that_does_not_apply_has_a_reason(name: str, word: str, reason: str):

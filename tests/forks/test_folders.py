@@ -113,7 +113,7 @@ def test_other_systems_are_refused_by_what_differs(folders, tmp_path):
     copied(folders["plain"], other)
     system = (other / "system.toml").read_text()
     (other / "system.toml").write_text(system.replace('"lennard-jones"', '"soft-sphere"'))
-    with pytest.raises(InputError, match=r"potential\.kind is lennard-jones in the first and soft-sphere"):
+    with pytest.raises(InputError, match=r"potential\.kind .*lennard-jones .*soft-sphere"):
         compare_folders(folders["plain"], other)
     (other / "system.toml").write_text(system)
     structure = (other / "structure.extxyz").read_text()
@@ -134,9 +134,7 @@ def test_fork_folders_are_told_from_runs(folders, tmp_path):
     answered.mkdir()
     (answered / "summary.json").write_text(json.dumps({"world": "fork", "question": "along"}))
     for pair in ((folders["plain"], answered), (answered, folders["plain"])):
-        with pytest.raises(
-            InputError, match=r"answered: this is a fork folder.* Give two folders of `mdnum run`"
-        ):
+        with pytest.raises(InputError, match=r"answered: .*fork folder.* `mdnum run`"):
             compare_folders(*pair)
 
 

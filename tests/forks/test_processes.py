@@ -123,10 +123,10 @@ def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: System):
 def test_what_cannot_be_run_is_refused(crystal: System, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(InputError, match="many-body"):
         variants(load("silicon/tersoff-512", world="md"))
-    with pytest.raises(InputError, match="at least one step"):
+    with pytest.raises(InputError, match=r"steps = 0: .*one step"):
         variants(crystal, 0)
-    with pytest.raises(InputError, match="at least one step and one variant"):
+    with pytest.raises(InputError, match=r"steps = 10: .*one variant"):
         variants(crystal, 10, [])
     monkeypatch.setattr(processes, "_ask", lambda *_, **options: "no such flag")
-    with pytest.raises(MdnumError, match="no variant ran; 'bogus' said: no such flag"):
+    with pytest.raises(MdnumError, match=r"'bogus'.*: no such flag"):
         variants(crystal, 2, [Variant("bogus")])

@@ -82,7 +82,7 @@ def test_what_is_no_loss_or_cannot_be_traced_or_named_is_refused(problem):
         (lambda: value_and_grad(problem, ("seed",)), "seed"),
         (lambda: loss({"sigma": jnp.asarray(np.nan)}), "expected finite numbers"),
         (lambda: Problem(simulation, vector, STEPS), "shape \\(3,\\)"),
-        (lambda: Problem(simulation, count, STEPS), "int.*of it that varies"),
+        (lambda: Problem(simulation, count, STEPS), "int.*varies"),
     ):
         with pytest.raises(InputError, match=text):
             ask()

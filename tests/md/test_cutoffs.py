@@ -126,17 +126,17 @@ class Ramp(Cutoff):
 @pytest.mark.parametrize(
     ("cutoff", "message"),
     [
-        (claims("quintic", smoothness=5), "derivative 3 by r² jumps by .* at the onset.* smoothness is 5"),
-        (claims("cosine", smoothness=3), "derivative 2 by r² jumps by .* at the onset.* smoothness is 3"),
-        (claims("force-shifted", smoothness=2), "derivative 2 by r² jumps by .* at r_cut"),
+        (claims("quintic", smoothness=5), "derivative 3 .* jumps .*onset.* smoothness .*5"),
+        (claims("cosine", smoothness=3), "derivative 2 .* jumps .*onset.* smoothness .*3"),
+        (claims("force-shifted", smoothness=2), "derivative 2 .* jumps .*at r_cut"),
         (claims("hard", smoothness=0), "energy jumps by .* at r_cut"),
-        (claims("shifted", smoothness=-1), "smoothness is -1, and its energy does not jump"),
-        (claims("quintic", smoothness=1), "smoothness is 1, and its derivative 2 by r² does not jump"),
+        (claims("shifted", smoothness=-1), "smoothness .*-1, .*energy .*not jump"),
+        (claims("quintic", smoothness=1), "smoothness .*1, .*derivative 2 .*not jump"),
         (claims("hard", energy_jump=lambda self, at: 0 * at.energy), "energy_jump is 0, .* is 0.25"),
         (claims("hard", force_jump=lambda self, at: 0 * at.slope), "force_jump is -?0, .* is 0.25"),
         (claims("hard", force_jump=lambda self, at: at.slope), "force_jump is -0.25, .* is 0.25"),
-        (type("Kinked", (Ramp,), {"smoothness": 1}), "slope jumps by .* at the onset"),
-        (type("Half", (Ramp,), {"share": 0.5}), "energy jumps by .* at the onset"),
+        (type("Kinked", (Ramp,), {"smoothness": 1}), "slope jumps .*onset"),
+        (type("Half", (Ramp,), {"share": 0.5}), "energy jumps .*onset"),
     ],
 )
 def test_a_cutoff_that_claims_what_it_is_not_is_refused(cutoff, message):

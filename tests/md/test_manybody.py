@@ -249,7 +249,7 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: made_eam(COPPER, ["Cu", "Al"]), "a table for Cu, but the structure holds Al"),
+        (lambda: made_eam(COPPER, ["Cu", "Al"]), "table for Cu, .*holds Al"),
         (lambda: made_eam(COPPER.with_name("none.alloy")), "no such potential table"),
         (lambda: manybody.tersoff("Ge"), "known are Si and Si-1989"),
         (lambda: manybody.stillinger_weber("Ge"), "known is Si"),
@@ -312,7 +312,7 @@ def test_an_energy_function_that_ignores_the_cell_is_found_out():
     atoms, energy_fn = argon_of_jax_md(space.periodic(jaxmd.scalar(3 * 5.26))[0])
     potential = manybody.from_jax_md(energy_fn, 6.5, "dense", name="boxed")
     neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions)
-    with pytest.raises(InputError, match="boxed: the energy function ignores the cell"):
+    with pytest.raises(InputError, match=r"boxed: .* ignores the cell"):
         potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
 
 

@@ -141,7 +141,7 @@ def test_what_is_rounded_has_the_derivative_of_what_is_not():
     slope = jax.vmap(jax.grad(lambda x: rounded(law, zero)(x)))(x)
     assert np.allclose(np.asarray(slope, np.float64), [1.0, 2.5 * 2.0**1.5, 20.0], rtol=2e-2)
     loop = rounded(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: y * y, x), zero)
-    with pytest.raises(TypeError, match="cannot be run operation by operation"):
+    with pytest.raises(TypeError, match=r"^(while|scan) .*operation"):
         loop(x)
 
 

@@ -262,9 +262,9 @@ def test_a_sum_of_nothing_is_zero_and_of_one_term_that_term():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("kahn", "no reduction 'kahn'.*Did you mean kahan"),
+        ("kahn", "'kahn'.*mean kahan"),
         ("exact:3", "'exact' takes no argument"),
-        ("permuted:x", "'x' is not a whole number"),
+        ("permuted:x", "'x' .*whole number"),
         ("blocked:1", "width 1 adds nothing"),
     ],
 )
@@ -436,7 +436,7 @@ def test_what_has_no_history_is_refused():
         running_sum_table(np.zeros(0))
     with pytest.raises(InputError, match="not finite"):
         running_sum_table([1.0, math.inf])
-    with pytest.raises(InputError, match="no loop over the terms"):
+    with pytest.raises(InputError, match=r"^exact is no loop"):
         running_sum_table([1.0], BY_NAME["exact"])
 
 

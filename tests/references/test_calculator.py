@@ -114,8 +114,8 @@ def test_a_shipped_system_by_name_and_with_overrides():
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({}, "give either a system or a potential"),
-        ({"system": "argon/liquid-864", "potential": LENNARD_JONES}, "give either a system or a potential"),
+        ({}, "a system or a potential"),
+        ({"system": "argon/liquid-864", "potential": LENNARD_JONES}, "a system or a potential"),
         ({"potential": {"kind": "lennard-jones", "sigma": -1.0, "epsilon": 1.0}, "cutoff": WIDE}, "sigma"),
         ({"potential": LENNARD_JONES}, "cutoff"),
         (

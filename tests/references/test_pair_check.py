@@ -232,6 +232,7 @@ def test_searches_that_cannot_be_asked_have_a_reason():
     ghost = search(lambda *_: None, "no-such-distribution")
     asked = [Search(load("mdanalysis")), ghost, Search(load("vesin"))]
     report = check_pairs(make(atoms, LENNARD_JONES, HARD), searches=asked, effective=False)
-    assert [one.note for one in report.results] == ["no periodicity axis by axis", "not installed", ""]
+    limited, *others = [one.note for one in report.results]
+    assert limited.endswith("axis by axis") and others == ["not installed", ""]
     assert [one.verdict for one in report.results] == ["not asked", "not asked", "agrees"]
     assert report.ok and codes(report) == []

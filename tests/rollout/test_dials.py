@@ -103,10 +103,10 @@ SWITCHED = {"cutoff.kind": "switched", "cutoff.onset": 7.5}
         ("argon/crystal-108", {}, "r_cut", 3.0, "exceeds half"),
         ("argon/crystal-108", {}, "skin", 5.0, "half the smallest"),
         ("argon/crystal-108", {}, "dynamics.temperature", 1.0, "can be turned"),
-        ("argon/liquid-864", SWITCHED, "onset", 9.0, "not below the cutoff radius"),
+        ("argon/liquid-864", SWITCHED, "onset", 9.0, r"9\.0 is not below .*8\.5"),
         ("argon/liquid-864", SWITCHED, "radius", 7.0, "not above its onset"),
         ("argon/liquid-864", {}, "timestpe", 1.0, r"Did you mean dynamics\.timestep\?"),
-        ("binary/kob-andersen-1000", {}, "epsilon", 1.0, r"could be any of potential\.pairs\.\S+epsilon, "),
+        ("binary/kob-andersen-1000", {}, "epsilon", 1.0, r"any of potential\.pairs\.\S+epsilon, "),
     ],
 )
 def test_what_cannot_be_turned_is_refused(system, overrides, word, value, message):

@@ -79,9 +79,9 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
     [
         ("radius = 8.0", "radius = 8.0.1", 14, "not TOML … radius = 8.0.1"),
         ("[cutoff]", "[cutoff", 12, "not TOML"),
-        ("radius = 8.0", "radus = 8.0", 14, "unknown key 'radus' … [cutoff] … Did you mean radius?"),
-        ("[neighbors]", "[neighbours]", 16, "unknown key 'neighbours' … Did you mean neighbors?"),
-        ("radius = 8.0", "radius = 8.0\nonset = 7.0", 12, "onset has no meaning for the kind hard"),
+        ("radius = 8.0", "radus = 8.0", 14, "key 'radus' … [cutoff] … mean radius?"),
+        ("[neighbors]", "[neighbours]", 16, "unknown key 'neighbours' … mean neighbors?"),
+        ("radius = 8.0", "radius = 8.0\nonset = 7.0", 12, "onset … no meaning … hard"),
         ('units = "metal"', 'units = "real"', 2, 'units = "real" … "metal" or "lj"'),
         ('units = "metal"', "", None, "key 'units' missing … metal: Å"),
         ("sigma = 3.405", "sigma = -3.405", 9, "potential.sigma = -3.405 … above 0 … Å or σ"),
@@ -93,26 +93,26 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
             '"lennard-jones"',
             '"lenard-jones"',
             8,
-            "unknown potential kind … Did you mean lennard-jones? … eam",
+            "unknown … mean lennard-jones? … eam",
         ),
-        ('kind = "nve"', "", 19, "'kind' missing in [dynamics] … nve, langevin"),
+        ('kind = "nve"', "", 19, "'kind' missing … [dynamics] … nve, langevin"),
         (
             '"nve"',
             '"langevin"',
             19,
-            "key 'temperature' missing in [dynamics] … Something is wrong with dynamics.friction, too",
+            "'temperature' missing … [dynamics] … dynamics.friction, too",
         ),
         ("radius = 8.0", "radius = true", 14, "cutoff.radius = true … expected a number"),
         ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the radius"),
         ("radius = 8.0", "", 12, "[cutoff] … radius missing … in_sigma"),
         ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, "both given"),
         ("epsilon = 0.0103235", "", 7, "[potential] … epsilon missing"),
-        (CUTOFF, "", None, "[cutoff] missing … lennard-jones needs one"),
+        (CUTOFF, "", None, "[cutoff] missing … lennard-jones needs"),
         (LJ, 'kind = "tersoff"', 10, "[cutoff]"),
         (f"[structure]\n{FILE}", "", None, "table [structure] missing"),
         (FILE, 'file = "gone.extxyz"', None, "gone.extxyz: no such structure file"),
         ("[neighbors]", "[neighbors]\nrebuild = 5", 17, "neighbors.rebuild = 5 … a table"),
-        (OWN, f"{OWN}\npairs.ArKr = {PAIR}", None, "'ArKr' is not two species joined by a hyphen"),
+        (OWN, f"{OWN}\npairs.ArKr = {PAIR}", None, "'ArKr' … two species … hyphen"),
         (OWN, f"{OWN}\npairs.Ar-Kr = {PAIR}\npairs.Kr-Ar = {PAIR}", None, "are the same pair"),
         (OWN, f"{OWN}\npairs.Kr-Kr = {{ sgima = 1.0 }}", None, "unknown key 'sgima' in [potential.pair"),
         (FILE, FILE + "\nmasses = { Kr = 80.0 }", None, "structure.masses names Kr"),
@@ -133,7 +133,7 @@ def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | Non
         ("cutof.radius", "8", "--set cutof.radius:  … Did you mean cutoff?"),
         ("cutoff.kind", "swiched", "--set cutoff.kind … Did you mean switched?"),
         ("neighbors.skin", "wide", '--set neighbors.skin … "wide" … expected a number'),
-        ("about.me", "x", "about is a value and not a table"),
+        ("about.me", "x", "--set about.me … about is a value"),
         ("cutoff..radius", "8", "--set … is not a key"),
         ("dynamics.kind", "langevin", "key 'temperature' missing"),
         ("potential.kind", "morse", "depth … missing"),
@@ -192,19 +192,20 @@ def flatten(atoms: Atoms) -> None:
     ("damage", "words"),
     [
         (lambda atoms: place(atoms, _17=[0, np.nan, 0]), "atom 17 (Ar) has positions"),
-        (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), "1 more atoms are like it"),
+        (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), ", and 1 more atoms"),
         (lambda atoms: atoms.set_momenta([[np.nan] * 3] * len(atoms)), "atom 0 (Ar) has momenta"),
         (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å apart, closer than 1.362"),
         (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) are 0.1 Å apart"),
-        (lean, "half the smallest perpendicular width of the box (along a) is 8.02"),
-        (flatten, "the lattice vectors span no volume"),
+        (lean, "perpendicular width … (along a) is 8.02"),
+        (flatten, "vectors span no volume"),
     ],
 )
 def test_a_structure_that_cannot_be_simulated(folder: Path, damage, words: str):
     atoms = load(folder / "system.toml").atoms
     damage(atoms)
     change(folder, atoms)
-    assert words in refusal(folder)
+    said = refusal(folder)
+    assert all(word in said for word in words.split(" … ")), said
 
 
 def test_vectors_in_a_plane_are_refused_where_nothing_repeats(folder: Path):
@@ -245,7 +246,7 @@ pairs.Ar-Ar = { sigma = 3.4, epsilon = 0.01 }
 pairs.Kr-Ar = { sigma = 3.5, epsilon = 0.01 }
 """
     edit(folder, LJ, with_pairs)
-    assert "no constants for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
+    assert "constants for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
 
 
 def test_silicon_constants_for_argon(folder: Path):

@@ -110,7 +110,7 @@ def test_the_world_decides_what_is_loaded(files: dict[str, Path]):
     assert isinstance(load(files["penalty"]), BallSystem)
     assert isinstance(load(files["penalty"], world="ball"), BallSystem)
     assert isinstance(load("argon/crystal-108"), System)
-    with pytest.raises(InputError, match=r"this system is a ball\. Use `mdnum ball "):
+    with pytest.raises(InputError, match=r"is a ball\. .*`mdnum ball "):
         load(files["penalty"], world="md")
     with pytest.raises(InputError, match=r"molecular dynamics\. Use `mdnum run argon/crystal-108`"):
         load("argon/crystal-108", world="ball")
@@ -128,8 +128,8 @@ def test_the_world_decides_what_is_loaded(files: dict[str, Path]):
     ("old", "new", "line", "words"),
     [
         ("k = 1e4", "k = -1e4", 19, "contact.k = -10000.0 … above 0 … 1/s²"),
-        ("k = 1e4", "k = 1e4\nrestitution = 0.8", 20, "unknown key 'restitution' … Known keys are kind"),
-        ('kind = "penalty"', 'kind = "penality"', 18, "unknown contact kind … Did you mean penalty?"),
+        ("k = 1e4", "k = 1e4\nrestitution = 0.8", 20, "unknown key 'restitution' … keys … kind"),
+        ('kind = "penalty"', 'kind = "penality"', 18, "unknown contact … mean penalty?"),
         ('kind = "sine"', 'kind = "cosine"', 13, "unknown flight.control kind 'cosine' … constant, sine"),
         ("period = 2.0", "perod = 2.0", 15, "unknown key 'perod' in [flight.control] … period?"),
         ("spread = 0.1", "spread = 0.1\nspread_ulps = 1", 8, "both given"),
@@ -160,8 +160,8 @@ LEAST = "smallest usable tolerance is 8.9e-308"
         ("penalty", {"start.height": "[]"}, "start.height is an empty array"),
         ("penalty", {"start.height": "[1.0, 2.0, 3.0]"}, "start.spread has no meaning"),
         ("penalty", {"start.balls": "1"}, "start.spread of a single ball"),
-        ("penalty", {"start.boundary.terms": "4"}, "[start] has boundary and balls, spread"),
-        ("penalty", {"gradient.of": '["alpha"]'}, "names alpha, which penalty does not have … damping"),
+        ("penalty", {"start.boundary.terms": "4"}, "boundary and balls, spread"),
+        ("penalty", {"gradient.of": '["alpha"]'}, "names alpha … penalty … damping"),
         ("penalty", {"gradient.of": '["eps"]'}, "contact.eps = 0 is the sharp contact"),
         ("penalty", {"contact.kind": "impact", "gradient.of": '["k"]'}, "names k"),
         ("penalty", {"integrator.kind": "event-located"}, "integrator.kind:  … the contact is a penalty"),
@@ -174,27 +174,27 @@ LEAST = "smallest usable tolerance is 8.9e-308"
         ("penalty", {"precision.arithmetic": "float16", "contact.k": "1e5"}, "largest float16, 6.55e+04"),
         ("penalty", {"variants.low": "3"}, "variants.low = 3 … a table"),
         ("penalty", {"variants.x.contact.k": "0"}, "--set variants.x … variant 'x': contact.k = 0"),
-        ("penalty", {"variants.x.contact.kk": "0"}, "variant 'x': unknown key 'kk' … Did you mean k?"),
-        ("penalty", {"variants.x.start.balls": "4"}, "variant 'x' has 4 balls and the system 3"),
+        ("penalty", {"variants.x.contact.kk": "0"}, "variant 'x': unknown key 'kk' … mean k?"),
+        ("penalty", {"variants.x.start.balls": "4"}, "variant 'x' … 4 balls … system 3"),
         ("penalty", {"variants.x.integrator.steps": "4"}, "variant 'x' changes integrator.steps"),
         ("penalty", CONTROL, "2 numbers for 100 steps"),
         ("projection", {"contact.k": "4"}, "alpha k = 0.5 × 4 = 2 … 1 - alpha k = -1 … alpha below 0.5"),
         ("projection", {"stop.max_iter": "4294967296"}, "at most 2147483647"),
         ("projection", {"stop.tol": "inf"}, "finite"),
         ("projection", {"stop.enter": "1e-7"}, "stop.enter = 1e-07 is below stop.tol = 1e-06"),
-        ("projection", {"stop.rule": "some"}, "unknown stop rule 'some' … sum, per-instance, maximum"),
+        ("projection", {"stop.rule": "some"}, "rule 'some' … sum, per-instance, maximum"),
         ("projection", {"stop.rule": "fixed"}, "key 'count' missing"),
         ("projection", {"stop.rule": "relative", "stop.tol": "1"}, "above that residual"),
-        ("projection", {"contact.hysteresis": "0.1"}, "has no meaning for projection … stop.enter"),
+        ("projection", {"contact.hysteresis": "0.1"}, "no meaning for projection … stop.enter"),
         ("projection", {"gradient.of": '["tol"]', "stop.rule": "fixed", "stop.count": "3"}, "rule is fixed"),
         ("projection", {"contact.kind": "impact", "stop.tol": "1e-3"}, "iterates nothing"),
         # of all roles, so that no second message corrects the first: 2.23e-308 / (alpha k)
         ("projection", {"stop.tol": "1e-320"}, LEAST),
         ("projection", {"stop.tol": "3e-308"}, LEAST),
         ("projection", RELATIVE | {"precision.decision": "float16"}, "precision.decision"),
-        ("impact", SMALL, "integrator.timestep = 1e-09 is 0 in float16 … the least is 5.96e-08"),
+        ("impact", SMALL, "integrator.timestep = 1e-09 is 0 in float16 … least is 5.96e-08"),
         ("impact", {"start.height": "1e5", "precision.state": "float16"}, "start.height = 100000 is above"),
-        ("impact", WAVE, "a parabola under constant acceleration, not under sine"),
+        ("impact", WAVE, "parabola … not under sine"),
     ],
 )
 def test_a_mistake_on_the_command_line(
@@ -314,10 +314,10 @@ NARROW = {"start.boundary.format": "float16", "stop.tol": repr(float(np.float16(
     [
         ({"stop.tol": "1e-3"}, r"is no bfloat16.*tol = 0\.00099945068359375"),
         # the nearest one would be 0 or infinite: no tolerance
-        ({"stop.tol": "1e-50"}, r"smallest usable tolerance is 1\.18e-38, the largest 3\.39e\+38"),
-        ({"stop.tol": "1e39"}, r"smallest usable tolerance is 1\.18e-38, the largest 3\.39e\+38"),
-        (NARROW | {"start.boundary.terms": "4096"}, r"in 4096 parts gives .* below the smallest float16"),
-        ({"stop.rule": "fixed", "stop.count": "2"}, "needs a tolerance to be on the boundary of"),
+        ({"stop.tol": "1e-50"}, r"tolerance is 1\.18e-38, .* 3\.39e\+38"),
+        ({"stop.tol": "1e39"}, r"tolerance is 1\.18e-38, .* 3\.39e\+38"),
+        (NARROW | {"start.boundary.terms": "4096"}, r"4096 parts .* smallest float16"),
+        ({"stop.rule": "fixed", "stop.count": "2"}, "needs a tolerance"),
     ],
 )
 def test_a_batch_on_the_boundary_needs_a_tolerance_of_its_format(changes: dict[str, str], message: str):

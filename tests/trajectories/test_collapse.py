@@ -268,7 +268,7 @@ def test_the_analysis_stops_there_too_and_may_run_again(tmp_path, parts):
     universe = MDAnalysis.Universe(str(tmp_path / "run.xyz"))
     analysis = NeighborFlips(universe, 5.0)
     for _ in range(2):
-        with pytest.raises(FrameError, match="frame 5: all atoms lie in a plane, z = 50"):
+        with pytest.raises(FrameError, match=r"frame 5: .*plane, z = 50"):
             analysis.run(n_parts=parts)
         assert analysis.frames.tolist() == [0, 1, 2, 3, 4]
     assert len(NeighborFlips(universe, 5.0).run(start=5).frames) == 3
@@ -281,7 +281,7 @@ def test_a_file_whose_first_frames_collapsed_is_refused_and_read_from_the_good_o
         for k, x in enumerate(liquid())
     ]
     ase.io.write(tmp_path / "run.extxyz", frames)
-    with pytest.raises(FrameError, match=f"frame {bad} is the first in which .*@{bad}:"):
+    with pytest.raises(FrameError, match=f"frame {bad} .*first .*@{bad}:"):
         mdnum.flips(tmp_path / "run.extxyz", cutoffs=[5.0], out=tmp_path / "a", report=False)
     found = mdnum.flips(tmp_path / f"run.extxyz@{bad}:", cutoffs=[5.0], out=tmp_path / "a", report=False)
     assert found.summary["frames"] == 8 - bad and found.summary["status"] != "stopped"

@@ -100,7 +100,7 @@ def test_what_is_not_there_is_told_as_what_it_is(tmp_path):
         (tmp_path / "summary.json").write_text(json.dumps({"world": world}))
         refuse(said, tmp_path)
     path = written(tmp_path, "traj", images())
-    with pytest.raises(InputError, match=r"names no atom of 9; there are names Ar"):
+    with pytest.raises(InputError, match=r"'name OW' names no atom .*9; .* Ar"):
         select(open_trajectory(path), "name OW")
     with pytest.raises(InputError, match="no frame is left"):
         select(open_trajectory(f"{path}@9:"), "name Ar")
@@ -150,12 +150,12 @@ def test_the_guard_takes_every_real_file():
 @pytest.mark.parametrize(
     ("kind", "damage", "said"),
     [
-        ("xtc", "cut", "the file ends in it"),
+        ("xtc", "cut", "file ends in it"),
         ("xtc", "hole", "damaged"),
-        ("dcd", "cut", r"the file ends after [\d,]+ bytes of it"),
-        ("trr", "cut", "the file ends in it"),
-        ("trr", "head", "the file ends in it"),
-        ("trr", "hole", "damaged: no head of a frame"),
+        ("dcd", "cut", r"file ends after [\d,]+ bytes"),
+        ("trr", "cut", "file ends in it"),
+        ("trr", "head", "file ends in it"),
+        ("trr", "hole", "damaged: no head"),
     ],
 )
 def test_a_file_that_was_cut_or_damaged_is_read_up_to_there(tmp_path, small, kind, damage, said):
@@ -234,7 +234,7 @@ def test_amber_files_without_a_whole_frame_or_with_more_than_their_head_names(
 def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
     path = written(tmp_path, "traj", images())
     path.write_bytes(path.read_bytes()[:-300])
-    ends(path, 4, "the file ends in it")
+    ends(path, 4, "file ends in it")
 
 
 # ---- text
@@ -355,7 +355,7 @@ def test_atoms_that_change_their_order_or_element_in_mid_file_end_it(tmp_path, k
     ])  # fmt: skip
     trajectory = open_trajectory(path)
     seen = []
-    with pytest.raises(FrameError, match=r"frame 3: atom 2 is .*C, and .*H in the first one") as told:
+    with pytest.raises(FrameError, match=r"frame 3: atom 2 .*C, .*H") as told:
         for frame in checked(trajectory.frames(), where=str(path)):
             seen.append(frame.index)
     assert seen == [0, 1, 2] and told.value.frame == 3

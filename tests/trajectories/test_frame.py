@@ -33,10 +33,10 @@ def put(number, rows, value):
     ("spoil", "said"),
     [
         (put(2, slice(4, 5), np.nan), r"frame 20: atom 4 is at \(nan, nan, nan\)"),
-        (put(2, (slice(1, 4), 2), -np.inf), r"frame 20: atom 1 is at \(.*-inf\), and 2 others"),
+        (put(2, (slice(1, 4), 2), -np.inf), r"frame 20: atom 1 .*-inf\), and 2 others"),
         (put(2, slice(None), 0.0), "frame 20: all coordinates are 0"),
-        (put(2, slice(3, 5), 0.0), "frame 20: atom 3 is at exactly 0, 0, 0, and 1 other"),
-        (None, "frame 20 has no box, and the first one looked at has a box"),
+        (put(2, slice(3, 5), 0.0), "frame 20: atom 3 .* 0, 0, 0, and 1 other"),
+        (None, "frame 20 has no box"),
     ],
 )
 def test_frame_and_atom_are_named(spoil, said):
@@ -65,7 +65,7 @@ def test_what_is_fine_is_not_refused(rows, value, atoms):
 def test_a_box_without_a_vector_is_named_with_its_frame():
     boxes = [Box(np.diag([9.0, 9.0, 9.0 - k]), np.ones(3, bool)) for k in (0, 9)]
     some = [Frame(90 * k, 0.0, np.ones((1, 3)), box) for k, box in enumerate(boxes)]
-    said = r"run.traj: frame 90: the box repeats along c, but .* 0.0\]"
+    said = r"run\.traj: frame 90: .*along c, but .* 0\.0\]"
     with pytest.raises(FrameError, match=said) as caught:
         list(checked(some, where="run.traj"))
     assert caught.value.frame == 90

@@ -105,7 +105,7 @@ def test_an_id_that_is_gone_ends_the_file(tmp_path):
     for k, atoms in enumerate(images):
         atoms.set_array("id", np.array([1, 2, 3, 4 + 3 * (k == 2)]))
     ase.io.write(tmp_path / "run.extxyz", images)
-    with pytest.raises(FrameError, match="frame 2 lacks atom 4 of the first frame"):
+    with pytest.raises(FrameError, match=r"frame 2 lacks atom 4 .*4 atoms, .*4"):
         list(open_trajectory(tmp_path / "run.extxyz").frames())
     # a column of that name that numbers molecules says nothing of the kind
     for atoms in images:

@@ -79,9 +79,7 @@ def trr(path: Path, positions, boxes, width=4, velocities=None) -> Path:
 )  # fmt: skip
 def test_whatever_a_reader_raises_is_one_line_with_file_and_frame(error):
     with (
-        pytest.raises(
-            UnreadableFrame, match=r"^run\.xyz: frame 4 cannot be read \(.+\)\. .*@:4 to the path"
-        ) as told,
+        pytest.raises(UnreadableFrame, match=r"^run\.xyz: frame 4 cannot be read \(.+\)\. .*@:4 ") as told,
         reading("run.xyz", 4),
     ):
         raise error
@@ -100,7 +98,7 @@ def test_what_mdnum_says_itself_and_a_wish_to_stop_pass():
     assert told.value is own
     with pytest.raises(KeyboardInterrupt), reading("run.xyz", 4):
         raise KeyboardInterrupt
-    with pytest.raises(InputError, match="package that is not installed"), reading("run.tng"):
+    with pytest.raises(InputError, match=r"run\.tng: .*not installed \(.*pytng"), reading("run.tng"):
         raise ImportError("please install pytng")
 
 
@@ -164,8 +162,8 @@ def test_netcdf_without_units_or_of_another_kind_is_one_line(tmp_path, rng):
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("a.extxyz", "1\nProperties=species:S:1:pos:R:3\nUue 0 0 0\n", "Uue is the symbol of no element"),
-        ("a.extxyz", "-5\nProperties=species:S:1:pos:R:3\nAr 0 0 0\n", "-5 where the number of atoms"),
+        ("a.extxyz", "1\nProperties=species:S:1:pos:R:3\nUue 0 0 0\n", "Uue is the symbol"),
+        ("a.extxyz", "-5\nProperties=species:S:1:pos:R:3\nAr 0 0 0\n", "-5 where the number"),
         ("a.xyz", "-5\nwords\nAr 0 0 0\n", "announces -5 atoms"),
         ("a.gro", "words\n-5\n\n", "-5 "),
         ("a.mdcrd", "words\n  1.0  2.0  3.0\n", "-s TOPOLOGY"),
@@ -356,7 +354,7 @@ def test_a_trr_whose_later_frame_has_no_box_or_no_positions_ends_there(tmp_path,
 def test_no_box_is_so_small_that_counting_its_images_overflows():
     for size in (1e-5, 1e-30):
         frame = Frame(0, 0.0, np.zeros((2, 3)), Box(np.eye(3) * size, np.ones(3, bool)))
-        with pytest.raises(InputError, match="Check the unit of the cutoff"):
+        with pytest.raises(InputError, match=f"^cutoff: .*widths .{size:.3g}".replace("+", r"\+")):
             Tracker(CutoffRule(4.0)).step(frame)
 
 

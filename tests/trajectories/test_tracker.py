@@ -330,7 +330,7 @@ def test_positions_that_are_no_numbers():
     # what was read before is still there, and an atom that takes no part may be anywhere
     assert tracker.frames == 1 and tracker.pairs == 1
     assert len(tracker.step(Frame(18, 0.0, shifted(x, (2, 0), np.inf), box))) == 0
-    with pytest.raises(InputError, match="5 atoms, 4 in the frames before"):
+    with pytest.raises(InputError, match="frame 19: 5 atoms, 4 in"):
         tracker.step(Frame(19, 0.0, np.zeros((5, 3)), box))
 
 
@@ -357,11 +357,11 @@ def first_of_four(chosen, **options):
         (lambda: Capped(1.0, 0), "whole number"),
         (lambda: SpeciesCutoffs({("O", "H"): 2.5, ("H", "O"): 2.6}), "two radii"),
         (lambda: SpeciesCutoffs({}), "no pair"),
-        (lambda: SpeciesCutoffs({("Ow", "H"): 2.5}).table(["O", "H"]), "no atom is of species 'Ow'"),
+        (lambda: SpeciesCutoffs({("Ow", "H"): 2.5}).table(["O", "H"]), "species 'Ow'; .*O, H"),
         (lambda: Tracker(SpeciesCutoffs({("O", "H"): 2.5})), "which species"),
         (lambda: first_of_four([0, 4]), "atom 4 is selected"),
         (lambda: first_of_four([-1, 2]), "whole numbers"),
-        (lambda: first_of_four([0], species=["O"] * 3), "3 species for frames of 4 atoms"),
+        (lambda: first_of_four([0], species=["O"] * 3), "3 species .* 4 atoms"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(make, message):

@@ -222,26 +222,27 @@ def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[s
     return told["run"], told["differentiate"], _headline(state, found)
 
 
-CARE = "Use x on Ar with care, to run and to differentiate: "
+NO, CARE = (TEXTS(f"same_{answer}", name="x on Ar") for answer in ("no", "with_care"))
 
 
 @pytest.mark.parametrize(
     ("parts", "answer", "headline"),
     [
-        ([part("forces")], "not asked", "x on Ar: 1 check found nothing."),
-        ([part("smoothness", ("A", "warning")), *map(part, REST)], "with care", f"{CARE}a."),
-        ([part("curl", ("B", "error"))], "no", "Neither run nor differentiate x on Ar as it is: b."),
+        ([part("forces")], "not asked", TEXTS("found_nothing", head="x on Ar", checks=1)),
+        ([part("smoothness", ("A", "warning")), *map(part, REST)], "with care", f"{CARE}: a."),
+        ([part("curl", ("B", "error"))], "no", f"{NO}: b."),
         (
             [part("state", *((f"A{n}", "warning") for n in range(5)))], "with care",
-            f"{CARE}a0; a1; and 3 more findings.",
+            f"{CARE}: a0; a1; and 3 more findings.",
         ),
     ],
 )  # fmt: skip
 def test_findings_add_up_to_two_answers(parts, answer, headline):
     found, others = judged(parts), [one for one in CHECKS if one not in {two.name for two in parts}]
-    unasked = "Not asked: stress, and elements other than Ar."
+    unasked = TEXTS("unasked", elements="Ar")
     if others:
-        unasked = f"Not asked: stress, elements other than Ar, and the checks of {listed(others)}."
+        unasked = TEXTS("unasked_checks", elements="Ar", checks=listed(others))
+        assert all(name in unasked for name in others)
     assert found == (answer, answer, f"{headline} {unasked}")
 
 

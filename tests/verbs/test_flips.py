@@ -225,15 +225,15 @@ def test_a_coarse_file_is_one(examined) -> None:
     assert said.severity == "warning" and said.values["missed"] > 0.01
     for rule in ("r < 2 Å", "r < 2.5 Å"):
         assert said.text.count(f"{rule}:") == 1
-    assert said.text.count("may have been on its other side") == 1
+    assert said.text.count("other side") == 1
 
 
 @pytest.mark.parametrize(
     ("share", "told", "variant"),
     [
-        ((0.2, 0.12, 0.33), "about 20 % of all flips (12 % to 33 %)", "to"),
-        ((0.04, 0.02, 0.08), "about 4.0 % of all flips (2.0 % to 8.0 %)", None),
-        ((0.01, 0.0, 0.03), "fewer than 3.0 % of all flips", None),
+        ((0.2, 0.12, 0.33), "20 % of all flips (12 % to 33 %)", "to"),
+        ((0.04, 0.02, 0.08), "4.0 % of all flips (2.0 % to 8.0 %)", None),
+        ((0.01, 0.0, 0.03), "fewer than 3.0 % of", None),
         ((None, None, None), "too far apart", "not resolvable"),
     ],
 )

@@ -188,7 +188,7 @@ def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Pat
     write(tmp_path / "b.traj", other)
     found = looked(Path(f"{tmp_path}/a.traj@::2"), tmp_path / "b.traj", tmp_path / "f")
     assert found.summary["rules"][0]["first"]["frame"] == 2
-    assert "frame 2 (4 in A’s file, 2 in B’s)" in found.verdict.headline
+    assert all(part in found.verdict.headline for part in ("frame 2 (4 in A’s", "2 in B’s)"))
     found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g")
     assert found.summary["seed"] is None and found.summary["frames"] == 8
     assert found.summary["rules"][0]["first"] is None

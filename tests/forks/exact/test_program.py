@@ -205,8 +205,9 @@ def test_species_masses_and_a_tilted_box():
 def test_what_cannot_be_certified_is_error():
     morse = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
     simulation = build(small_systems.make(small_systems.crystal(), morse, {"kind": "hard", "radius": 1.6}))
-    with pytest.raises(InputError, match=r"Lennard-Jones potentials, not 'morse'.*Use a lennard-jones"):
+    with pytest.raises(InputError, match=r"Lennard-Jones.*'morse'.*lennard-jones") as caught:
         ExactProgram(simulation)
+    assert caught.value.where == "potential.kind"
     langevin = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 1}
     error = unsupported(liquid(dynamics=langevin))
     assert error is not None and error.where == "dynamics.kind"

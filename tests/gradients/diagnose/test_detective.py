@@ -76,7 +76,7 @@ def test_a_root_of_the_loss_at_zero_is_found_in_the_loss(meeting, loss, expected
 def test_a_gradient_that_is_not_finite_is_refused_with_the_operation_at_fault(meeting):
     far = with_values(meeting.simulation, {"initial.velocities": np.zeros((2, 3))})
     function = value_and_grad(Problem(far, Custom(see=gone), 1), ["initial.velocities"], "symmetric")
-    with pytest.raises(NumericalError, match=r"gradient by initial.velocities is not finite: .* div\(.*gone"):
+    with pytest.raises(NumericalError, match=r"initial\.velocities .*not finite: .* div\(.*gone"):
         function()
 
 

@@ -73,9 +73,10 @@ def test_each_fault_has_its_code():
     assert _codes(_with(distance=np.where(np.arange(most) == 5, np.nan, right.distance))) == ["DISTANCES"]
     assert _codes(_with(vector=-right.vector)) == ["VECTORS"]
     assert _codes(_with(vector=-right.vector), Conventions(toward=-1)) == []
-    assert (
-        "added to the other atom" in judge(_with(shift=-right.shift), truth(_CASE, 0), Conventions())[0].text
-    )
+    # turned around they are right, rolled they are not
+    for shift, turned in ((-right.shift, True), (np.roll(right.shift, 1, axis=0), False)):
+        (wrong,) = judge(_with(shift=shift), truth(_CASE, 0), Conventions())
+        assert wrong.code == "SHIFTS" and ("the other atom" in wrong.text) == turned
 
 
 def test_what_shifts_cannot_mend_is_not_called_a_shift():
@@ -175,12 +176,12 @@ def test_a_lattice_is_known_as_brute_force_finds_it():
         ({"i": [0], "j": [1], "shift": [[0.5, 0, 0]]}, "whole numbers"),
         ({"i": [0], "j": [1], "distance": [1.0, 2.0]}, "distance has shape"),
         (([0], [1], ["far"]), "dtype"),
-        ([[0, 1], [2, 3], [4, 5]], "whole numbers; pairs one by one are to be tuples"),
-        ([[0, 1]] * 6, "6 parts.*pairs one by one are to be tuples"),
-        ([(0, 1, 2)], "row \\(i, j\\) for each pair"),
-        (np.zeros((2, 7), int), "row \\(i, j\\) for each pair"),
+        ([[0, 1], [2, 3], [4, 5]], "whole numbers; .*tuples"),
+        ([[0, 1]] * 6, "6 parts.*tuples"),
+        ([(0, 1, 2)], "row \\(i, j\\)"),
+        (np.zeros((2, 7), int), "row \\(i, j\\)"),
         ((row for row in ((0, 1), (1, 0))), "generator"),
-        (np.array(3), "row \\(i, j\\) for each pair"),
+        (np.array(3), "row \\(i, j\\)"),
         (([object()], [1]), "no array of numbers"),
     ],
 )

@@ -72,7 +72,7 @@ def test_an_adopted_suite_fails_with_a_script_and_skips_with_a_reason(monkeypatc
         pairs = staticmethod(_plain)
         large = True
 
-    with pytest.raises(pytest.fail.Exception, match=r"(?s)MISSING.*This reproduces the first.*import numpy"):
+    with pytest.raises(pytest.fail.Exception, match=r"(?s)MISSING.*reproduces.*import numpy"):
         Broken().test_neighbor_list("few")
     for suite, area, reason in (
         (NeighborListConformance(), "few", "no list"),
@@ -102,7 +102,7 @@ def test_an_adopted_list_that_refuses_everything_fails():
             return [once("two", area, [[0.0, 0, 0], [0.5, 0, 0]])]
 
     for refuses.periodic, outcome, message in (
-        (False, pytest.fail.Exception, "refuses whatever it is asked: ValueError: cannot"),
+        (False, pytest.fail.Exception, "refuses .*: ValueError: cannot"),
         (True, pytest.skip.Exception, "refused: ValueError: cannot"),
     ):
         with pytest.raises(outcome, match=message):
@@ -181,7 +181,7 @@ def _in(cell) -> object:
         (ListLimits(right_handed=True), _in(np.eye(3)[[1, 0, 2]] * 4), "left-handed"),
         (ListLimits(lower_triangular=True), _in(np.triu(np.ones((3, 3))) * 4), "lower"),
         (ListLimits(orthorhombic=True), _in(np.tril(np.ones((3, 3)))), "right angles"),
-        (ListLimits(along_axes=True), _in(-4 * np.eye(3)), "along x, y and z only"),
+        (ListLimits(along_axes=True), _in(-4 * np.eye(3)), "along x, y and z"),
         (ListLimits(minimum_image=True), _in(1.9 * np.eye(3)), "minimum image"),
         (ListLimits(wrapped=True), once("", "outside", [[-1.0, 0, 0]], 4.0), "inside the box"),
         (ListLimits(whole_cell=True), _FREE, "lacks a vector"),
@@ -274,13 +274,13 @@ def test_only_an_exception_of_its_own_is_a_refusal(name: str, tmp_path: Path):
     ("message", "words"),
     [
         (
-            "no  cell\nto speak of\nException raised from f at a.cpp:3\nframe #0: f",
-            "RuntimeError: no cell to speak of",
+            "no  cell\nat all\nException raised from f at a.cpp:3\nframe #0: f",
+            "RuntimeError: no cell at all",
         ),
         (
-            "Failed in the interpreter.\nTraceback of TorchScript (most recent call last):\n"
+            "It failed.\nTraceback of TorchScript (most recent call last):\n"
             '  File "a.py", line 3, in f\n    x = y\n        ~ <--- HERE\nRuntimeError: no atoms\n',
-            "RuntimeError: Failed in the interpreter. RuntimeError: no atoms",
+            "RuntimeError: It failed. RuntimeError: no atoms",
         ),
     ],
 )
@@ -475,7 +475,7 @@ def test_all_packages_that_are_missing_are_named(monkeypatch: pytest.MonkeyPatch
             load(word)
         assert (caught.value.remedy or "").endswith(remedy)
     monkeypatch.setattr("mdnum.references.conformance.lists._version", {}.get)
-    with pytest.raises(InputError, match="nvalchemi-toolkit-ops and torch, which are not installed"):
+    with pytest.raises(InputError, match=r"nvalchemi-toolkit-ops and torch, .*not"):
         load("nvalchemi-ops")
     assert not installed()
 
@@ -537,5 +537,5 @@ def test_a_package_outside_adds_a_list(monkeypatch: pytest.MonkeyPatch):
     point = EntryPoint("theirs", "planted_lists:search", LISTS.group)
     monkeypatch.setattr(registry, "_plugins", lambda group, path: (point,) if group == LISTS.group else ())
     theirs = next(one for one in known() if one.name == "theirs")
-    assert theirs.description.startswith("(i, j, shift, distance, vector) by name")
+    assert theirs.description.startswith("(i, j, shift, distance, vector)")
     assert examine(theirs, asked=[_TWO], shrink=False).conforms
