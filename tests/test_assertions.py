@@ -81,10 +81,26 @@ def expected(function: ast.FunctionDef) -> Iterator[ast.expr]:
             yield from columns(targets, ast.Tuple([node.value]), used)
 
 
+def handed_on(call: ast.AST, functions: dict[str, ast.FunctionDef]) -> Iterator[ast.expr]:
+    """The arguments of a call that a function of the same file asserts."""
+    if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in functions:
+        function = functions[call.func.id]
+        used = {
+            node.id for each in assertions(function) for node in ast.walk(each) if isinstance(node, ast.Name)
+        }
+        names = [one.arg for one in function.args.args]
+        yield from columns(names, ast.Tuple([ast.Tuple(call.args)]), used)
+        yield from (one.value for one in call.keywords if one.arg in used)
+
+
 def sentences(source: str) -> dict[int, str]:
     """Strings of assertions with more words than they may have, by line."""
-    functions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
-    found = (pair for function in functions for each in expected(function) for pair in strings(each))
+    nodes = list(ast.walk(ast.parse(source)))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    asserted = [each for function in functions for each in expected(function)]
+    named = {function.name: function for function in functions}
+    asserted += [each for node in nodes for each in handed_on(node, named)]
+    found = (pair for each in asserted for pair in strings(each))
     return {line: text for line, text in found if len(words(text)) > MOST}
 
 
@@ -106,6 +122,7 @@ WAYS = {
     "loop": f"for n, message in ((1, {SENTENCE!r}),):\n        assert message in f(n)",
     "one column": f"for message in [{SENTENCE!r}]:\n        assert message in text",
     "dictionary": f"for n, message in {{1: {SENTENCE!r}}}.items():\n        assert message in f(n)",
+    "helper": f"def holds(part, text):\n        assert part in text\n    holds({SENTENCE!r}, text)",
     "comprehension": f"assert all(part in text for part in ({SENTENCE!r}, 'x'))",
 }
 

@@ -117,7 +117,7 @@ def test_a_frame_that_collapsed_or_was_shifted_far_ends_the_file(how, said, side
 )
 def test_first_frames_that_collapsed_are_named_and_not_the_good_one_behind_them(axis, value, said, side, bad):
     positions = [put(axis, value)(x) if k < bad else x for k, x in enumerate(liquid())]
-    refused(f"is the first in which not all atoms have {said}: the frames before", positions, side, bad)
+    refused(f"is the first .* have {said}: ", positions, side, bad)
     assert len(examined(positions[bad:], side)) == 8 - bad
 
 
@@ -129,7 +129,7 @@ def test_a_part_of_the_atoms_that_is_far_out_is_damage_as_one_is(share, last, si
     positions = list(liquid(32))
     for x in positions[5:last]:
         x[: int(32 * share), 1] += 2**31 / 100
-    refused("atom .* away from the others, and .* others likewise", positions, side)
+    refused(r"atom .* away .*, and \d+ others", positions, side)
 
 
 @pytest.mark.parametrize("atoms", [5, 40])
@@ -137,7 +137,7 @@ def test_a_cluster_without_a_box_does_not_leap_by_hundreds_of_its_sizes(atoms):
     """Nor is it left where it was by a shift of some sizes, to the middle of a box that the file lacks."""
     cluster = [x * 7 / SIDE for x in liquid(atoms)]
     refused(
-        "all atoms are shifted by 2.15e",
+        "all .* shifted by 2.15e",
         [x + (k > 4) * 2**31 / 1e6 * np.eye(3)[2] for k, x in enumerate(cluster)],
         None,
     )

@@ -354,7 +354,7 @@ def test_a_trr_whose_later_frame_has_no_box_or_no_positions_ends_there(tmp_path,
 def test_no_box_is_so_small_that_counting_its_images_overflows():
     for size in (1e-5, 1e-30):
         frame = Frame(0, 0.0, np.zeros((2, 3)), Box(np.eye(3) * size, np.ones(3, bool)))
-        with pytest.raises(InputError, match=f"^cutoff: .*widths .{size:.3g}".replace("+", r"\+")):
+        with pytest.raises(InputError, match=r"^cutoff: .* pairs within 4[:.] .*box"):
             Tracker(CutoffRule(4.0)).step(frame)
 
 

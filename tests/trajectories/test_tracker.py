@@ -357,7 +357,7 @@ def first_of_four(chosen, **options):
         (lambda: Capped(1.0, 0), "whole number"),
         (lambda: SpeciesCutoffs({("O", "H"): 2.5, ("H", "O"): 2.6}), "two radii"),
         (lambda: SpeciesCutoffs({}), "no pair"),
-        (lambda: SpeciesCutoffs({("Ow", "H"): 2.5}).table(["O", "H"]), "species 'Ow'; .*O, H"),
+        (lambda: SpeciesCutoffs({("Ow", "H"): 2.5}).table(["O", "H"]), "species 'Ow'; .* H, O"),
         (lambda: Tracker(SpeciesCutoffs({("O", "H"): 2.5})), "which species"),
         (lambda: first_of_four([0, 4]), "atom 4 is selected"),
         (lambda: first_of_four([-1, 2]), "whole numbers"),

@@ -244,6 +244,7 @@ def test_findings_add_up_to_two_answers(parts, answer, headline):
         unasked = TEXTS("unasked_checks", elements="Ar", checks=listed(others))
         assert all(name in unasked for name in others)
     assert found == (answer, answer, f"{headline} {unasked}")
+    assert headline.count("x on Ar") == 1 and "stress" in unasked and "Ar" in unasked
 
 
 def test_checks_that_were_not_selected_are_named_and_a_measured_number_is_not_nothing():
