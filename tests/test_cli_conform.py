@@ -115,8 +115,8 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
         (("mine.py",), "Give mine.py:nearest_image"),
         (("empty.py:pairs",), "It has no function"),
         (("broken.py:pairs",), "(broken.py, line 1)"),
-        (("mine.py:np",), "mine.py:np … with allocate and update"),
-        (("mine.py:without_pbc",), "mine.py:without_pbc … with (positions, cell, pbc, r_cut)"),
+        (("mine.py:np",), "neither … with allocate and"),
+        (("mine.py:without_pbc",), "without_pbc … with (positions, cell, pbc, r_cut)"),
         (("mine.py:Half",), "a class without update"),
         (("mine.py:Sized",), "Sized(size) cannot be called with ()"),
         (("mine.py:Sized(1, 2)",), "making it failed: TypeError"),
@@ -300,7 +300,8 @@ def test_a_refusal_that_depends_on_what_it_should_not_is_a_finding():
     """The order of atoms, or what was asked before; not another unit of length, nor other images."""
     _, findings = _judged(_refusing(lambda x, _: len(x) > 1 and x[0, 0] < x[-1, 0]), [_TWO, _THREE])
     assert findings["UNEVEN_REFUSALS"].severity == "warning"
-    assert findings["UNEVEN_REFUSALS"].values["how"].endswith("in reverse order")
+    how = findings["UNEVEN_REFUSALS"].values["how"]
+    assert how.endswith("in reverse order") and "anew" not in how
     asked = []
 
     def second(x, _):
@@ -308,7 +309,7 @@ def test_a_refusal_that_depends_on_what_it_should_not_is_a_finding():
         return len(asked) == 3  # the first finds out its conventions
 
     _, findings = _judged(_refusing(second), [_TWO, _THREE])
-    assert findings["UNEVEN_REFUSALS"].values["how"].endswith("asked anew")
+    assert "asked anew" in findings["UNEVEN_REFUSALS"].values["how"]
     outside = once("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
     _, findings = _judged(_refusing(lambda x, _: x.max() > 4.0), [_TWO, outside])
     assert set(findings) == {"REFUSES"}  # and nothing uneven
