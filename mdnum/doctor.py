@@ -441,14 +441,12 @@ def own_forces() -> DoctorRow:
 
 def worst_errors() -> tuple[float, float]:
     """Relative energy difference, and the largest force difference over the largest force."""
-    from mdnum.systems import build, load
+    from mdnum.systems import build
 
-    system = load("argon/tilted-500")
-    ours, cell = build(system).evaluate(), system.atoms.cell.array
-    potential, cutoff = system.spec.potential, system.spec.cutoff
-    assert cutoff is not None and potential.sigma and potential.epsilon and cutoff.radius
+    simulation = build("argon/tilted-500")
+    ours, constants = simulation.evaluate(), simulation.potential.constants(0)
     energy, forces = _lennard_jones(
-        system.atoms.get_positions(), cell, potential.sigma, potential.epsilon, cutoff.radius
+        simulation.positions, simulation.structure.cell.array, r_cut=simulation.r_cut, **constants
     )
     force = float(np.max(np.abs(ours.forces - forces)) / np.max(np.abs(forces)))
     return abs(ours.energy - energy) / abs(energy), force

@@ -46,13 +46,9 @@ class _System(Protocol):
     @property
     def name(self) -> str: ...
     @property
-    def spec(self) -> Any: ...
+    def program(self) -> dict[str, Any]: ...
     @property
     def path(self) -> Path | None: ...
-
-
-#: Of a system file: words, what is hashed by itself, and what is asked about the run.
-_NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants", "fork"}
 
 
 def collect(system: _System) -> dict[str, Any]:
@@ -72,8 +68,7 @@ def collect(system: _System) -> dict[str, Any]:
     environment = {
         name: value for name, value in sorted(os.environ.items()) if name.startswith(("XLA_", "JAX_"))
     }
-    precision = getattr(system.spec, "precision", None)
-    dtypes = precision.model_dump(mode="json") if precision is not None else {}
+    dtypes = system.program.get("precision", {})
     return {
         **{name: around[name] for name in ("started", "command", "folder")},
         "system": system.name,
@@ -177,11 +172,8 @@ def hashes(system: _System) -> dict[str, str | None]:
     file = None
     if system.path is not None and Path(system.path).is_file():
         file = hashlib.sha256(Path(system.path).read_bytes()).hexdigest()
-    program = None
-    if system.spec is not None:
-        spec = system.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
-        program = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
-    atoms = getattr(system, "atoms", None)
+    program = hashlib.sha256(json.dumps(system.program, sort_keys=True).encode()).hexdigest()
+    atoms = getattr(system, "structure", None) or getattr(system, "atoms", None)
     if atoms is None:
         return {"file": file, "program": program, "structure": None}
     digest = hashlib.sha256()

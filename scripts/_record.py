@@ -49,7 +49,7 @@ def record(simulation: Simulation, steps: int) -> Recorded:
         health.take(segment, recorder.missed)
     numbers = _joined(series)
     return Recorded(
-        simulation.system.spec.dynamics.timestep * np.arange(len(numbers["potential"])),
+        simulation.timestep * np.arange(len(numbers["potential"])),
         numbers["potential"],
         numbers["potential"] + numbers["kinetic"] - numbers["heat"],
         numbers["moved"],

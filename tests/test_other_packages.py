@@ -117,7 +117,7 @@ def test_a_cutoff_runs_is_compared_and_certified(site, tmp_path):
     energy, force = simulation.jumps()
     assert energy[0] == 0
     assert force[0] == pytest.approx(-(slope - 2 * u / 2.5), rel=1e-14)
-    compared = check_energy(simulation.system)
+    compared = check_energy(simulation)
     assert compared.ok and compared.worst["energy_rel"] < 1e-12
     certified = mdnum.fork_certify(
         "pair/at-cutoff", overrides=overrides, steps=400, policies={"float64": {}}, out=tmp_path / "exact"
@@ -130,7 +130,7 @@ def test_a_potential_of_two_constants(site, tmp_path):
     overrides = {"potential.kind": "power", "potential.length": 1.0, "potential.strength": 0.5}
     simulation = mdnum.build("pair/at-cutoff", overrides)
     assert simulation.potential.evaluate(np.float64(4.0))[0] == pytest.approx(0.5 / 2**8)
-    assert check_energy(simulation.system).ok
+    assert check_energy(simulation).ok
     with pytest.raises(InputError, match="strength missing"):
         mdnum.load("pair/at-cutoff", {"potential.kind": "power", "potential.length": 1.0})
     with pytest.raises(InputError, match=r"unknown sigma; .*length, strength"):

@@ -18,7 +18,7 @@ from mdnum import provenance, systems
 
 def _system(path: Path | None = None) -> types.SimpleNamespace:
     atoms = ase.build.bulk("Ar", "fcc", 5.26, cubic=True)
-    return types.SimpleNamespace(name="argon/cell", spec=None, path=path, atoms=atoms)
+    return types.SimpleNamespace(name="argon/cell", program={}, path=path, atoms=atoms)
 
 
 def test_collect_is_json_and_names_what_decides_bits(monkeypatch: pytest.MonkeyPatch):

@@ -100,12 +100,11 @@ def _of_system(text: str) -> LoadedCalculator:
         ) from error
 
     def make() -> Any:
-        from mdnum.references.ase_models import MdnumCalculator
+        from mdnum.references.calculator import MdnumCalculator
 
         return MdnumCalculator(system)
 
-    temperature = getattr(system.spec.dynamics, "temperature", None)
-    kT = float(temperature) * system.units.k_B if temperature else None
+    kT = system.draw.temperature * system.units.k_B or None
     stem = Path(text).stem.removesuffix(".toml")
     return LoadedCalculator(text, stem, make, system.atoms.copy(), kT, system.units)
 

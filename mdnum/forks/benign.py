@@ -35,7 +35,7 @@ from mdnum.forks.ensemble import (
 from mdnum.md.integrators import Langevin
 from mdnum.program import Twin
 from mdnum.rollout.engine import Start, first_state
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Components that are compared, at most; fewer where so much of the variance is explained by fewer.
 COMPONENTS, _EXPLAINED = 10, 0.999
@@ -263,7 +263,7 @@ def calibrate(
     features = ensemble(simulation, starts(simulation, own, 0, start), tried, nodes, note)
     if not np.isfinite(features).all():
         raise InputError(
-            "a run of the ensemble blew up", where=simulation.system.name, remedy="Use a shorter time step"
+            "a run of the ensemble blew up", where=simulation.name, remedy="Use a shorter time step"
         )
     spaces = [(Space.of(rows[:members]), limit_of(rows[:members])) for rows in features]
     tables: list[list[Planted]] = [[] for _ in tried]
@@ -278,7 +278,7 @@ def calibrate(
     windows = [
         Window(step, *space, tuple(table)) for step, space, table in zip(tried, spaces, tables, strict=True)
     ]
-    chosen = choose(windows, simulation.system.name)
+    chosen = choose(windows, simulation.name)
     seconds = chosen.space.second(features[windows.index(chosen)][members:]) if held_out else np.empty(0)
     medians = triples(seconds)
     alone, failed = (int(np.count_nonzero(values > chosen.limit)) for values in (seconds, medians))

@@ -10,7 +10,7 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,10 @@ from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program
-from mdnum.systems import BallSystem, System
+from mdnum.systems import BallSystem
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
@@ -194,7 +197,7 @@ class NumberLine:
 
 
 def boundaries(
-    system: System | BallSystem,
+    system: Simulation | BallSystem,
     key: str,
     low: float,
     high: float,

@@ -30,7 +30,8 @@ from mdnum.numerics.rounding import unit_roundoff
 from mdnum.program import Twin
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
-from mdnum.systems.build import Simulation
+from mdnum.systems.describe import described
+from mdnum.systems.simulation import Simulation
 
 #: Ambiguous decisions that are listed; the count covers all of them.
 LISTED = 10_000
@@ -130,9 +131,9 @@ def wider(twin: Twin) -> str | None:
 
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
     """What must be the same in a program and its shadow."""
-    spec = run.system.spec.model_dump(mode="json")
-    spec["precision"] = {key: value for key, value in spec["precision"].items() if key not in ROLES["md"]}
-    return spec, run.rule, run.builder, repr(run.reduction)
+    tables = described(run)
+    tables["precision"] = {key: value for key, value in tables["precision"].items() if key not in ROLES["md"]}
+    return tables, repr(run.reduction)
 
 
 # --- one run, its ambiguous decisions in exact arithmetic ------------------------------------------------

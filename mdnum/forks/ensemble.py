@@ -18,7 +18,7 @@ from mdnum.md.cell import displacement
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.program import MdProgram
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Hats of the pair histogram, which reaches so many times the cutoff, or to half the box.
 HATS, _REACH = 24, 1.5

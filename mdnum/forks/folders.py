@@ -21,7 +21,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of
 from mdnum.program import Twin
 from mdnum.store import RunFolder
-from mdnum.systems.load import load
+from mdnum.systems.load import load, opened
 from mdnum.systems.toml import flat
 
 Difference = tuple[str, Any, Any]
@@ -109,13 +109,18 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         return _compared(first, second, where)
 
 
+def simulation_in(folder: Path) -> Any:
+    """The simulation or the ball's system of a run folder."""
+    return opened(load(folder))
+
+
 def twin_of(found: FolderFork) -> Twin:
     """The runs of two folders of molecular dynamics, to be followed again.
 
     A replay has the bits of the stored run where versions and processor are the same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
-    a, b = (program_of(load(path, world="md")) for path in (found.a, found.b))
+    a, b = (program_of(simulation_in(path)) for path in (found.a, found.b))
     return Twin(a, b, difference or "nothing known")
 
 

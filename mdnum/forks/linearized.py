@@ -29,7 +29,7 @@ from mdnum.errors import InputError
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics.verdicts import Growth
 from mdnum.rollout.engine import FAILURES, Engine, Segment
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Share of a run in which the tangent turns to the direction that grows fastest.
 _TRANSIENT = 0.2
@@ -286,7 +286,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
     Error: statistical, see Lyapunov.error; and flips of a hard cutoff do not act on a tangent, so growth that
         is made by flips alone is not in it.
     """
-    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    last = simulation.steps if steps is None else steps
     if last < 10 * _BLOCKS:
         raise InputError(
             f"steps = {last} are too few for a growth rate", remedy=f"Give at least {10 * _BLOCKS}"
@@ -475,7 +475,7 @@ def forecast(
     Raises:
         InputError: a many-body potential, a direction that is zero or of the wrong shape.
     """
-    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    last = simulation.steps if steps is None else steps
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
     shape = simulation.positions.shape

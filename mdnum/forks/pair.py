@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Shaped
@@ -28,7 +28,10 @@ from mdnum.numerics.verdicts import (
     table,
 )
 from mdnum.program import Decision, PairRows, Twin
-from mdnum.systems import BallSystem, System
+from mdnum.systems import BallSystem
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 #: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that split a
 #: crystal do so slowly, and its atoms have no room to be much further apart; docs/verdict-calibration.md has
@@ -347,7 +350,7 @@ class Screened:
 
 
 def screen(
-    system: System | BallSystem,
+    system: Simulation | BallSystem,
     steps: int | None = None,
     choices: Sequence[Choice] | None = None,
     progress: Callable[[int, int, str], None] | None = None,

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock, Timer
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +32,11 @@ from jaxtyping import Float
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks.worlds import program_of, varied
 from mdnum.safe_path import environment, python
-from mdnum.systems import BallSystem, System, load
+from mdnum.systems import BallSystem
+from mdnum.systems.load import opened
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 ProgramName = Literal["scan", "rollout", "vmap", "grad", "eager"]
 
@@ -120,7 +124,7 @@ class Variants:
 
 
 def variants(
-    system: System,
+    system: Simulation,
     steps: int = 200,
     which: Sequence[Variant] = VARIANTS,
     progress: Callable[[int, int, str], None] | None = None,
@@ -131,7 +135,7 @@ def variants(
     another machine the clusters may be others: a processor without fused multiply-add has nothing to fuse.
 
     Args:
-        system: as loaded; pair potentials only.
+        system: one that came from a file; pair potentials only.
         steps: of each program; the eager one takes a dozen.
         which: the first one that runs is what the others are compared with; one that fails or takes too long
             says so in its row.
@@ -143,14 +147,13 @@ def variants(
     """
     from mdnum.md.cell import Cell, displacement
 
-    if system.spec.cutoff is None:
+    if not system.pairwise:
         raise InputError("variants of a many-body potential are not supported", where=system.name)
     if steps < 1 or not which:
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        # a system changed in memory is on no disk; what is written loads bit for bit
-        question = {"path": str(system.write(folder / "system")), "steps": steps}
+        question = {"path": _written(system, folder), "steps": steps}
         done, count = 0, Lock()
 
         def ran(k: int) -> tuple[Ran, np.ndarray | None]:
@@ -172,7 +175,7 @@ def variants(
     if reference is None or own is None:
         row = found[0][0]
         raise MdnumError(f"no variant ran; {row.variant.name!r} said: {row.failed}")
-    cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
+    cell = Cell.create(np.asarray(system.cell.matrix), system.pbc)
 
     def furthest(one: np.ndarray, other: np.ndarray) -> float:
         return float(np.sqrt(np.max(sum(c * c for c in displacement(cell, one.T, other.T)))))
@@ -262,16 +265,16 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
         yield cause("reversed", "reversed")
 
 
-def positions_of(system: System, steps: int, program: ProgramName) -> Float[np.ndarray, "steps 3 atoms"]:
+def positions_of(
+    simulation: Simulation, steps: int, program: ProgramName
+) -> Float[np.ndarray, "steps 3 atoms"]:
     """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
 
     Ends before an atom has moved by half the skin of the one list.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state
-    from mdnum.systems.build import build
 
-    simulation = build(system)
     room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
     skin = min(2 * simulation.rule.skin, room)
     simulation = replace(simulation, rule=replace(simulation.rule, skin=skin, check=True))
@@ -340,14 +343,14 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 # --- histories in a fresh process ---------------------------------------------------------------------
 
 
-def digests(system: System | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
+def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
     """Digests of the histories at some values of a number, one after the other."""
     number = program_of(system, steps).number(key)
     return [number.at(value).history(steps).digest for value in values]
 
 
 def digests_elsewhere(
-    system: System | BallSystem,
+    system: Simulation | BallSystem,
     key: str,
     steps: int,
     values: Sequence[float],
@@ -375,7 +378,7 @@ def digests_elsewhere(
         progress(0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {"path": str(system.write(folder / "system")), "key": key, "steps": steps}
+        question = {"path": _written(system, folder), "key": key, "steps": steps}
         asked = [value.hex() for value in values]
         failed = _ask({**question, "values": asked}, folder / "question.json", heard)
     if failed or len(found) != len(asked):
@@ -384,6 +387,18 @@ def digests_elsewhere(
             remedy="Run `mdnum doctor`",
         )
     return found
+
+
+def _written(system: Simulation | BallSystem, scratch: Path) -> str:
+    """The file from which another process makes a system again, bit for bit.
+
+    Raises:
+        InputError: it was made of objects, which are in this process only.
+    """
+    own = system if isinstance(system, BallSystem) else system.file
+    if own is None:
+        raise InputError("objects of this process cannot be made again by another", where=system.name)
+    return str(own.write(scratch / "system"))
 
 
 # --- asking and answering -----------------------------------------------------------------------------
@@ -440,14 +455,14 @@ def _ask(
 def main() -> None:
     """Answer the question in the file that the last argument names."""
     question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
-    system = load(question["path"])
+    system = opened(question["path"])
     if "values" in question:
         for value in question["values"]:
             print(*digests(system, question["key"], question["steps"], [float.fromhex(value)]), flush=True)
         return
     if question["reduction"]:
         system = varied(system, {"precision.reduction": question["reduction"]})
-    assert isinstance(system, System)
+    assert not isinstance(system, BallSystem)
     np.save(question["out"], positions_of(system, question["steps"], question["program"]))
 
 

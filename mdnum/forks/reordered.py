@@ -22,7 +22,7 @@ from jaxtyping import Bool, Int
 
 from mdnum.md.neighbors import ListBuilder, PairTable, VerletList
 from mdnum.numerics.sums import Halves, Reduction, Sequential, Twice
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: The sums that go with each format.
 _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}

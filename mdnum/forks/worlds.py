@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
-
-from pydantic import ValidationError
+from typing import TYPE_CHECKING, Any
 
 from mdnum.ball.limits import DTYPES, rounded
-from mdnum.errors import InputError
 from mdnum.program import Program, Twin
-from mdnum.systems import BallSystem, System
+from mdnum.systems import BallSystem
 from mdnum.systems.toml import flat
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 #: What has a dtype of its own, by world.
 ROLES = {
@@ -27,8 +27,8 @@ ROLES = {
 _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 
-def program_of(system: System | BallSystem, steps: int | None = None) -> Program:
-    """The program of a loaded system.
+def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Program:
+    """The program of a simulation, or of a ball's system.
 
     Args:
         steps: of a ball, instead of the file's.
@@ -45,35 +45,25 @@ def program_of(system: System | BallSystem, steps: int | None = None) -> Program
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:
-    """The system with other values of some keys of its file, checked as the file is.
+    """The simulation with other values of some keys, checked as those of a system file are.
 
     Args:
-        system: as loaded, of either world.
-        values: dotted key to value. A key of the structure makes the atoms again.
+        system: a simulation, or the system of a ball.
+        values: dotted key to value. A key of the structure makes the atoms of a file again.
         name: of the choice, for messages about a ball.
 
     Raises:
-        InputError: a value that the file could not have.
+        InputError: a value that it could not have.
     """
     if isinstance(system, BallSystem):
         from mdnum.systems.load import vary
 
         name = name or ", ".join(values)
         return replace(system, spec=vary(name, values, system.spec, f"--vary {name}"), variants={})
-    from mdnum.systems import structures, toml
-    from mdnum.systems.schema import SystemSpec
+    from mdnum.systems.build import build
+    from mdnum.systems.parameters import changed
 
-    data = system.spec.model_dump(mode="python", exclude_none=True)
-    keys = {toml.dotted(key): value for key, value in values.items()}
-    toml.apply_overrides(data, keys, SystemSpec)
-    try:
-        spec = SystemSpec.model_validate(data)
-    except ValidationError as error:
-        raise InputError(error.errors()[0]["msg"], where=", ".join(values)) from None
-    atoms = system.atoms
-    if any(key[0] == "structure" for key in keys):
-        atoms = structures.make(spec.structure, spec.units, system.folder)
-    return replace(system, spec=spec, atoms=atoms)
+    return changed(build(system), values)
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
@@ -83,8 +73,8 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:
-    """Keys of the system files whose values differ, with both values."""
-    first, second = (flat(one.spec.model_dump(mode="json", exclude={"variants"})) for one in (a, b))
+    """Keys whose values differ, with both values."""
+    first, second = (flat(one) for one in _tables(a, b))
     return {
         key: [first.get(key), second.get(key)]
         for key in dict.fromkeys((*first, *second))
@@ -92,13 +82,23 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
     }
 
 
+def _tables(a: Any, b: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    if isinstance(a, BallSystem):
+        first, second = (one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
+        return first, second
+    from mdnum.systems.describe import keys_of
+
+    return keys_of(a, b)
+
+
 def floats(system: Any) -> dict[str, float]:
-    """The numbers of a system file that are floats and enter a step, by their dotted keys."""
+    """The numbers that are floats and enter a step, by their dotted keys."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
-    else:
-        data = system.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"})
-    return {key: value for key, value in flat(data).items() if isinstance(value, float)}
+        return {key: value for key, value in flat(data).items() if isinstance(value, float)}
+    from mdnum.systems.parameters import floats
+
+    return floats(system)
 
 
 def as_used(system: Any, key: str) -> tuple[float, Any]:

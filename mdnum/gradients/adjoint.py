@@ -272,7 +272,7 @@ class StretchReversal:
             raise InputError(
                 "what flips add is known for pair potentials only",
                 remedy="Use the method symmetric for a many-body potential",
-                where=simulation.system.name,
+                where=simulation.name,
             )
         self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
         self.onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)

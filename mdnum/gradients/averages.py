@@ -30,7 +30,7 @@ from mdnum.md.cutoffs import Hard
 from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.md.pairforce import PairForce
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Widths of the kernel, each half of the one before.
 WIDTHS = 5

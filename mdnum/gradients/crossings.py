@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.numerics import Ledger
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 if TYPE_CHECKING:
     from mdnum.gradients.tape import TapeStretch

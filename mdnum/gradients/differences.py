@@ -33,7 +33,7 @@ from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.roles import LATTICE
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: The widest step that is tried, and the spacing of the values that the noise is estimated from in rounding
 #: errors of the parameter, as shares of it.
@@ -300,7 +300,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
     """
     masses = simulation.masses
     kT = simulation.units.k_B * float(parameters.value(simulation, "dynamics.temperature"))
-    random = np.random.default_rng((seed, simulation.system.spec.dynamics.seed))
+    random = np.random.default_rng((seed, simulation.draw.seed))
     v = random.standard_normal((len(masses), 3)) * np.sqrt(kT / masses)[:, None]
     # a velocity that all atoms share is no temperature
     v -= masses @ v / masses.sum()

@@ -23,7 +23,7 @@ from mdnum.errors import InputError
 from mdnum.registry import Registry
 
 if TYPE_CHECKING:
-    from mdnum.systems.build import Simulation
+    from mdnum.systems.simulation import Simulation
 
 # why a complex loss is refused where a real one is needed, and what to do
 NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_grad, jnp.real or jnp.abs")

@@ -23,7 +23,7 @@ from mdnum.md.cell import Cell
 from mdnum.md.integrators import Integrator, Langevin
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.registry import nearest
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Other words for a parameter.
 _ALIASES = {
@@ -146,7 +146,7 @@ class _PairQuantity(Parameter):
     """An array of the cut pair potential with an entry for each pair type."""
 
     def of(self, model):
-        return getattr(model.potential, self.key)
+        return model.potential.leaves[self.key]
 
     def value(self):
         return _plain(self.of(self.simulation.model))
@@ -253,7 +253,7 @@ class _Temperature(Parameter):
     """It scales the velocities of step 0 with its root, and is that of a thermostat."""
 
     def value(self):
-        return np.asarray(float(self.simulation.system.spec.dynamics.temperature))
+        return np.asarray(float(self.simulation.draw.temperature))
 
     def changed(self, new):
         old, simulation = self.value(), self.simulation
@@ -261,10 +261,8 @@ class _Temperature(Parameter):
             raise InputError(
                 f"temperature {float(old):g} to {float(new):g}; expected both above 0", where="dynamics"
             )
-        dynamics = simulation.system.spec.dynamics.model_copy(update={"temperature": float(new)})
-        spec = simulation.system.spec.model_copy(update={"dynamics": dynamics})
         v = simulation.velocities * np.sqrt(float(new) / float(old))
-        simulation = replace(simulation, system=replace(simulation.system, spec=spec), velocities=v)
+        simulation = replace(simulation, draw=replace(simulation.draw, temperature=float(new)), velocities=v)
         if isinstance(simulation.integrator, Langevin):
             simulation = _integrated(simulation, "kT", simulation.units.k_B * new)
         return simulation
@@ -333,7 +331,7 @@ def parameter(simulation: Simulation, name: str) -> Parameter:
 def names(simulation: Simulation) -> tuple[str, ...]:
     """Parameters that a simulation has."""
     if simulation.pairwise:
-        found = [f"potential.{leaf.name}" for leaf in fields(simulation.model.potential)]
+        found = [f"potential.{name}" for name in simulation.model.potential.leaves]
         found += ["cutoff.radius"]
         if simulation.model.cutoff.switches:
             found += ["cutoff.onset"]
@@ -341,7 +339,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
         found = [f"potential.{name}" for name in _quantities_of(simulation.model)]
     found += ["dynamics.timestep"]
     # without one there is nothing that a temperature would scale
-    if simulation.system.spec.dynamics.temperature:
+    if simulation.draw.temperature:
         found += ["dynamics.temperature"]
     if isinstance(simulation.integrator, Langevin):
         found += ["dynamics.friction"]

@@ -20,7 +20,7 @@ from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Called with the steps done, all steps, and the name of the phase.
 Progress = Callable[[int, int, str], None]

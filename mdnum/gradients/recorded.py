@@ -31,8 +31,8 @@ from mdnum.gradients.problem import (
 from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
 from mdnum.md.lattice import forgotten_bits
-from mdnum.systems.build import Simulation
 from mdnum.systems.schema import ONSET_FRACTION
+from mdnum.systems.simulation import Simulation
 
 #: Default guard of event-aware gradients, as a share of the rms radial speed of a pair.
 GUARD = 1e-3

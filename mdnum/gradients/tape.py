@@ -27,7 +27,7 @@ from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point, room_for
 from mdnum.rollout.flips import PairRecorder
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Bytes of recorded stretches that a tape keeps.
 KEPT = 2**29
@@ -315,7 +315,7 @@ class ReversibleTape(RunTape):
         raise NumericalError(
             f"reversed, the run is not the one that was made: the way back went astray {where}",
             remedy="The run may have missed pairs: use a list that is rebuilt in time (neighbors.rebuild)",
-            where=self.simulation.system.name,
+            where=self.simulation.name,
         )
 
 

@@ -528,6 +528,7 @@ class EmbeddedAtom(ManyBody):
     embedding: Spline
     r_cut: float = eqx.field(static=True)
     name: str = eqx.field(static=True, kw_only=True, default="eam")
+    file: str = eqx.field(static=True, kw_only=True, default="")  # the table that it was read from
 
     def charge(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
         """Density of an atom at distance r; 0 at r = 0 (the atom itself) and from r_cut on."""
@@ -578,6 +579,7 @@ def embedded_atom(
         smoothness=_smoothness(table, pair, density, embedding),
         sources=tuple(line for line in table.comment if line.strip()),
         pbc=pbc,
+        file=str(path),
     )
 
 

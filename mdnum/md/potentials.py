@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -12,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
+from mdnum.errors import InputError
 from mdnum.md.cutoffs import AtCutoff, Cutoff
 from mdnum.registry import Registry
 
@@ -47,6 +51,19 @@ class PairPotential(eqx.Module):
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
         return jax.tree.map(lambda leaf: of_type(leaf, types), self)
+
+    @property
+    def leaves(self) -> dict[str, Float[Array, "types"]]:
+        """Its parameters by name, each with one entry per pair type."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:
+        """The same form with other parameters."""
+        return replace(self, **leaves)
+
+    def constants(self, kind: int) -> dict[str, float]:
+        """Its parameters for one pair type."""
+        return {name: float(leaf[kind]) for name, leaf in self.leaves.items()}
 
 
 class LennardJones(PairPotential):
@@ -97,6 +114,76 @@ class SoftSphere(PairPotential):
             self.epsilon / self.alpha * power * overlap,
             -self.epsilon / self.sigma * power / (r + r),
         )
+
+
+class PairFunction(PairPotential):
+    """A pair energy u(r, **parameters) or u(r2, **parameters) that a person wrote; its slope is jax's.
+
+    Example:
+        >>> def morse(r, depth, alpha, r0):
+        ...     e = jnp.exp(-alpha * (r - r0))
+        ...     return depth * (e * e - 2 * e)
+        >>> PairFunction(morse, depth=0.2, alpha=1.4, r0=2.9)
+
+    Args:
+        function: of jax operations, elementwise in its first argument, whose name says whether that is the
+            distance, `r` (length), or its square, `r2`.
+        parameters: by name, a number for all pairs or one for each pair of species, {"Ni-P": 0.2, ...}.
+
+    Raises:
+        InputError: the first argument is neither, or the parameters are not those of the function.
+    """
+
+    function: Callable[..., Any] = eqx.field(static=True)
+    parameters: dict[str, Any]  # in a simulation, arrays with one entry per pair type
+
+    def __init__(self, function: Callable[..., Any], **parameters: Any):
+        self.function, self.parameters = function, parameters
+        arguments = list(inspect.signature(function).parameters)
+        if arguments[:1] not in (["r"], ["r2"]):
+            raise InputError(
+                f"its first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
+                "distance, or r2, its square",
+                where=_name_of(function),
+                remedy="Name it r or r2",
+            )
+        try:
+            inspect.signature(function).bind(0.0, **parameters)
+        except TypeError as error:
+            raise InputError(
+                f"{error}; it takes {', '.join(arguments[1:])}",
+                where=_name_of(function),
+                remedy="Give every parameter by its name",
+            ) from None
+
+    name = property(lambda self: _name_of(self.function))  # type: ignore[assignment]
+
+    def evaluate(self, r2):
+        ones = jnp.ones_like(r2)
+        if next(iter(inspect.signature(self.function).parameters)) == "r2":
+            return jax.jvp(lambda q: self.function(q, **self.parameters), (r2,), (ones,))
+        r = jnp.sqrt(r2)
+        energy, slope = jax.jvp(lambda r: self.function(r, **self.parameters), (r,), (ones,))
+        return energy, slope / (r + r)
+
+    def reference(self, r, **constants):  # type: ignore[override]
+        return PairFunction(self.function, **constants)._on_host(r)
+
+    def _on_host(self, r):
+        r = jnp.asarray(r)
+        energy, slope = jax.jvp(lambda r: self.evaluate(r * r)[0], (r,), (jnp.ones(r.shape),))
+        return np.asarray(energy), np.asarray(slope)
+
+    @property
+    def leaves(self):
+        return self.parameters
+
+    def with_leaves(self, leaves):
+        return PairFunction(self.function, **{**self.parameters, **leaves})
+
+
+def _name_of(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", None) or type(function).__name__
 
 
 #: Every pair potential by its name; a package adds one by an entry point of this group. Its fields are the

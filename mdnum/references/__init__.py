@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mdnum.references.ase_models import MdnumCalculator as MdnumCalculator
+    from mdnum.references.calculator import MdnumCalculator as MdnumCalculator
     from mdnum.references.energy_check import check_dynamics as check_dynamics
     from mdnum.references.energy_check import check_energy as check_energy
     from mdnum.references.oracle import all_pairs as all_pairs
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mdnum.references.pair_check import effective_cutoff as effective_cutoff
 
 __getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "ase_models": "MdnumCalculator",
+    "calculator": "MdnumCalculator",
     "energy_check": "check_dynamics check_energy",
     "oracle": "all_pairs",
     "pair_check": "Search all_searches check_pairs effective_cutoff",

@@ -1,4 +1,4 @@
-"""ASE calculators: the one that corresponds to a system, and mdnum as one.
+"""ASE calculators: the one that corresponds to a simulation.
 
 What differs between the codes, and what is done about it:
 
@@ -20,22 +20,21 @@ shifted and switched forms such a pair has no energy, so only its force can diff
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from ase import Atoms
-from ase.calculators.calculator import Calculator, Parameters, PropertyNotImplementedError
+from ase.calculators.calculator import Calculator, PropertyNotImplementedError
 from ase.calculators.tersoff import Tersoff, TersoffParameters
-from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
+from ase.stress import voigt_6_to_full_3x3_stress
 from numpy import ndarray
-from pydantic import ValidationError
 
-from mdnum import systems
-from mdnum.errors import InputError, NumericalError
+from mdnum.errors import InputError
+from mdnum.md.potentials import CutPotential, PairFunction
 from mdnum.references.independent import (
     ClassicalCalculator,
     OnNeighborList,
@@ -46,10 +45,9 @@ from mdnum.references.independent import (
     edges_of,
     pair_forms,
 )
-from mdnum.systems import System, SystemSpec
-
-if TYPE_CHECKING:
-    from mdnum.systems.build import Evaluator, Simulation
+from mdnum.systems import System
+from mdnum.systems.build import model_of
+from mdnum.systems.simulation import Simulation
 
 
 @dataclass(frozen=True)
@@ -62,49 +60,69 @@ class Reference:
     make: Callable[[], Calculator]  # a fresh calculator
 
 
-def reference(system: System) -> Reference:
-    """The best judge there is for a system: ASE where it has the class, else plain numpy."""
-    kind = system.spec.potential.kind
+def reference(subject: Simulation | System) -> Reference:
+    """The best judge there is for a simulation: ASE where it has the class, else plain numpy.
+
+    Args:
+        subject: a `Simulation`, or a `System`, which need not fit its box.
+    """
+    model, species, compare = _interaction(subject)
+    pairwise = isinstance(model, CutPotential)
+    kind = model.potential.name if pairwise else model.name
     if kind == "eam":
-        (file,) = system.tables
-        return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(file))
+        return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(Path(model.file)))
     if kind == "tersoff":
         constants = TersoffParameters(**asdict(TersoffModel()))
         return Reference(
             "ASE Tersoff", True, "none", lambda: Tersoff({("Si", "Si", "Si"): constants}, skin=0.0)
         )
     if kind == "stillinger-weber":
-        return independent(system)
-    species = system.species
-    forms = pair_forms(system.spec, species)
+        return independent(subject)
+    if not pairwise:
+        raise InputError("nothing here evaluates an energy function a second time", where=kind)
+    forms = pair_forms(model, species, compare)
     cutoff = forms[species[0], species[0]].cutoff
-    if (kind, cutoff) not in _ASE_PAIR:
-        return independent(system)
-    label, conversion, build = _ASE_PAIR[kind, cutoff]
+    if (kind, cutoff) not in _ASE_PAIR or isinstance(model.potential, PairFunction):
+        return independent(subject)
+    label, conversion, made = _ASE_PAIR[kind, cutoff]
     if len(species) == 1:
         form = forms[species[0], species[0]]
-        return Reference(label, True, conversion, lambda: build(form))
+        return Reference(label, True, conversion, lambda: made(form))
     return Reference(
         f"{label}, a sum over species",
         True,
         f"{conversion}; unlike pairs as all minus like (ASE's class has one set of constants)",
-        lambda: SpeciesSum(
-            [(build(forms[a, b]), a, b) for a, b in combinations_with_replacement(species, 2)]
-        ),
+        lambda: SpeciesSum([(made(forms[a, b]), a, b) for a, b in combinations_with_replacement(species, 2)]),
     )
 
 
-def independent(system: System) -> Reference:
-    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second."""
-    kind = system.spec.potential.kind
+def _interaction(subject: Simulation | System) -> tuple[Any, tuple[str, ...], str]:
+    """A potential with its end, the species, and what inside means."""
+    if isinstance(subject, Simulation):
+        return subject.model, subject.symbols, subject.decider.compare
+    spec = subject.spec
+    model = model_of(spec, subject.atoms, subject.folder, subject.name)
+    return model, subject.species, "r <" if spec.cutoff is None else spec.cutoff.compare
+
+
+def independent(subject: Simulation | System) -> Reference:
+    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second.
+
+    Args:
+        subject: a `Simulation`, or a `System`, which need not fit its box.
+    """
+    model, species, compare = _interaction(subject)
+    pairwise = isinstance(model, CutPotential)
     models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
-    make_model = models.get(kind) or (lambda: PairModel(pair_forms(system.spec, system.species)))
+    own = pairwise and isinstance(model.potential, PairFunction)
+    make_model = (lambda: PairModel(pair_forms(model, species, compare))) if pairwise else models[model.name]
     return Reference(
-        "plain numpy on ASE's neighbor list",
+        f"{'the function itself' if own else 'plain numpy'} on ASE's neighbor list",
         False,
-        "none: the formulas of the system file, written a second time",
+        "none: the function, called pair by pair outside of the loop" if own
+        else "none: the formulas of the system file, written a second time",
         lambda: OnNeighborList(make_model()),
-    )
+    )  # fmt: skip
 
 
 class StepAtCutoff(ClassicalCalculator):
@@ -272,149 +290,3 @@ def _short_listed_eam(file: Path) -> Calculator:
             self.neighbors.update(atoms)
 
     return ShortListed(potential=str(file), form="alloy", skin=0.0)
-
-
-# --- the other way round: mdnum as an ASE calculator, for anything in ASE that wants one ----------------
-
-# a change of either is another program; positions and cell are arguments of it
-_REBUILD = {"numbers", "pbc"}
-
-
-class MdnumCalculator(ClassicalCalculator):
-    """What mdnum computes for a system file, wherever ASE takes a calculator.
-
-    For relaxing with ase.optimize, for stress and equations of state, and for holding mdnum's forces
-    against ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its
-    skin; for molecular dynamics use mdnum's rollout, which records its flips.
-
-    Args:
-        system: a `System`, or the name or path of one, whose structure is not used; or a `Simulation`, for
-            its own atoms at other places.
-        overrides: keys of the system file to change, as `--set` does.
-        potential, cutoff, units: instead of a system: the tables of a system file as dictionaries, and
-            "metal" (Å, eV) or "lj".
-    Raises:
-        InputError: neither or both of system and potential; tables that a system file could not hold. At the
-            first use: species without constants, a cell narrower than two cutoffs; a coordinate that is not
-            finite.
-        NumericalError: an energy or a force that is not finite, as of two atoms at one place.
-        TypeError: another keyword.
-
-    Example:
-        >>> argon = MdnumCalculator(
-        ...     potential={"kind": "lennard-jones", "sigma": 3.405, "epsilon": 0.0103235},
-        ...     cutoff={"kind": "switched", "radius": 8.5, "onset": 7.0},
-        ... )
-    """
-
-    def __init__(
-        self,
-        system: System | Simulation | str | None = None,
-        *,
-        overrides: Mapping[str, Any] | None = None,
-        potential: Mapping[str, Any] | None = None,
-        cutoff: Mapping[str, Any] | None = None,
-        units: str = "metal",
-    ):
-        from mdnum.systems.build import Simulation
-
-        super().__init__()
-        self._evaluator: Evaluator | None = None
-        self._given: Simulation | None = None
-        where = "MdnumCalculator"
-        if (system is None) == (potential is None):
-            remedy = "Say MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
-            raise InputError("give either a system or a potential", remedy=remedy, where=where)
-        if potential is not None:
-            self._template = System("calculator", _spec(potential, cutoff, units), None, Atoms())
-        elif isinstance(system, System | Simulation):
-            if overrides:
-                remedy = "Pass the name of the system, or load it with the overrides"
-                raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
-            self._template = system if isinstance(system, System) else system.system
-            self._given = system if isinstance(system, Simulation) else None
-        else:
-            self._template = systems.load(str(system), overrides, world="md")
-        if not (self._template.spec.cutoff if self._given is None else self._given.pairwise):
-            # a potential of many bodies need not split its energy by atom
-            self.implemented_properties = [one for one in self.implemented_properties if one != "energies"]
-        kept = self._template.spec.model_dump(exclude_none=True, include={"potential", "cutoff", "units"})
-        self.parameters = Parameters(kept)
-
-    @property
-    def system(self) -> System:
-        """What is evaluated: the tables of the system file with the atoms of the last call."""
-        return self._template if self._evaluator is None else self._evaluator.simulation.system
-
-    def set(self, **changes: Any) -> dict[str, Any]:
-        """Changes nothing: another potential is another calculator.
-
-        Raises:
-            TypeError: something is to be changed.
-        """
-        if changes:
-            raise TypeError(f"MdnumCalculator has no {', '.join(changes)} to set; make another calculator")
-        return {}
-
-    def evaluated(self, atoms, changes):
-        numbers = {"atom": atoms.positions, "lattice vector": np.asarray(atoms.cell)}
-        for what, rows in numbers.items():
-            if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
-                place = f"{what} {bad[0]} is {rows[bad[0]].tolist()}"
-                raise InputError(f"{place}; expected finite numbers", where="MdnumCalculator")
-        if self._evaluator is None or _REBUILD & set(changes):
-            self._evaluator = self._made_for(atoms)
-        evaluation = self._evaluator(atoms.get_positions(), np.asarray(atoms.cell))
-        results = {"energy": float(evaluation.energy), "forces": np.array(evaluation.forces)}
-        if not all(np.isfinite(value).all() for value in results.values()):
-            pair = ""
-            if len(r := evaluation.distance):
-                near = int(np.argmin(r))
-                pair = f"; the closest pair is {evaluation.i[near]}-{evaluation.j[near]} at {r[near]:.4g}"
-            raise NumericalError(
-                f"an energy or a force is not finite{pair}", where="MdnumCalculator",
-                remedy="Relax the structure with a softer potential, or move the atoms apart",
-            )  # fmt: skip
-        if "energies" in self.implemented_properties:
-            results["energies"] = np.array(evaluation.energies)
-        if atoms.cell.rank == 3 and atoms.pbc.any():
-            results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(evaluation.stress))
-        return results
-
-    def _made_for(self, atoms: Atoms) -> Evaluator:
-        """What evaluates these atoms, wherever they are and in whatever box."""
-        from mdnum.systems.build import Evaluator
-
-        # only what the forces depend on: constraints and the like stay with ASE
-        bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-        if self._given is not None:
-            own = self._given.system.atoms
-            if not (np.array_equal(own.numbers, bare.numbers) and np.array_equal(own.pbc, bare.pbc)):
-                raise InputError(
-                    "these are other atoms than the simulation's", where="MdnumCalculator",
-                    remedy="Give the system instead: MdnumCalculator(mdnum.load(...))",
-                )  # fmt: skip
-            return Evaluator(self._given)
-        # the evaluator keeps as much of the skin as the box has room for; it must not be refused for it
-        neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
-        spec = self._template.spec.model_copy(update={"neighbors": neighbors})
-        simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
-        return Evaluator(simulation, skin=self._template.spec.skin)
-
-
-def _spec(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None, units: str) -> SystemSpec:
-    """The tables of a system file around a potential; structure and dynamics are never looked at."""
-    data: dict[str, Any] = {
-        "units": units,
-        "structure": {"file": "none"},
-        "potential": dict(potential),
-        "dynamics": {"kind": "nve", "timestep": 1.0},
-    }
-    if cutoff is not None:
-        data["cutoff"] = dict(cutoff)
-    try:
-        return SystemSpec.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(first["msg"], where=f"MdnumCalculator: {where}") from None

@@ -11,13 +11,15 @@ from ase import Atoms
 from jaxtyping import Int
 from numpy import ndarray
 
+from mdnum.md.integrators import VelocityVerlet as OwnVerlet
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.independent import SLACK, Edges, PairModel, edges_of, pair_forms
 from mdnum.references.oracle import rounding_bound
-from mdnum.systems import System, build, schema
-from mdnum.systems.build import Evaluation
+from mdnum.systems import build
+from mdnum.systems.evaluate import Evaluation
+from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import with_images
 
 #: What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale.
@@ -114,7 +116,7 @@ def check_energy(
     """Compare energies, forces and stresses with ASE (or, where ASE has no class, with plain numpy).
 
     Args:
-        subject: a `System`, or a `Simulation` built from one.
+        subject: a `Simulation`, or what `mdnum.build` makes one from.
         frames: positions and cells to compare at, by name or in order, or names and frames as they come;
             default the initial frame and one some steps later, which a crystal needs to have forces at all.
         judge: instead of the reference chosen by `ase_models.reference`.
@@ -126,41 +128,42 @@ def check_energy(
     Raises:
         InputError: the system cannot be built.
     """
-    simulation = build(subject) if isinstance(subject, System) else subject
-    system: System = simulation.system
-    judge = reference(system) if judge is None else judge
-    third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
+    simulation = build(subject)
+    judge = reference(simulation) if judge is None else judge
+    third = independent(simulation) if judge.is_ase and simulation.potential.name != "eam" else None
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
     compared: list[FrameComparison] = []
     sampled: set[int] = set()
     for seed, (name, atoms) in enumerate(named):
-        sample = system.spec.cutoff is not None and len(atoms) > SAMPLED
+        sample = simulation.pairwise and len(atoms) > SAMPLED
         whole, mine = _evaluated(atoms, simulation, stress=not sample)
         if not sample:
-            compared.append(_compare(name, whole, mine, simulation, system, calculator, other))
+            compared.append(_compare(name, whole, mine, simulation, calculator, other))
             continue
         for cluster, chosen in neighborhoods(whole, simulation.r_cut, seed=seed):
             of = f"{name}, around atom {chosen[0]}"
             part = _part(mine, cluster, chosen, simulation.r_cut)
-            compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
+            compared.append(_compare(of, cluster, part, simulation, calculator, other))
             sampled |= set(chosen.tolist())
     of, ok = (judge.label, judge.is_ase, judge.conversion), all(frame.ok for frame in compared)
-    return EnergyReport(system.name, *of, narrowest(system), tuple(compared), ok, len(sampled) or None)
+    return EnergyReport(
+        simulation.name, *of, narrowest(simulation), tuple(compared), ok, len(sampled) or None
+    )
 
 
-def narrowest(system: System) -> str:
+def narrowest(simulation: Simulation) -> str:
     """The narrowest float type among the roles that energies and forces depend on."""
-    precision = system.spec.precision
+    precision = simulation.policy
     roles = (precision.state, precision.force, precision.accumulate)
     return max(map(str, map(carrier, roles)), key=unit_roundoff)
 
 
-def _places(system: System) -> str:
+def _places(simulation: Simulation) -> str:
     """The narrowest float type of places: a force in sixteen bits has the displacements of the decision."""
-    precision = system.spec.precision
+    precision = simulation.policy
     if precision.force in WIDE:
-        return narrowest(system)
+        return narrowest(simulation)
     return max(map(str, map(carrier, (precision.state, precision.decision))), key=unit_roundoff)
 
 
@@ -171,23 +174,22 @@ def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
         return frames.items()
     if frames is not None:
         return ((f"frame {number}", atoms) for number, atoms in enumerate(frames))
-    system: System = simulation.system
-    steps = min(SOME_STEPS, system.spec.dynamics.steps)
+    steps = min(SOME_STEPS, simulation.steps)
     positions = simulation.positions
     for positions, _, _ in _rollout(simulation, steps):  # noqa: B007 the last one counts
         pass
-    later = system.atoms.copy()
+    first, later = simulation.structure.copy(), simulation.structure.copy()
+    first.set_positions(simulation.positions)
     later.set_positions(positions)
-    return ("initial", system.atoms), (f"step {steps}", later)
+    return ("initial", first), (f"step {steps}", later)
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
     """A frame as the state can hold it, and what mdnum makes of it."""
     positions = atoms.get_positions()
-    if simulation.system.spec.precision.state == "float32":
+    if simulation.policy.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
-    pbc = simulation.system.atoms.pbc
-    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=pbc)
+    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=simulation.structure.pbc)
     return stored, simulation.evaluate(positions, np.asarray(atoms.cell), stress)
 
 
@@ -201,19 +203,19 @@ def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Ev
 
 
 def _compare(
-    name: str, stored: Atoms, mine: Evaluation, simulation: Any, system: System, calculator: Any, other: Any
+    name: str, stored: Atoms, mine: Evaluation, simulation: Simulation, calculator: Any, other: Any
 ) -> FrameComparison:
     theirs = _of_first(evaluate(calculator, stored), len(mine.forces))
     third = _of_first(evaluate(other, stored), len(mine.forces)) if other is not None else None
-    scale = _Scales.of(system, simulation, stored, mine, theirs)
+    scale = _Scales.of(simulation, stored, mine, theirs)
     energy_rel, force_max = _off(mine, theirs, scale.energy)
     stress_max = stress_rel = None
     if theirs["stress"] is not None:
         stress_max = float(np.abs(np.asarray(mine.stress) - theirs["stress"]).max())
         stress_rel = _over(stress_max, scale.stress)
     force_rel = _over(force_max, scale.force)
-    if narrowest(system) == "float64":
-        tolerance = ENERGY_PAIR if system.spec.cutoff is not None else ENERGY_MANY_BODY
+    if narrowest(simulation) == "float64":
+        tolerance = ENERGY_PAIR if simulation.pairwise else ENERGY_MANY_BODY
         ok = energy_rel <= tolerance and force_rel <= FORCE and (stress_rel is None or stress_rel <= FORCE)
     else:
         close = abs(float(mine.energy) - theirs["energy"]) <= ROUNDINGS * scale.energy_expected
@@ -263,18 +265,16 @@ class _Scales:
     ambiguous: int
 
     @classmethod
-    def of(
-        cls, system: System, simulation: Any, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]
-    ) -> _Scales:
+    def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
         """Scales of a frame; pair by pair where there are pairs, else from the totals."""
-        unit, places = unit_roundoff(narrowest(system)), unit_roundoff(_places(system))
+        unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
         positions, cell = atoms.get_positions(), np.asarray(atoms.cell)
         # a displacement is a difference of coordinates of this size, each rounded once or twice
         shift = rounding_bound(positions, cell, 0.0, unit_roundoff=places) / 8.0
         i, j, r = (np.asarray(array) for array in (mine.i, mine.j, mine.distance))
-        if system.spec.cutoff is None:
+        if not simulation.pairwise:
             # many-body potentials need not split their energy by atom
             split = theirs["energies"]
             energies = float(np.abs(theirs["energy"] if split is None else split).sum())
@@ -288,7 +288,7 @@ class _Scales:
         if places < unit:
             # the distance itself is rounded, too
             shift = shift + unit * r
-        model = PairModel(pair_forms(system.spec, system.species))
+        model = PairModel(pair_forms(simulation.model, simulation.symbols, simulation.decider.compare))
         edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
         energies, forces, stiffness = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i))
         for form, rows in model.groups(edges):
@@ -375,33 +375,34 @@ class DynamicsReport:
         ]
 
 
-def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
+def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
     """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
 
-    A Langevin system is run without its bath. A hard cutoff has the forces of ASE's shifted one, so the
+    A system with a thermostat is run without it. A hard cutoff has the forces of ASE's shifted one, so the
     trajectories must agree although the energies have different zeros.
 
     Args:
+        subject: a `Simulation`, or what `mdnum.build` makes one from.
         judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
     """
     # its optimizers come with it, and a run that is only compared needs none
     from ase.md.verlet import VelocityVerlet
 
-    system = _without_bath(system)
-    judge = _forces(system) if judge is None else judge
-    simulation = build(system)
-    narrow = system.spec.precision.state == "float32"
+    simulation = build(subject)
+    simulation = replace(simulation, integrator=OwnVerlet(simulation.integrator.timestep))
+    judge = _forces(simulation) if judge is None else judge
+    narrow = simulation.policy.state == "float32"
     start = simulation.positions.astype(np.float32).astype(np.float64) if narrow else simulation.positions
     atoms = Atoms(
-        numbers=system.atoms.numbers,
+        numbers=simulation.structure.numbers,
         positions=start,
-        cell=system.atoms.cell,
-        pbc=system.atoms.pbc,
+        cell=simulation.structure.cell,
+        pbc=simulation.structure.pbc,
         masses=simulation.masses,
     )
     atoms.set_velocities(simulation.velocities)
     atoms.calc = judge.make()
-    integrator = VelocityVerlet(atoms, timestep=system.spec.dynamics.timestep * system.units.time_factor)
+    integrator = VelocityVerlet(atoms, timestep=float(simulation.integrator.timestep))
 
     rows = []
     for step, (x, v, potential) in enumerate(_rollout(simulation, steps)):
@@ -410,28 +411,19 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
         off = np.abs(x - atoms.positions).max(), np.abs(v - atoms.get_velocities()).max()
         rows.append((*map(float, off), abs(potential - float(atoms.get_potential_energy()))))
     position, velocity, energy = zip(*rows, strict=True)
-    precision, r_cut = narrowest(system), simulation.r_cut
+    precision, r_cut = narrowest(simulation), simulation.r_cut
     tolerance = AGREEMENT[precision] * r_cut
     ok = len(position) == steps + 1 and position[-1] <= tolerance
     sudden = _sudden(position, floor=(1e-5 if narrow else 1e-13) * r_cut)
-    of = system.name, judge.label, judge.is_ase, precision, steps
+    of = simulation.name, judge.label, judge.is_ase, precision, steps
     return DynamicsReport(*of, position, velocity, energy, _growth(position), sudden, r_cut, tolerance, ok)
 
 
-def _without_bath(system: System) -> System:
-    dynamics = system.spec.dynamics
-    if isinstance(dynamics, schema.NVETable):
-        return system
-    shared = dynamics.model_dump(exclude={"kind", "friction"})
-    nve = schema.NVETable(kind="nve", **shared)
-    return replace(system, spec=system.spec.model_copy(update={"dynamics": nve}))
-
-
-def _forces(system: System) -> Reference:
+def _forces(simulation: Simulation) -> Reference:
     """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
-    judge = reference(system)
-    slow = system.spec.potential.kind == "tersoff" or len(system.species) > 1
-    return independent(system) if slow and system.spec.potential.kind != "eam" else judge
+    kind, judge = simulation.potential.name, reference(simulation)
+    slow = kind == "tersoff" or len(simulation.symbols) > 1
+    return independent(simulation) if slow and kind != "eam" else judge
 
 
 def _sudden(position: Sequence[float], floor: float) -> int | None:

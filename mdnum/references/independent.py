@@ -27,9 +27,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff
-from mdnum.md.potentials import POTENTIALS
-from mdnum.systems import pairs
-from mdnum.systems.schema import SystemSpec
+from mdnum.md.potentials import PairPotential
 
 
 @dataclass(frozen=True)
@@ -138,12 +136,17 @@ class PairForm:
     """The interaction of one pair of species."""
 
     species: tuple[str, str]  # the two symbols
-    kind: str  # potential
+    potential: PairPotential  # of all pairs
     constants: Mapping[str, float]  # its constants by name, in the units of the system file
     cutoff: str  # cutoff kind
     r_cut: float  # cutoff radius
     r_onset: float  # where switching starts; r_cut for cutoffs that do not switch
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
+
+    @property
+    def kind(self) -> str:
+        """Name of the potential."""
+        return self.potential.name
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
         """Whether distances count as inside, in the space and with the comparison of the system file."""
@@ -155,7 +158,7 @@ class PairForm:
         """u(r) and u'(r) without any cutoff."""
         if self.kind in _BARE:
             return _BARE[self.kind](r, **self.constants)
-        return POTENTIALS[self.kind].reference(r, **self.constants)
+        return self.potential.reference(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
@@ -165,28 +168,26 @@ class PairForm:
         return CUTOFFS.parse(self.cutoff).reference(r, u, du, at)
 
 
-def pair_forms(spec: SystemSpec, species: tuple[str, ...]) -> dict[tuple[str, str], PairForm]:
+def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:
     """The interaction of every two species, both orders.
-    Raises:
-        InputError: a pair of species has no constants or no radius.
+
+    Args:
+        symbols: of the species, sorted.
+        compare: what inside means, as in a system file.
     """
-    if spec.cutoff is None:
-        raise TypeError(f"{spec.potential.kind} has no [cutoff]")
-    tables = pairs.pair_constants(spec, species)
-    radius, onset = pairs.cutoff_radii(spec, species)
-    return {
-        (a, b): PairForm(
+    forms = {}
+    for kind, (x, y) in enumerate(zip(*np.triu_indices(len(symbols)), strict=True)):
+        a, b = symbols[x], symbols[y]
+        forms[a, b] = forms[b, a] = PairForm(
             (a, b),
-            spec.potential.kind,
-            {name: float(table[x, y]) for name, table in tables.items()},
-            spec.cutoff.kind,
-            float(radius[x, y]),
-            float(radius[x, y] if onset is None else onset[x, y]),
-            spec.cutoff.compare,
+            model.potential,
+            model.potential.constants(kind),
+            model.cutoff.name,
+            float(model.r_cut[kind]),
+            float(model.r_onset[kind]),
+            compare,
         )
-        for x, a in enumerate(species)
-        for y, b in enumerate(species)
-    }
+    return forms
 
 
 def _lennard_jones(r: ndarray, sigma: float, epsilon: float) -> tuple[ndarray, ndarray]:

@@ -20,7 +20,8 @@ from mdnum.references.conformance.case import once
 from mdnum.references.conformance.lists import ListLimits, PairList
 from mdnum.references.conformance.peers import known
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
-from mdnum.systems import System
+from mdnum.systems.construct import with_atoms
+from mdnum.systems.simulation import Simulation
 
 AGREES, AT_THE_CUTOFF, DIFFERS = "agrees", "differs at the cutoff", "differs"
 FAILED, NOT_ASKED = "failed", "not asked"
@@ -105,21 +106,20 @@ class Search:
         return positions, cell
 
 
-def all_searches(system: System) -> tuple[Search, ...]:
+def all_searches(system: Simulation) -> tuple[Search, ...]:
     """mdnum's own searches with the convention of a system, and those of libraries."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
 
-def own_searches(system: System) -> tuple[Search, ...]:
+def own_searches(system: Simulation) -> tuple[Search, ...]:
     """What mdnum uses for this system.
 
     "mdnum force loop" is the set of decisions that multiply the forces, out of jit. The other two are its
     list builders with the same decision made on the host.
     """
-    compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
-    dtype = system.spec.precision.decision
-    unit = _SINGLE if "float32" in (dtype, system.spec.precision.state) else 2.0**-53
+    compare, dtype = system.decider.compare, system.policy.decision
+    unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
 
     searches = {
         "mdnum force loop": (_force_loop(system), 1.0),
@@ -133,33 +133,35 @@ def own_searches(system: System) -> tuple[Search, ...]:
     )
 
 
-def _force_loop(system: System) -> Callable[..., Any]:
+def _force_loop(system: Simulation) -> Callable[..., Any]:
     built: dict[Any, Any] = {}
 
     def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
         key = (len(positions), pbc.tobytes(), r_cut)
         if key not in built:
-            built[key] = systems.build(_variant(system, positions, cell, pbc, r_cut))
+            built[key] = _variant(system, positions, cell, pbc, r_cut)
         evaluation = built[key].evaluate(positions, cell, stress=False)
         return np.asarray(evaluation.i), np.asarray(evaluation.j)
 
     return search
 
 
-def _variant(system: System, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> System:
+def _variant(system: Simulation, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Simulation:
     """The system itself, or two atoms of it with r_cut for all pairs, without a skin to ask for room."""
-    spec = system.spec
-    spec = spec.model_copy(update={"neighbors": spec.neighbors.model_copy(update={"skin": 0.0})})
-    if len(positions) == len(system.atoms):
-        atoms = Atoms(numbers=system.atoms.numbers, positions=positions, cell=cell, pbc=pbc)
-        return replace(system, spec=spec, atoms=atoms)
-    # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
-    a = b = 0
-    if spec.cutoff is not None:
-        radius, _ = systems.pairs.cutoff_radii(spec, system.species)
-        a, b = np.argwhere(radius == r_cut)[0]
-    atoms = Atoms([system.species[a], system.species[b]], positions=positions, cell=cell, pbc=pbc)
-    return replace(system, spec=spec, atoms=atoms)
+    species = system.structure.numbers
+    if len(positions) != system.atoms:
+        # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
+        a, b = np.argwhere(_radii(system) == r_cut)[0]
+        species = [system.symbols[a], system.symbols[b]]
+    return with_atoms(system, Atoms(species, positions=positions, cell=cell, pbc=pbc), skin=0.0)
+
+
+def _radii(system: Simulation) -> ndarray:
+    """The cutoff radius of every two species, shape (species, species)."""
+    rows, columns = np.triu_indices(len(system.symbols))
+    table = np.zeros((len(system.symbols),) * 2)
+    table[rows, columns] = table[columns, rows] = system.decider.r_cut
+    return table
 
 
 def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
@@ -237,7 +239,7 @@ class PairsReport:
 
 
 def check_pairs(
-    system: System,
+    subject: Any,
     *,
     searches: Sequence[Search] | None = None,
     positions: ndarray | None = None,
@@ -250,17 +252,17 @@ def check_pairs(
     otherwise is "at the cutoff", which is rounding or convention and not an error.
 
     Args:
+        subject: a `Simulation`, or what `mdnum.build` makes one from.
         searches: default: mdnum's own and those of every library that is installed.
         positions: instead of the system's own.
         effective: also bisect each search's effective cutoff.
     """
-    x: ndarray = system.atoms.get_positions() if positions is None else np.asarray(positions, dtype=float)
-    cell, pbc, species = np.asarray(system.atoms.cell), np.asarray(system.atoms.pbc), system.species_index
-    compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
+    system = systems.build(subject)
+    x: ndarray = system.positions if positions is None else np.asarray(positions, dtype=float)
+    cell, pbc, species = np.asarray(system.structure.cell), np.asarray(system.pbc), system.species
+    compare = system.decider.compare
     # each cutoff radius with the pairs of species it is for, as a square table of booleans
-    radius = np.full((len(system.species),) * 2, system.r_cut)
-    if system.spec.cutoff is not None:
-        radius, _ = systems.pairs.cutoff_radii(system.spec, system.species)
+    radius = _radii(system)
     groups = [(float(value), radius == value) for value in np.unique(radius)[::-1]]
     truth = []
     for value, chosen in groups:

@@ -256,6 +256,7 @@ class Page:
     about: str = ""  # one line below it
     keys: Sequence[Key] = ()  # the numbers in brief
     sections: Sequence[Section] = ()  # in order; findings come before them, provenance after
-    system_toml: str = ""  # the system that was run, empty where none was
+    system_file: str = ""  # name of the file that says what was run, empty where nothing was
+    system: str = ""  # its text
     provenance: Mapping[str, Any] = field(default_factory=dict)  # of the folder
     pictures: Mapping[str, str] = field(default_factory=dict)  # figures that are drawn already, by their name

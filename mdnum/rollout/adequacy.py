@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.systems.build import Evaluator, Simulation
+from mdnum.systems.evaluate import Evaluator
+from mdnum.systems.simulation import Simulation
 
 # a Lanczos iteration of 12 steps finds the highest frequency of a liquid and of a crystal within 3 %
 _LANCZOS, _MOVE = 12, 1e-4
@@ -68,9 +68,9 @@ def beyond_cutoff(simulation: Simulation) -> Mapping[str, float] | None:
     node, weight = (node + 1) / 2, weight / 2
     energy = pressure = 0.0
     potential = simulation.potential
-    kinds = zip(*np.triu_indices(len(simulation.system.species)), strict=True)
+    kinds = zip(*np.triu_indices(len(simulation.symbols)), strict=True)
     for kind, (a, b) in enumerate(kinds):
-        constants = {one.name: float(getattr(potential, one.name)[kind]) for one in fields(potential)}
+        constants = potential.constants(kind)
         end = float(simulation.model.r_cut[kind])
         # from r = end to infinity is s = end / r from 1 to 0
         r = end / node

@@ -24,7 +24,7 @@ from mdnum.md.lattice import LatticeLangevin
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import EpochProgram, EpochRecord, EpochState, write_row
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 
 class Back(NamedTuple):

@@ -30,7 +30,7 @@ from mdnum.rollout.epoch import (
     empty_record,
     run_epoch,
 )
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
 _RECORD_BYTES = 64 * 2**20

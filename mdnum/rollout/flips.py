@@ -16,7 +16,7 @@ from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
 from mdnum.numerics import Ledger, count_set
 from mdnum.rollout.engine import Segment
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 
 @njit
@@ -176,7 +176,7 @@ class PairRecorder:
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
         self._narrow = None if decider.dtype == "float64" else self._decision_cell.numbers
         self._rule = decider.space == "r", decider.compare.endswith("<=")
-        types = len(simulation.system.species) if simulation.pair_types > 1 else 1
+        types = len(simulation.symbols) if simulation.pair_types > 1 else 1
         self._kinds = pair_type(np.arange(types)[:, None], np.arange(types), types)
         self._species = simulation.species if types > 1 else np.zeros(simulation.atoms, np.int64)
         thresholds = np.array([threshold.value for threshold in decider.thresholds])

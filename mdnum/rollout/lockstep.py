@@ -17,7 +17,7 @@ from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, ReferenceFra
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import AmbiguousPairs
 from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 
 def lockstep(

@@ -32,8 +32,11 @@ from mdnum.rollout.summary import (
 )
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
-from mdnum.systems.build import Simulation, build, evaluate_listed
-from mdnum.systems.load import System, load
+from mdnum.systems.build import build
+from mdnum.systems.describe import again
+from mdnum.systems.evaluate import evaluate_listed
+from mdnum.systems.load import System
+from mdnum.systems.simulation import Simulation
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Shown = Callable[[Simulation, np.ndarray], None]
@@ -223,13 +226,13 @@ class Rollout:
 
     def _frame(self, segment: Segment, row: int, tables: Any) -> Atoms:
         step, simulation = segment.first + row, self.simulation
-        atoms: Atoms = simulation.system.atoms.copy()
+        atoms: Atoms = simulation.structure.copy()
         atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
         atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
         # ASE's trajectories drop arrays that they do not know
         atoms.info["images"] = segment.unsorted("images", row)
         atoms.info["step"] = step
-        atoms.info["time"] = step * simulation.system.spec.dynamics.timestep
+        atoms.info["time"] = step * simulation.timestep
         # the loop records no forces: they are worked out again, with its list and hence its decisions
         made, _, virial = evaluate_listed(simulation.force, segment.rows_of("x")[row], tables, True)
         forces = np.empty((len(atoms), 3))
@@ -302,7 +305,7 @@ class Rollout:
         self.folder.write_summary(summary)
         raise NumericalError(
             message,
-            where=self.simulation.system.name,
+            where=self.simulation.name,
             remedy=f"Everything up to step {kept} is in {self.folder.path}. "
             "Use a shorter dynamics.timestep, relax the structure or lower the temperature",
             folder=self.folder.path,
@@ -315,7 +318,7 @@ def _finite_rows(segment: Segment) -> Segment:
 
 
 def run(
-    system: System | str | Path | None,
+    system: Simulation | System | str | Path | None,
     *,
     out: str | Path | None = None,
     steps: int | None = None,
@@ -328,7 +331,8 @@ def run(
     """Simulate a system and record every flip into a run folder.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file; None when resuming.
+        system: a simulation, a system, a shipped name or the path of a system file; None when resuming, but
+            for a simulation that was made of objects.
         out: the new run folder; default runs/<name>-<n>.
         steps: last step; default the system's.
         save_every: a trajectory frame every so many steps; default the system's.
@@ -344,21 +348,22 @@ def run(
     """
     began = time.perf_counter()
     if resume is not None:
-        if system is not None or save_every is not None or overrides:
+        given = system if isinstance(system, Simulation) else None
+        if system is not given or save_every is not None or overrides:
             raise InputError(
                 "a resumed run keeps its own system, settings and save_every",
                 remedy="Give only the folder and, to go further, steps",
                 where=str(resume),
             )
-        finished = _finished(Path(resume), steps)
+        finished = _finished(Path(resume), steps, given)
         if finished is not None:
             return finished
-        rollout = _resumed(Path(resume), steps, progress, began)
+        rollout = _resumed(Path(resume), given, steps, progress, began)
     elif system is None:
         raise InputError("no system given", remedy="Name a system, or a folder to resume")
     else:
-        loaded = load(system, overrides, world="md")
-        rollout = _fresh(loaded, out, steps, save_every, progress, began)
+        simulation = build(system, overrides)
+        rollout = _fresh(simulation, out, steps, save_every, progress, began)
     rollout.shown = shown
     try:
         summary = rollout.run()
@@ -371,19 +376,18 @@ def run(
     return RunResult(rollout.folder.path, summary, rollout.simulation, frames)
 
 
-def _fresh(system: System, out, steps, save_every, progress, began) -> Rollout:
-    simulation = build(system)
-    last = system.spec.dynamics.steps if steps is None else steps
-    every = system.spec.record.save_every if save_every is None else save_every
+def _fresh(simulation: Simulation, out, steps, save_every, progress, began) -> Rollout:
+    last = simulation.steps if steps is None else steps
+    every = simulation.save_every if save_every is None else save_every
     if last < 0 or every < 0:
         raise InputError("steps and save_every must not be negative")
-    folder = RunFolder.create(Path(out) if out is not None else default_folder(system.name))
-    system.write(folder.path)
-    folder.write_provenance(provenance.collect(system))
+    folder = RunFolder.create(Path(out) if out is not None else default_folder(simulation.name))
+    simulation.write(folder.path)
+    folder.write_provenance(provenance.collect(simulation))
     return Rollout(simulation, folder, last, every, progress, began)
 
 
-def _finished(path: Path, steps: int | None) -> RunResult | None:
+def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunResult | None:
     """The result of a run that has nothing left to do; None where it has."""
     folder = RunFolder.open(path)
     summary = folder.summary
@@ -396,10 +400,10 @@ def _finished(path: Path, steps: int | None) -> RunResult | None:
             return None
         folder.check_start()
         frames = (np.asarray(saved["first"], np.float64), np.asarray(saved["last"], np.float64))
-        return RunResult(path, summary, build(load(path / "system.toml")), frames)
+        return RunResult(path, summary, again(path, given), frames)
 
 
-def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
+def _resumed(path: Path, given: Simulation | None, steps: int | None, progress, began) -> Rollout:
     folder = RunFolder.open(path)
     if folder.summary.get("status") == "failed":
         raise FolderError(
@@ -413,7 +417,7 @@ def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
         if steps is not None and steps < int(np.asarray(state["state_step"])) - 1:
             raise FolderError(f"has run past step {steps} already", where=str(path))
         folder.check_start()
-        simulation = build(load(path / "system.toml"))
+        simulation = again(path, given)
         last = int(state["steps"]) if steps is None else steps
         rollout = Rollout(simulation, folder, last, int(state["save_every"]), progress, began)
         rollout.restore(state)

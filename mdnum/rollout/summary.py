@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.md.cell import displacement, wrap_positions
+from mdnum.md.integrators import Langevin
 from mdnum.numerics import Ledger, unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
-from mdnum.systems import schema
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 
 @dataclass
@@ -106,7 +106,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
     potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
     temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
     step = segment.first + row
-    time = step * simulation.system.spec.dynamics.timestep
+    time = step * simulation.timestep
     return (
         f"{step:8d} {time:10.4f} {potential:14.6f} {kinetic:14.6f} {potential + kinetic:14.6f} "
         f"{temperature:12.4f} {pairs:9d} {flips:6d}"
@@ -117,12 +117,12 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
     """The content of summary.json, without the references' and the report's part."""
     tally, health, budget = done.tally, done.health, done.budget
     energy_jump, force_jump = simulation.jumps()
-    timestep = simulation.system.spec.dynamics.timestep
+    timestep = simulation.timestep
     cutoff = simulation.cutoff
     slope, without = tally.conserved.slope, tally.without_jumps.slope
     return {
-        "system": simulation.system.name,
-        "about": simulation.system.spec.about,
+        "system": simulation.name,
+        "about": simulation.origin.about,
         "status": status,
         "units": simulation.units.name,
         "atoms": simulation.atoms,
@@ -195,9 +195,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 def degrees_of_freedom(simulation: Simulation) -> int:
     """3 N, less the three of a center of mass that nothing moves."""
-    conserved = simulation.system.spec.dynamics.remove_drift and not isinstance(
-        simulation.system.spec.dynamics, schema.LangevinTable
-    )
+    conserved = simulation.draw.remove_drift and not isinstance(simulation.integrator, Langevin)
     return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
 
 
@@ -224,7 +222,7 @@ def series_columns(
     pressure = (2 * kinetic + segment.rows_of("virial")) / (3 * simulation.cell.volume)
     return {
         "step": step,
-        "time": step * simulation.system.spec.dynamics.timestep,
+        "time": step * simulation.timestep,
         "potential": potential,
         "kinetic": kinetic,
         "total": total,

@@ -19,7 +19,7 @@ from mdnum.rollout.compared import Apart, PairFlips, ReferenceFrame, in_user_ord
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.epoch import EpochRecord, EpochState, Pins, empty_record, run_epoch
 from mdnum.rollout.flips import AmbiguousPairs, PairRecorder, decided_pairs
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ class Handed:
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "species species"]:
     """The cutoff of each pair of species, length."""
     radii = np.array(simulation.decider.r_cut)
-    count = len(simulation.system.species)
+    count = len(simulation.symbols)
     if len(radii) == 1:
         return np.full((count, count), radii[0])
     first, second = np.indices((count, count))

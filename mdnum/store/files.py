@@ -22,6 +22,8 @@ from mdnum.reading import whole_text
 
 #: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
 SUBFOLDERS = ("parts", "figures", "structures")
+#: What was run: a system file, or the description of a simulation that was made of objects.
+SYSTEM_FILE, SIMULATION_FILE = "system.toml", "simulation.json"
 
 _REMEDIES = {
     errno.ENOSPC: ("the disk is full", "Free some space, then {again}"),

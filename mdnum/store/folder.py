@@ -25,17 +25,27 @@ from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
-from mdnum.store.files import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
+from mdnum.store.files import (
+    SIMULATION_FILE,
+    SUBFOLDERS,
+    SYSTEM_FILE,
+    disk_errors,
+    opened,
+    read_text,
+    refuse_link,
+    write_text,
+)
 from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
 
 _FILES = (
-    "system.toml", "structure.extxyz", "provenance.json", "summary.json", "log.txt", "checkpoint.npz",
-    "trajectory.traj", "report.html", "gradients.npz", "answers.json",
+    SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "summary.json", "log.txt",
+    "checkpoint.npz", "trajectory.traj", "report.html", "gradients.npz", "answers.json",
     *(f"{name}.parquet" for name in COLUMNS),
 )  # fmt: skip
+_SYSTEM = (SYSTEM_FILE, SIMULATION_FILE)
 _LOCK = ".lock"
 # of those, what nothing is read from: each report writes it anew
 _WRITTEN_ANEW = "report.html"
@@ -43,7 +53,8 @@ _WRITTEN_ANEW = "report.html"
 _FURTHER = re.compile(r"reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 # what may be in a folder whose writing came to nothing
 _NOTHING_YET = (
-    "system.toml", "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK, "parts",
+    SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK,
+    "parts",
 )  # fmt: skip
 _RESTORE = "Restore it from a copy, or run again in a new folder"
 # what values of another kind or form than those that were written lead to
@@ -51,7 +62,21 @@ _OF_WRONG_VALUES = (
     ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
 # what people do with system.toml and log.txt changes no number that was recorded
-_EDITED = ("system.toml", "log.txt")
+_EDITED = (SYSTEM_FILE, "log.txt")
+
+
+def system_tables(file: Path) -> dict[str, Any]:
+    """The tables of a system file in a run folder, or of the description of a simulation made of objects.
+
+    Raises:
+        FolderError: it is no TOML, or no JSON.
+    """
+    text, is_json = read_text(file), file.suffix == ".json"
+    try:
+        return json.loads(text) if is_json else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        kind = "JSON" if is_json else "TOML"
+        raise FolderError(f"is damaged: not valid {kind} ({error})", where=str(file)) from error
 
 
 class RunFolder:
@@ -408,22 +433,19 @@ class RunFolder:
         return stream.flushed
 
     @property
-    def system_toml(self) -> str:
-        """The text of system.toml."""
-        return read_text(self.path / "system.toml")
+    def system_file(self) -> Path | None:
+        """What says what was run: the system file, or the description of objects; None without a system."""
+        return next((self.path / name for name in _SYSTEM if (self.path / name).exists()), None)
 
     @property
     def system(self) -> dict[str, Any]:
-        """The tables of system.toml; empty if there is none.
+        """The tables of the system that was run; empty if there is none.
 
         Raises:
-            FolderError: it is no TOML.
+            FolderError: its file is no TOML, or no JSON.
         """
-        try:
-            return tomllib.loads(self.system_toml)
-        except (ValueError, RecursionError) as error:
-            where = str(self.path / "system.toml")
-            raise FolderError(f"is damaged: not valid TOML ({error})", where=where) from error
+        file = self.system_file
+        return {} if file is None else system_tables(file)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -503,7 +525,7 @@ class RunFolder:
         """
         for name in self._listed():
             further = name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
-            if further or name in ("system.toml", "structure.extxyz"):
+            if further or name in (*_SYSTEM, "structure.extxyz"):
                 self.check(name)
 
     def noted(self) -> list[str]:

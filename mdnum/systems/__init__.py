@@ -15,8 +15,9 @@ from mdnum.systems.load import BallSystem, System, copy, load, names, shipped_fo
 from mdnum.systems.schema import SystemSpec
 
 if TYPE_CHECKING:
-    from mdnum.systems.build import Simulation, build
+    from mdnum.systems.build import build
     from mdnum.systems.build_ball import BallSimulation, build_ball
+    from mdnum.systems.simulation import Simulation
 
 __all__ = [
     "BallSimulation",
@@ -36,7 +37,7 @@ __all__ = [
 
 _LATER = {
     "build": "mdnum.systems.build",
-    "Simulation": "mdnum.systems.build",
+    "Simulation": "mdnum.systems.simulation",
     "build_ball": "mdnum.systems.build_ball",
     "BallSimulation": "mdnum.systems.build_ball",
 }

@@ -10,22 +10,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-import numpy as np
-from jaxtyping import Float64, Int64
-
 from mdnum import units as unit_systems
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import whole_text
 from mdnum.registry import nearest
-from mdnum.store.files import disk_errors, replacing, write_text
+from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, disk_errors, replacing, write_text
 from mdnum.systems import pairs, schema, structures, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
-from mdnum.systems.toml import SYSTEM_FILE, Source, apply_overrides, checked, read_overrides
+from mdnum.systems.toml import Source, apply_overrides, checked, read_overrides
 
 if TYPE_CHECKING:
     from ase import Atoms
 
+    from mdnum.systems.simulation import Simulation
+
 STRUCTURE_FILE = "structure.extxyz"
+#: Of a system file: words, what is hashed by itself, and what is asked about the run.
+_NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants", "fork"}
+#: What can be done with a folder whose simulation came from no file.
+GIVE_OBJECTS = "Give the simulation itself, made by the same code, from Python"
 BALL_SCHEMA = "ball-schema.json"
 
 
@@ -50,12 +53,12 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
 
 
 def world_of(name: Any) -> str:
-    """ "md" or "ball", of a loaded system or read from its file unchecked; "md" where that is no TOML.
+    """ "md" or "ball", of a system or simulation, or read from a file unchecked; "md" where that is no TOML.
 
     Raises:
         InputError: nothing of that name.
     """
-    if isinstance(name, System | BallSystem):
+    if not isinstance(name, str | Path):
         return "ball" if isinstance(name, BallSystem) else "md"
     try:
         return str(_world(find(name)[1]))
@@ -79,6 +82,10 @@ def find(name: str | Path) -> tuple[str, Path]:
     text = str(name)
     if path.is_dir() and (path / SYSTEM_FILE).is_file():
         return path.resolve().name, path / SYSTEM_FILE
+    if path.is_dir() and (path / SIMULATION_FILE).is_file():
+        raise InputError(
+            "was made of objects, and no file says how to make them again", where=text, remedy=GIVE_OBJECTS
+        )
     if path.is_file():
         return path.stem, path
     if path.suffix == ".toml":
@@ -141,28 +148,35 @@ class System:
     @property
     def species(self) -> tuple[str, ...]:
         """Chemical symbols present, sorted."""
-        from ase.data import chemical_symbols
-
-        return tuple(sorted(chemical_symbols[number] for number in np.unique(self.atoms.numbers)))
+        return structures.species_of(self.atoms)[0]
 
     @property
-    def species_index(self) -> Int64[np.ndarray, " atoms"]:
-        """Each atom's place in species."""
-        from ase.data import atomic_numbers, chemical_symbols
-
-        place = np.zeros(len(chemical_symbols), np.int64)
-        place[[atomic_numbers[symbol] for symbol in self.species]] = np.arange(len(self.species))
-        return place[self.atoms.numbers]
+    def draw(self) -> structures.Draw:
+        """How the velocities of step 0 are made."""
+        dynamics, drawn = self.spec.dynamics, not self.atoms.has("momenta")
+        return structures.Draw(float(dynamics.temperature), dynamics.seed, dynamics.remove_drift, drawn)
 
     @property
-    def velocities(self) -> Float64[np.ndarray, "atoms 3"] | None:
-        """Velocities the structure came with (length per internal time), or None."""
-        return self.atoms.get_velocities() if self.atoms.has("momenta") else None
+    def without_skin(self) -> System:
+        """The same with a list that asks the box for no room."""
+        neighbors = self.spec.neighbors.model_copy(update={"skin": 0.0})
+        return replace(self, spec=self.spec.model_copy(update={"neighbors": neighbors}))
+
+    @property
+    def ignored(self) -> list[str]:
+        """Columns of the structure's file that look like velocities, where none of it are read."""
+        structure = self.spec.structure
+        return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
     @property
     def r_cut(self) -> float:
         """The longest interaction (length)."""
         return pairs.longest_radius(self.spec, self.species, self.folder)
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """Every number and choice but the structure, plain values: what is hashed."""
+        return self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
 
     @property
     def tables(self) -> set[Path]:
@@ -220,6 +234,11 @@ class BallSystem:
     spec: BallSpec
     path: Path | None = None
     variants: Mapping[str, BallSpec] = field(default_factory=dict)
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """Every number and choice, plain values: what is hashed."""
+        return self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
 
     @property
     def balls(self) -> int:
@@ -400,6 +419,19 @@ def load(
     return _ball(spec, source) if isinstance(spec, BallSpec) else _md(spec, source)
 
 
+def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
+    """What a verb of both worlds works with: a simulation, or the system of a ball; arguments as for `load`.
+
+    Raises:
+        InputError: anything that cannot be run, in one line.
+    """
+    if world_of(system) == "ball":
+        return load(system, overrides)  # type: ignore[arg-type]
+    from mdnum.systems.build import build
+
+    return build(system, overrides)  # type: ignore[arg-type]
+
+
 def _check_world(name: str | Path, is_ball: bool, world: str | None) -> None:
     if world is not None and is_ball != (world == "ball"):
         verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
@@ -429,7 +461,13 @@ def _md(spec: schema.SystemSpec, source: Source) -> System:
     try:
         atoms = structures.make(spec.structure, spec.units, source.path.parent)
         system = System(spec.name or source.name, spec, source.path, atoms)
-        structures.check(atoms, spec, system.r_cut, system.units.length)
+        potential: Any = spec.potential
+        sigmas = [potential.sigma] if getattr(potential, "sigma", None) is not None else []
+        sigmas += [
+            row.sigma for row in (getattr(potential, "pairs", None) or {}).values() if hasattr(row, "sigma")
+        ]
+        smallest = structures.smallest_distance(potential.kind, spec.units, sigmas)
+        structures.check(atoms, system.r_cut, spec.skin, smallest, system.units.length)
     except InputError as error:
         if error.where:
             raise

@@ -15,12 +15,12 @@ from jaxtyping import Float64
 
 from mdnum.errors import InputError
 from mdnum.systems import schema
-from mdnum.systems.schema import SystemSpec, pair_key
+from mdnum.systems.schema import Interaction, SystemSpec, pair_key
 
 Table = Float64[np.ndarray, "species species"]
 
 
-def pair_constants(spec: SystemSpec, species: tuple[str, ...]) -> dict[str, Table]:
+def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> dict[str, Table]:
     """Each constant of a pair potential for every pair of species.
 
     Args:
@@ -59,7 +59,7 @@ def pair_constants(spec: SystemSpec, species: tuple[str, ...]) -> dict[str, Tabl
     return tables
 
 
-def cutoff_radii(spec: SystemSpec, species: tuple[str, ...]) -> tuple[Table, Table | None]:
+def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tuple[Table, Table | None]:
     """Cutoff radius and onset for every pair of species.
 
     Returns:

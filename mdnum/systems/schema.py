@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
@@ -428,6 +428,25 @@ class RecordTable(TomlTable):
     )
 
 
+class Interaction(NamedTuple):
+    """A potential and its end, without a system around them."""
+
+    potential: Any  # a table of `Potential`
+    cutoff: CutoffTable | None
+
+
+def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
+    """Raise ValueError where a potential and a cutoff do not belong together."""
+    kind = potential.kind
+    if isinstance(potential, PairPotentialTable):
+        if cutoff is None:
+            raise ValueError(f"table [cutoff] missing; {kind} needs one")
+        if cutoff.in_sigma is not None and "sigma" not in potential.constants:
+            raise ValueError(f"cutoff.in_sigma needs a potential with a sigma; {kind} has none, give radius")
+    elif cutoff is not None:
+        raise ValueError(f"[cutoff] given, but {kind} carries its own cutoff; remove the table")
+
+
 class SystemSpec(TomlTable):
     """A system file."""
 
@@ -447,16 +466,7 @@ class SystemSpec(TomlTable):
 
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> SystemSpec:
-        kind = self.potential.kind
-        if isinstance(self.potential, PairPotentialTable):
-            if self.cutoff is None:
-                raise ValueError(f"table [cutoff] missing; {kind} needs one")
-            if self.cutoff.in_sigma is not None and "sigma" not in self.potential.constants:
-                raise ValueError(
-                    f"cutoff.in_sigma needs a potential with a sigma; {kind} has none, give radius"
-                )
-        elif self.cutoff is not None:
-            raise ValueError(f"[cutoff] given, but {kind} carries its own cutoff; remove the table")
+        check_interaction(self.potential, self.cutoff)
         return self
 
     @property

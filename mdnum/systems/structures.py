@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ase import Atoms
 
     from mdnum.md.cell import Cell
+    from mdnum.units import Units
 
 #: Closer than this (Å) is a mistake in any structure of metal units without a pair sigma.
 _SMALLEST_DISTANCE = 0.3
@@ -30,6 +32,32 @@ _ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
 _FARTHEST = 1e8
 #: Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair.
 _SMALLEST_IN_SIGMA = 0.4
+
+
+@dataclass(frozen=True)
+class Draw:
+    """How the velocities of step 0 are made, unless the structure has them."""
+
+    temperature: float  # Maxwell-Boltzmann's, and a thermostat's, in the unit of the simulation
+    seed: int = 0  # of the draw and of a thermostat's noise
+    remove_drift: bool = True  # whether the velocity of the center of mass is taken out
+    drawn: bool = True  # whether they were drawn; else they are the structure's
+
+    def velocities(
+        self, masses: Float64[np.ndarray, " atoms"], units: Units, own: Float64[np.ndarray, "atoms 3"] | None
+    ) -> Float64[np.ndarray, "atoms 3"]:
+        """Velocities of step 0, length per internal time.
+
+        Args:
+            own: the structure's, or None for a draw.
+        """
+        velocities = own
+        if velocities is None:
+            noise = np.random.default_rng(self.seed).standard_normal((len(masses), 3))
+            velocities = noise * np.sqrt(units.k_B * self.temperature / masses)[:, None]
+        if self.remove_drift and len(masses) > 1:
+            velocities = velocities - masses @ velocities / masses.sum()
+        return np.asarray(velocities, np.float64)
 
 
 def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
@@ -63,6 +91,16 @@ def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, 
         # momenta and not velocities: dividing by the mass once keeps what is written and read the same bits
         atoms.set_momenta(np.asarray(source.get_momenta(), dtype=np.float64))
     return atoms
+
+
+def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms"]]:
+    """Chemical symbols present, sorted, and each atom's place among them."""
+    from ase.data import chemical_symbols
+
+    numbers, place = np.unique(atoms.numbers, return_inverse=True)
+    symbols = [chemical_symbols[number] for number in numbers]
+    order = sorted(range(len(symbols)), key=symbols.__getitem__)
+    return tuple(symbols[k] for k in order), np.argsort(order)[place]
 
 
 def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
@@ -154,11 +192,13 @@ def _set_masses(
     atoms.set_array("masses", masses, float, ())
 
 
-def check(atoms: Atoms, spec: schema.SystemSpec, r_cut: float, length: str) -> None:
+def check(atoms: Atoms, r_cut: float, skin: float, smallest: float, length: str) -> None:
     """Refuse a structure that cannot be simulated.
 
     Args:
         r_cut: longest interaction (length).
+        skin: of the Verlet list (length).
+        smallest: atoms closer than this are a mistake (length).
         length: name of the unit of length, for messages.
 
     Raises:
@@ -171,8 +211,8 @@ def check(atoms: Atoms, spec: schema.SystemSpec, r_cut: float, length: str) -> N
     # ASE, which the run is compared with, wants vectors of free axes to span a volume too
     Cell.create(atoms.cell, atoms.pbc | atoms.cell.array.any(axis=1))
     cell = Cell.create(atoms.cell, atoms.pbc)
-    _check_width(cell, r_cut, spec.skin, length)
-    _check_overlap(atoms, cell, _smallest_distance(spec), length)
+    _check_width(cell, r_cut, skin, length)
+    _check_overlap(atoms, cell, smallest, length)
 
 
 def _check_finite(atoms: Atoms) -> None:
@@ -227,16 +267,18 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
     )
 
 
-def _smallest_distance(spec: schema.SystemSpec) -> float:
-    potential: Any = spec.potential
-    if isinstance(potential, schema.SoftSphereTable):
+def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
+    """Atoms closer than this are a mistake in a structure with this kind of potential, length.
+
+    Args:
+        sigmas: of a Lennard-Jones potential, length.
+    """
+    if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
-    if isinstance(potential, schema.LennardJonesTable):
-        sigmas = [potential.sigma] if potential.sigma is not None else []
-        sigmas += [row.sigma for row in (potential.pairs or {}).values()]
+    if kind == "lennard-jones":
         return _SMALLEST_IN_SIGMA * min(sigmas)
-    return _SMALLEST_DISTANCE if spec.units == "metal" else 1e-3
+    return _SMALLEST_DISTANCE if units == "metal" else 1e-3
 
 
 def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> None:

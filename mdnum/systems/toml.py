@@ -27,7 +27,6 @@ from mdnum.registry import nearest
 
 Key = tuple[str, ...]
 #: Name of the system file in a folder.
-SYSTEM_FILE = "system.toml"
 
 #: Depth of tables and arrays beyond which a file is refused.
 _DEEPEST = 20

@@ -13,13 +13,13 @@ import numpy as np
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed
-from mdnum.systems import structures
 from mdnum.trajectories.frame import Box, Frame, far_out
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
     from mdnum.references.pair_check import PairsReport
     from mdnum.systems import System
+    from mdnum.systems.simulation import Simulation
 
 TEXTS, RUN_TEXTS = Texts(__file__), Texts(Path(__file__).with_name("run.py"))
 # ratio of temperatures from which on the one of a structure is another than the one requested
@@ -40,23 +40,29 @@ class Checked:
         return plain({"ok": self.report.ok, **vars(self.report), **worst, "findings": self.verdict.findings})
 
 
-def check(question: str, system: System) -> Checked:
-    """Check a system.
+def check(question: str, system: Simulation | System | str | Path) -> Checked:
+    """Compare a system with other codes.
 
     Args:
         question: "energy", "pairs" or "dynamics".
+        system: a simulation, a system, a shipped name or the path of a system file.
+
+    Raises:
+        InputError: the system cannot be run.
     """
     from mdnum.references.energy_check import check_dynamics, check_energy
     from mdnum.references.pair_check import check_pairs
+    from mdnum.systems import build
 
+    simulation = build(system)
     checks: Mapping[str, tuple[Callable[[Any], Any], Callable[[Any], Iterator[Finding]]]] = {
         "energy": (check_energy, energy_findings),
         "pairs": (check_pairs, pair_findings),
         "dynamics": (check_dynamics, dynamics_findings),
     }
     compare, findings = checks[question]
-    report: Any = compare(system)
-    headline = TEXTS("agrees" if report.ok else "differs", system=system.name)
+    report: Any = compare(simulation)
+    headline = TEXTS("agrees" if report.ok else "differs", system=simulation.name)
     return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
 
 
@@ -66,16 +72,15 @@ def structure_findings(system: System) -> Iterator[Finding]:
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
         yield TEXTS.finding("ATOM_FAR", atom=far[0], why=far[2])
-    structure, dynamics = system.spec.structure, system.spec.dynamics
-    if (velocities := system.velocities) is not None:
+    draw = system.draw
+    if not draw.drawn:
         masses = system.atoms.get_masses()
-        if dynamics.remove_drift and len(masses) > 1:
-            velocities = velocities - masses @ velocities / masses.sum()
+        velocities = draw.velocities(masses, system.units, system.atoms.get_velocities())
         twice = float((masses[:, None] * velocities**2).sum())
         temperature = twice / (3 * len(masses) * system.units.k_B)
         unit = system.units.temperature
-        yield from temperature_findings(temperature, dynamics.temperature, len(masses), unit)
-    elif structure.velocities == "file" and (names := structures.ignored(structure, system.folder)):
+        yield from temperature_findings(temperature, draw.temperature, len(masses), unit)
+    elif names := system.ignored:
         yield TEXTS.finding("VELOCITIES_IGNORED", names=listed([f"“{name}”" for name in names]))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -15,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError, expect_path
-from mdnum.reading import whole_text
+from mdnum.errors import InputError, MdnumError, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
@@ -211,15 +209,11 @@ def _species_cutoffs(words: str) -> dict[tuple[str, str], float]:
 
 
 def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """The cutoff with which mdnum made the file, from the system.toml beside it."""
+    """The cutoff with which mdnum made the file, from what says beside it what was run."""
     radius = None
-    try:
-        file = trajectory.path.parent / "system.toml"
-        system = tomllib.loads(whole_text(file, file))
-        radius = system.get("cutoff", {}).get("radius")
-    except (OSError, tomllib.TOMLDecodeError, AttributeError):
-        # no run of mdnum's
-        pass
+    # no run of mdnum's
+    with suppress(OSError, MdnumError, AttributeError):
+        radius = RunFolder(trajectory.path.parent).system.get("cutoff", {}).get("radius")
     if not isinstance(radius, int | float):
         unit = f" in {trajectory.length}" if trajectory.length else ""
         message = "no rule says which pairs count"

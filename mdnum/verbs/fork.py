@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from mdnum.forks import Fork
     from mdnum.systems import BallSystem, System
+    from mdnum.systems.simulation import Simulation
 
 #: Screens every choice that there is, where one is asked for.
 ALL = "all"
@@ -38,7 +39,7 @@ ALL = "all"
 
 @frame.keywords_checked
 def fork(
-    system: System | BallSystem | str | Path,
+    system: Simulation | System | BallSystem | str | Path,
     vary: str | None = None,
     *,
     steps: int | None = None,
@@ -54,7 +55,7 @@ def fork(
     """Run a system and its twin that differs in one choice, and say where and why they diverge.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file, of either world.
+        system: a simulation, a system, a shipped name or the path of a system file, of either world.
         vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. Default what
             the [fork] table of the system file says, as for steps and split, and else "precision".
         steps: last step; default the system's own.
@@ -82,16 +83,16 @@ def fork(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
-    from mdnum.systems import BallSystem, load
+    from mdnum.systems import BallSystem
+    from mdnum.systems.load import opened
 
-    loaded: System | BallSystem = load(system, keep.pop("overrides", None))
-    own = loaded.spec.fork
-    asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
-    if own is not None:
-        vary = own.vary if vary is None else vary
-        asked = replace(
-            asked, steps=own.steps if steps is None else steps, split=own.split if split is None else split
-        )
+    loaded = opened(system, keep.pop("overrides", None))
+    own = _asked_by_default(loaded)
+    vary = own.get("vary") if vary is None else vary
+    asked = PairQuestion(
+        own.get("steps") if steps is None else steps, own.get("split") if split is None else split,
+        repeats, counterfactual, back, lyapunov, minimal, pin,
+    )  # fmt: skip
     check(asked)
     if vary == ALL:
         given = {"split": split is not None, "repeats": repeats is not None, "minimal": minimal,
@@ -107,7 +108,7 @@ def fork(
     elif pin is not None:
         from mdnum.forks.replays import parse_pin
 
-        parse_pin(pin, len(loaded.atoms))
+        parse_pin(pin, loaded.atoms)
     word, world = vary or "precision", world_of(loaded)
     choice = parse(word, world)
     labels = {"choice": word, "choice_about": choice.describe(world), "must_hold": choice.must_hold}
@@ -115,9 +116,18 @@ def fork(
     return followed(loaded, twin_of(choice, loaded), labels, asked, **keep)
 
 
+def _asked_by_default(system: Any) -> Mapping[str, Any]:
+    """What the [fork] table of a system file asks: vary, steps and split."""
+    from mdnum.systems.load import world_of
+
+    if world_of(system) == "md":
+        return system.origin.fork
+    return {} if system.spec.fork is None else system.spec.fork.model_dump()
+
+
 @frame.keywords_checked
 def fork_screen(
-    system: System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
+    system: Simulation | System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Follow the free runs of every choice, and rank the choices by when they fork.
 
@@ -132,11 +142,10 @@ def fork_screen(
         its result is a list of `mdnum.forks.pair.Screened`.
     """
     from mdnum.forks.pair import screen
-    from mdnum.systems import load
+    from mdnum.systems.load import opened
 
-    loaded: System | BallSystem = load(system, keep.get("overrides"))
-    if steps is None and loaded.spec.fork is not None:
-        steps = loaded.spec.fork.steps
+    loaded = opened(system, keep.get("overrides"))
+    steps = _asked_by_default(loaded).get("steps") if steps is None else steps
     check(PairQuestion(steps))
     with frame.answering("screen", f"fork-{loaded.name}", loaded, **keep) as answer:
 
@@ -172,13 +181,12 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
         InputError: the folders hold runs of other systems, or no runs.
         FolderError: a folder holds no run, or the new one cannot be used.
     """
-    from mdnum.forks.folders import compare_folders, twin_of
-    from mdnum.systems.load import load
+    from mdnum.forks.folders import compare_folders, simulation_in, twin_of
 
     keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
     frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
-    system: Any = load(found.a)
+    system: Any = simulation_in(found.a)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:
@@ -209,7 +217,7 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
 
 @frame.keywords_checked
 def fork_benign(
-    system: System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
+    system: Simulation | System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Whether a choice changes anything that would be measured: an ensemble-consistency test.
 

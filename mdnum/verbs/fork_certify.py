@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from mdnum.forks.processes import Variant
     from mdnum.systems import BallSystem, System
+    from mdnum.systems.simulation import Simulation
 
 TEXTS = Texts(__file__)
 
@@ -35,7 +36,7 @@ _NARROW = ("float16", "bfloat16")
 
 @frame.keywords_checked
 def fork_certify(
-    system: System | BallSystem | str | Path,
+    system: Simulation | System | BallSystem | str | Path,
     *,
     steps: int | None = None,
     policies: Mapping[str, Any] | None = None,
@@ -44,8 +45,8 @@ def fork_certify(
     """When runs in each precision leave the history in exact arithmetic.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file: Lennard-Jones, NVE, at most 108
-            atoms; or a ball whose steps are sums and products.
+        system: a simulation, a system, a shipped name or the path of a system file: Lennard-Jones, NVE, at
+            most 108 atoms; or a ball whose steps are sums and products.
         steps: last step; default the system's own.
         policies: precisions to rank, by name: dtypes by role, such as {"state": "float32"}; default
             `MD_POLICIES` or `BALL_POLICIES` of `mdnum.forks.exact.certify`.
@@ -60,13 +61,14 @@ def fork_certify(
     """
     from mdnum.forks.exact.certify import certify
     from mdnum.forks.exact.program import unsupported
-    from mdnum.systems import BallSystem, build, load
+    from mdnum.systems import BallSystem
+    from mdnum.systems.load import opened
 
-    loaded = load(system, keep.get("overrides"))
+    loaded = opened(system, keep.get("overrides"))
     last, ball = last_step(loaded, steps), isinstance(loaded, BallSystem)
     # what cannot be is refused before there is a folder; a ball takes no time
     found: Any = certify(loaded, last, policies, keep.get("progress")) if ball else None
-    simulation: Any = None if ball else build(loaded)
+    simulation: Any = None if ball else loaded
     if simulation is not None and (error := unsupported(simulation)) is not None:
         raise error
     with frame.answering("certify", f"fork-{loaded.name}", loaded, **keep) as answer:
@@ -266,7 +268,7 @@ def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
 
 @frame.keywords_checked
 def fork_processes(
-    system: System | str | Path,
+    system: Simulation | System | str | Path,
     *,
     steps: int | None = None,
     which: Sequence[Variant] | None = None,
@@ -275,7 +277,7 @@ def fork_processes(
     """Run a system jitted, eagerly, in a batch, in a gradient and under flags of XLA, and find which agree.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file; pair potentials only.
+        system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.
         steps: of each program; default 200, or the system's own where they are fewer.
         which: the variants; default `mdnum.forks.processes.VARIANTS`.
         keep: see `mdnum.verbs.frame.Keep`.

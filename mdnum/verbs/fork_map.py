@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mdnum.forks.boundaries import Boundary
     from mdnum.rollout.program import Loss
     from mdnum.systems import BallSystem, System
+    from mdnum.systems.simulation import Simulation
 
 TEXTS = Texts(__file__)
 
@@ -35,7 +36,7 @@ _ROOM = 0.03
 
 @frame.keywords_checked
 def fork_map(
-    system: System | BallSystem | str | Path,
+    system: Simulation | System | BallSystem | str | Path,
     key: str,
     low: float,
     high: float,
@@ -50,7 +51,7 @@ def fork_map(
     """Where the history of a run's decisions changes along a number, to adjacent floats.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file, of either world.
+        system: a simulation, a system, a shipped name or the path of a system file, of either world.
         key: the number, such as "potential.sigma", "timestep" or "position.17.x"; of a ball "k", "tol", "y0".
         low, high: the interval, in the units of the system's file; both belong to it.
         steps: last step of every run; default the system's own, but no more than 500 of molecular dynamics.
@@ -58,7 +59,8 @@ def fork_map(
         most: stop after this number of boundaries; default 24, and of a ball 64.
         loss: of the final state, called with the simulation, unwrapped positions and velocities; default the
             mean squared displacement from the start. That of a ball is the file's.
-        confirm: whether to run both sides of every boundary again in a fresh process.
+        confirm: whether to run both sides of every boundary again in a fresh process; not of a simulation
+            made of objects, which only this process has.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
@@ -70,9 +72,10 @@ def fork_map(
     """
     from mdnum.forks.boundaries import boundaries, checked
     from mdnum.forks.worlds import program_of
-    from mdnum.systems import BallSystem, load
+    from mdnum.systems import BallSystem
+    from mdnum.systems.load import opened
 
-    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    loaded = opened(system, keep.get("overrides"))
     if isinstance(loaded, BallSystem):
         if loss is not None:
             raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
@@ -86,6 +89,8 @@ def fork_map(
             lost = getattr(loss, "__name__", "loss"), ""
     # what cannot be is refused before there is a folder
     spelled = checked(program_of(loaded), key, low, high)
+    # another process cannot make objects of this one again
+    confirm = confirm and (isinstance(loaded, BallSystem) or loaded.file is not None)
     with frame.answering("map", f"fork-{loaded.name}", loaded, **keep) as answer:
         answer.result = found = boundaries(
             loaded, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
@@ -297,12 +302,12 @@ def _with_unit(text: str, unit: str) -> str:
 
 @frame.keywords_checked
 def fork_forecast(
-    system: System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
+    system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Which decisions a random displacement of the start would flip first, from one tangent run.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file; pair potentials only.
+        system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.
         size: of the displacement: how far the furthest atom is moved, length.
         steps: last step; default the system's own.
         keep: see `mdnum.verbs.frame.Keep`.
@@ -315,20 +320,19 @@ def fork_forecast(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.linearized import LINEAR, forecast
-    from mdnum.systems import build
 
     if not 0 < size < float("inf"):
         raise InputError(f"a displacement of {size:g}; expected a length above 0")
     loaded = of_md(system, keep.get("overrides"), "forecast", pairwise=True)
-    last, simulation = last_step(loaded, steps), build(loaded)
+    last = last_step(loaded, steps)
     with frame.answering("forecast", f"fork-{loaded.name}", loaded, **keep) as answer:
         frame.say(answer.log, "carrying a tangent along")
-        answer.result = found = forecast(simulation, last)
+        answer.result = found = forecast(loaded, last)
         flips = {"first": found.first(size, _LISTED), "nearest": found.nearest(_LISTED)}
         good = found.good_until(size)
         answer.summary = basics(loaded, last) | {
             "size": size, **flips, "until": good.step, "ends": good.ends, "kicks": found.kicks,
-            "examined": int(found.listed[: good.step + 1].sum()), "linear": LINEAR * simulation.r_cut,
+            "examined": int(found.listed[: good.step + 1].sum()), "linear": LINEAR * loaded.r_cut,
             "ulp": found.ulp,
         }  # fmt: skip
         least = np.argmin(found.reach, axis=2, keepdims=True)

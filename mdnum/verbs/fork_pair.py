@@ -16,7 +16,8 @@ from mdnum.verbs.frame import Answer, Keep, Outcome, Progress
 
 if TYPE_CHECKING:
     from mdnum.forks import Fork, Twin
-    from mdnum.systems import BallSystem, System
+    from mdnum.systems import BallSystem
+    from mdnum.systems.simulation import Simulation
 
 #: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
 FEW_STEPS = 500
@@ -61,15 +62,17 @@ def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
     """
     from mdnum.systems.load import world_of
 
-    own = (system.spec.integrator if world_of(system) == "ball" else system.spec.dynamics).steps
+    own = system.spec.integrator.steps if world_of(system) == "ball" else system.steps
     last = steps if steps is not None else own if most is None else min(most, own)
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
     return last
 
 
-def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False) -> System:
-    """A system of molecular dynamics, the only ones that a question is asked of.
+def of_md(
+    system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False
+) -> Simulation:
+    """A simulation, the only ones that a question is asked of.
 
     Args:
         question: whose sentence "ball_<question>" says what a ball offers in its place.
@@ -78,31 +81,32 @@ def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str, pairw
     Raises:
         InputError: it is a ball, has a many-body potential, or is no system.
     """
-    from mdnum.systems import BallSystem, load
+    from mdnum.systems import BallSystem
+    from mdnum.systems.load import opened
 
-    loaded = load(system, overrides)
+    loaded = opened(system, overrides)
     if isinstance(loaded, BallSystem):
         raise InputError("this system is a ball", where=loaded.name, remedy=TEXTS(f"ball_{question}"))
-    if pairwise and loaded.spec.cutoff is None:
+    if pairwise and not loaded.pairwise:
         remedy = "Use a system with a pair potential"
         raise InputError(TEXTS(f"many_body_{question}"), where=loaded.name, remedy=remedy)
     return loaded
 
 
-def basics(system: System | BallSystem, steps: int | None) -> dict[str, Any]:
+def basics(system: Simulation | BallSystem, steps: int | None) -> dict[str, Any]:
     """What every summary says of the system; steps default to its own."""
     from mdnum.systems import BallSystem
 
-    spec: Any = system.spec
-    own = spec.integrator if isinstance(system, BallSystem) else spec.dynamics
-    last = own.steps if steps is None else steps
-    head: dict[str, Any] = {"system": system.name, "about": spec.about}
+    head: dict[str, Any] = {"system": system.name}
     if isinstance(system, BallSystem):
+        spec, own = system.spec, system.spec.integrator
         counted = "impacts" if own.kind == "event-located" else "iterations"
-        head |= {"balls": system.balls, "contact_kind": spec.contact.kind, "integrator": own.kind,
-                 "counted": counted, "units": "ball"}  # fmt: skip
+        head |= {"about": spec.about, "balls": system.balls, "contact_kind": spec.contact.kind,
+                 "integrator": own.kind, "counted": counted, "units": "ball"}  # fmt: skip
     else:
-        head |= {"atoms": len(system.atoms), "units": system.units.name}
+        own = system
+        head |= {"about": system.origin.about, "atoms": system.atoms, "units": system.units.name}
+    last = own.steps if steps is None else steps
     return {
         **head, "steps": last, "steps_asked": last, "timestep": float(own.timestep), "status": "complete",
         "findings": [],
@@ -124,7 +128,7 @@ def check(asked: PairQuestion) -> None:
 
 
 def followed(
-    system: System | BallSystem,
+    system: Simulation | BallSystem,
     twin: Twin,
     labels: Mapping[str, Any],
     asked: PairQuestion,

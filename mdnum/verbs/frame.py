@@ -34,7 +34,7 @@ from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
 from mdnum.store import RunFolder
-from mdnum.store.files import default_folder
+from mdnum.store.files import default_folder, read_text
 
 if TYPE_CHECKING:
     from mdnum.units import Units
@@ -83,13 +83,8 @@ class View:
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """The tables of system.toml, empty where there is none."""
-        return self.folder.system if (self.folder.path / "system.toml").exists() else {}
-
-    @cached_property
-    def system_toml(self) -> str:
-        """The text of system.toml, empty where there is none."""
-        return self.folder.system_toml if (self.folder.path / "system.toml").exists() else ""
+        """The tables of the system that was run, empty where there is none."""
+        return self.folder.system
 
     @cached_property
     def units(self) -> Units:
@@ -115,8 +110,9 @@ class View:
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
         """A page of this folder, with its system and provenance; sections without content are left out."""
         kept = [section for section in sections if section.parts]
-        said = self.system_toml, self.folder.provenance, self.pictures
-        return Page(title, about, list(keys), kept, *said)
+        file = self.folder.system_file
+        what = ("", "") if file is None else (file.name, read_text(file))
+        return Page(title, about, list(keys), kept, *what, self.folder.provenance, self.pictures)
 
 
 @dataclass(frozen=True)

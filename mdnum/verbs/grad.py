@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mdnum.gradients import Gradient, Method, Problem
     from mdnum.gradients.diagnose import GradientDiagnosis
     from mdnum.systems import BallSystem, System
-    from mdnum.systems.build import Simulation
+    from mdnum.systems.simulation import Simulation
 
 ALL = "all"
 #: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
@@ -52,7 +52,7 @@ _CLOSE = 0.01
 
 @frame.keywords_checked
 def grad(
-    system: System | BallSystem | str | Path,
+    system: Simulation | System | BallSystem | str | Path,
     of: str | None = None,
     wrt: str | Sequence[str] = (),
     *,
@@ -66,8 +66,8 @@ def grad(
     """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file; of molecular dynamics or a
-            ball.
+        system: a simulation, a system, a shipped name or the path of a system file; of molecular dynamics or
+            a ball.
         of: the loss, a name of `gradients.losses.LOSSES` with options behind a colon
             ("potential:every=10"); of a ball a kind of its [loss] table, default what its file has.
         wrt: parameters, full or short names, one by one or with commas; of a ball default what the
@@ -90,7 +90,8 @@ def grad(
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """
-    from mdnum.systems.load import load, world_of
+    from mdnum.systems.build import build
+    from mdnum.systems.load import world_of
 
     if replicas < 0 or replicas == 1:
         raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
@@ -111,13 +112,13 @@ def grad(
             _differentiated(ball, chosen, answer)
         return answer.outcome
 
-    md = load(system, keep.get("overrides"), world="md")
+    md = build(system, keep.get("overrides"))  # type: ignore[arg-type]
     problem, names = _problem(md, of, names, steps)
     chosen, left = plan(problem, names, asked, replicas)
     with frame.answering("grad", f"grad-{md.name}", md, **keep) as answer:
         found = _diagnosed(problem, names, chosen, left, further, replicas, half_step, answer.log)
         answer.result, answer.summary = found, _summary(problem, names, found)
-        skipped = _not_run(md, steps, problem, found, replicas, further, half_step)
+        skipped = _not_run(steps, problem, found, replicas, further, half_step)
         answer.summary["left_out"] = [*skipped, *left]
         tables = {name: getattr(found, part).table for part, name in _TABLES.items() if getattr(found, part)}
         answer.tables = {name: table for name, table in tables.items() if len(next(iter(table.values())))}
@@ -135,21 +136,20 @@ def words(texts: Sequence[str] | str) -> tuple[str, ...]:
 
 
 def _problem(
-    system: System, of: str | None, names: Sequence[str], steps: int | None
+    simulation: Simulation, of: str | None, names: Sequence[str], steps: int | None
 ) -> tuple[Problem, tuple[str, ...]]:
     """The problem and full names of the parameters: what is not possible is refused here."""
     from mdnum.gradients import Problem, parameters
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
-    from mdnum.systems import build
 
     if of is None:
         remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
-        raise InputError("no loss to differentiate", where=system.name, remedy=remedy)
-    last, simulation = last_step(system, steps, FEW_STEPS), build(system)
+        raise InputError("no loss to differentiate", where=simulation.name, remedy=remedy)
+    last = last_step(simulation, steps, FEW_STEPS)
     loss = parse(of, simulation, last)
     if not names:
         remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"
-        raise InputError("no parameter to differentiate by", where=system.name, remedy=remedy)
+        raise InputError("no parameter to differentiate by", where=simulation.name, remedy=remedy)
     if (problem := Problem(simulation, loss, last)).parts:
         raise loss.wrong(*NOT_REAL)
     return problem, parameters.resolve(simulation, names)
@@ -216,7 +216,7 @@ def _diagnosed(
     from mdnum.gradients import parameters
     from mdnum.gradients.diagnose import diagnose
 
-    where = problem.simulation.system.name
+    where = problem.simulation.name
     if not chosen:
         reasons = "; ".join(f"{one['what']}: {one['why']}" for one in left)
         raise InputError(f"no method applies: {reasons}", where=where, remedy="Ask for one with --methods")
@@ -262,7 +262,7 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
             "turns": len(turns), "within": int(turns.within.sum()),
             "heaviest": turns.heaviest(found.trust.columns),
         }  # fmt: skip
-    return basics(simulation.system, problem.steps) | {
+    return basics(simulation, problem.steps) | {
         "world": "grad",
         "loss": {
             "word": loss.name, "about": loss.label, "unit": loss.unit.format_map(vars(simulation.units)),
@@ -286,13 +286,13 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
 
 
 def _not_run(
-    system: System, asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
+    asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
     """What was left out: what, why, and how to have it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
-    own, rows = system.spec.dynamics.steps, []
+    own, rows = problem.simulation.steps, []
     if asked is None and problem.steps < own:
         rows += [(f"{own - problem.steps:,} steps", f"the system has {own:,}", f"--steps {own}")]
     if found.trust is not None and not replicas:
@@ -312,7 +312,7 @@ def _entries(simulation: Simulation, name: str) -> list[str] | None:
     several = np.ndim(parameters.value(simulation, name)) and not name.startswith("initial.")
     if not simulation.pairwise or not several:
         return None
-    species = simulation.system.species
+    species = simulation.symbols
     found = [""] * simulation.pair_types
     for i, first in enumerate(species):
         for j, second in enumerate(species[i:], i):

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from mdnum.references.energy_check import EnergyReport
     from mdnum.rollout.run import RunResult
-    from mdnum.systems.build import Simulation
     from mdnum.systems.load import System
+    from mdnum.systems.simulation import Simulation
 
 #: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
 #: a few percent at usual time steps.
@@ -181,7 +181,7 @@ def _beside_the_loop(
             given = iter(both if len(both) == 2 else ())
         for name, positions in zip(("initial", "last"), given, strict=False):
             periods.append(fastest_period(simulation, positions))
-            atoms = simulation.system.atoms.copy()
+            atoms = simulation.structure.copy()
             atoms.set_positions(positions)
             yield name, atoms
 

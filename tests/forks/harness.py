@@ -13,8 +13,9 @@ from mdnum.ball.program import BallProgram
 from mdnum.forks import Fork, Twin, fork
 from mdnum.forks.choices import parse, twin_of
 from mdnum.rollout.program import MdProgram
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
 from mdnum.systems.load import System, load
+from mdnum.systems.simulation import Simulation
 
 
 @cache

@@ -29,7 +29,8 @@ from mdnum.forks.ensemble import (
     stretches,
 )
 from mdnum.rollout.engine import first_state
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 # ensembles
 pytestmark = pytest.mark.slow

@@ -11,7 +11,7 @@ from rollout.harness import history
 
 from mdnum.forks import Fork, fork
 from mdnum.forks.certified import certified, protection, wider
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 STEPS = 180
 

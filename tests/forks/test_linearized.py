@@ -17,7 +17,8 @@ from mdnum.errors import InputError
 from mdnum.forks.linearized import forecast, lyapunov, tangents
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.rollout.program import MdProgram
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 
 @cache

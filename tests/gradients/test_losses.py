@@ -69,7 +69,7 @@ def test_a_loss_of_one_frame_has_no_pace():
 
 def g_of_r(run) -> np.ndarray:
     """g(r) of the frames that RDF looks at, from ASE's distances and scipy's B-splines."""
-    atoms = run.simulation.system.atoms.copy()
+    atoms = run.simulation.structure.copy()
     width = R_MAX / BINS
     centers = width * (np.arange(BINS) + 0.5)
     fine = np.linspace(-2 * width, 2 * width, 2001)
@@ -97,7 +97,7 @@ def test_g_of_r_is_that_of_all_distances(run):
 
 
 def test_diffusion_is_slope_and_integral(run):
-    dt = run.simulation.system.spec.dynamics.timestep
+    dt = run.simulation.timestep
     time = dt * np.arange(STEPS + 1)
     msd = np.mean(np.sum((run.x - run.x[0]) ** 2, axis=2), axis=1)
     slope = np.polyfit(time[10::5], msd[10::5], 1)[0]
@@ -116,7 +116,7 @@ def test_diffusion_is_told_per_unit_of_time():
     moving = replace(simulation, velocities=np.tile([0.01, 0.0, 0.0], (simulation.atoms, 1)))
     problem = Problem(moving, GreenKuboDiffusion(until=1), 1)
     speed = 0.01 * simulation.units.time_factor
-    dt = simulation.system.spec.dynamics.timestep
+    dt = simulation.timestep
     assert problem.value() == pytest.approx(speed**2 * dt / 3, rel=1e-3)
     assert Problem(moving, EinsteinDiffusion(), 1).value() == pytest.approx(speed**2 * dt / 6, rel=1e-3)
 

@@ -26,7 +26,7 @@ from mdnum.md.jaxmd import neighbor_vectors
 from mdnum.md.manybody import EnergyFunction
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
-from mdnum.systems.build import with_potential
+from mdnum.systems.construct import with_potential
 
 SCALARS = ("timestep", "temperature", "scale")
 

@@ -14,7 +14,8 @@ from rollout.harness import listed
 from mdnum.md.cell import HostCell
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import rounded, zero_bits
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 SHORT = {"bfloat16": np.dtype(ml_dtypes.bfloat16), "float16": np.dtype(np.float16)}
 RADIUS, ONSET = 1.9, 1.5

@@ -14,6 +14,7 @@ from small_systems import KOB_ANDERSEN, make
 
 from mdnum.references.ase_models import evaluate, independent, reference
 from mdnum.references.independent import OnNeighborList, StillingerWeberModel, TersoffModel, pair_forms
+from mdnum.systems.build import model_of
 
 CUTOFFS = ["hard", "shifted", "force-shifted", "switched", "quintic", "cosine"]
 POTENTIALS = {
@@ -51,6 +52,11 @@ def agree(system) -> None:
     np.testing.assert_allclose(theirs["energies"].sum(), theirs["energy"], rtol=1e-13)
 
 
+def forms_of(system):
+    model = model_of(system.spec, system.atoms, system.folder, system.name)
+    return pair_forms(model, system.species, system.spec.cutoff.compare)
+
+
 @pytest.mark.parametrize("cutoff", CUTOFFS)
 @pytest.mark.parametrize("kind", POTENTIALS)
 def test_every_pair_potential_and_cutoff(kind: str, cutoff: str):
@@ -61,7 +67,7 @@ def test_every_pair_potential_and_cutoff(kind: str, cutoff: str):
     agree(system)
     onset = {"onset": 2.0} if cutoff in ("switched", "quintic", "cosine") else {}
     system = make(crystal(2), POTENTIALS[kind], {"kind": cutoff, "radius": 2.5, **onset})
-    form, step = pair_forms(system.spec, ("Ar",))["Ar", "Ar"], 1e-6
+    form, step = forms_of(system)["Ar", "Ar"], 1e-6
     r = np.linspace(0.95, 2.499, 200)
     slope = (form(r + step)[0] - form(r - step)[0]) / (2 * step)
     np.testing.assert_allclose(form(r)[1], slope, rtol=1e-7, atol=1e-7)
@@ -74,7 +80,7 @@ def test_mixtures_as_sums_over_species(cutoff: str):
     atoms.symbols[:] = "Ni"
     atoms.symbols[::5] = "P"
     system = make(atoms, KOB_ANDERSEN, {"kind": cutoff, "in_sigma": 2.5})
-    forms = pair_forms(system.spec, system.species)
+    forms = forms_of(system)
     assert forms["Ni", "P"].r_cut == 2.0 == forms["P", "Ni"].r_cut
     assert reference(system).is_ase
     agree(system)

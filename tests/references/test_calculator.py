@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from ase.build import bulk
@@ -99,15 +97,16 @@ def test_it_follows_atoms_cell_periodicity_and_species():
         atoms.calc = argon()
         assert energies[-1] == atoms.get_potential_energy()
     assert len(set(energies)) == len(energies)
-    assert shared.system.atoms is not atoms
+    assert shared.simulation.structure is not atoms
 
 
 def test_a_shipped_system_by_name_and_with_overrides():
     atoms = crystal(rattle=0.0, lattice_constant=5.8)
     atoms.calc = MdnumCalculator("argon/liquid-864", overrides={"cutoff.kind": "switched"})
-    judge = reference(replace(atoms.calc.system, atoms=atoms)).make()
-    assert atoms.get_potential_energy() == pytest.approx(evaluate(judge, atoms)["energy"], rel=1e-14)
-    kinds = [made.system.spec.cutoff.kind for made in (atoms.calc, MdnumCalculator("argon/liquid-864"))]
+    energy = atoms.get_potential_energy()
+    judge = reference(atoms.calc.simulation).make()
+    assert energy == pytest.approx(evaluate(judge, atoms)["energy"], rel=1e-14)
+    kinds = [made.parameters["cutoff"]["kind"] for made in (atoms.calc, MdnumCalculator("argon/liquid-864"))]
     assert kinds == ["switched", "hard"]
 
 
@@ -190,7 +189,14 @@ def test_a_simulation_is_evaluated_at_other_places_of_its_own_atoms():
     energy = atoms.get_potential_energy()
     atoms.calc = argon()
     assert energy == pytest.approx(atoms.get_potential_energy(), rel=1e-13)
-    atoms.calc = MdnumCalculator(build(system))
+    # and other atoms of its species, but none of another
     atoms.pop(3)
-    with pytest.raises(InputError, match="other atoms"):
+    fewer = []
+    for calculator in (MdnumCalculator(build(system)), argon()):
+        atoms.calc = calculator
+        fewer.append(atoms.get_potential_energy())
+    assert fewer[0] == pytest.approx(fewer[1], rel=1e-13) and fewer[0] != energy
+    atoms.symbols[0] = "Ne"
+    atoms.calc = MdnumCalculator(build(system))
+    with pytest.raises(InputError, match=r"Ne.*Ar"):
         atoms.get_potential_energy()

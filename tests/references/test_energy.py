@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,6 +18,7 @@ from mdnum.references import energy_check
 from mdnum.references.ase_models import independent, reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy, neighborhoods
 from mdnum.systems import build
+from mdnum.systems.simulation import Simulation
 from mdnum.verbs.check import dynamics_findings, energy_findings
 
 HARD = {"kind": "hard", "radius": 2.5}
@@ -122,16 +123,15 @@ def test_narrow_numbers_are_compared_in_units_of_their_rounding(
     assert codes(report) == [("NARROW_PRECISION", "info")]
 
 
-class Faulty:
+def faulty(simulation, **change):
     """A simulation whose results are changed on the way out."""
 
-    def __init__(self, simulation, **change):
-        self.simulation, self.system, self.change = simulation, simulation.system, change
-        self.r_cut = simulation.r_cut
+    class Faulty(Simulation):
+        def evaluate(self, *asked):
+            right = super().evaluate(*asked)
+            return replace(right, **{name: alter(getattr(right, name)) for name, alter in change.items()})
 
-    def evaluate(self, *asked):
-        right = self.simulation.evaluate(*asked)
-        return replace(right, **{name: change(getattr(right, name)) for name, change in self.change.items()})
+    return Faulty(**{one.name: getattr(simulation, one.name) for one in fields(simulation)})
 
 
 def _nudged(forces: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def _nudged(forces: np.ndarray) -> np.ndarray:
 )
 def test_planted_faults_are_found(fault: dict):
     atoms = crystal()
-    report = check_energy(Faulty(build(make(atoms, LENNARD_JONES, HARD)), **fault), {"initial": atoms})
+    report = check_energy(faulty(build(make(atoms, LENNARD_JONES, HARD)), **fault), {"initial": atoms})
     assert not report.ok
     assert codes(report) == [("ASE_DISAGREES", "error")]
 
@@ -242,16 +242,18 @@ def test_a_sample_is_compared_at_other_places_in_each_frame(monkeypatch):
     monkeypatch.setattr(energy_check, "neighborhoods", partial(neighborhoods, places=2, count=9))
     asked = []
 
-    class Counting(Faulty):
-        def evaluate(self, positions, cell, stress):
-            asked.append(stress)
-            return super().evaluate(positions, cell, stress)
+    def evaluate(self, positions, cell, stress):
+        asked.append(stress)
+        return evaluated(self, positions, cell, stress)
 
-    report = check_energy(Counting(build(system)), {"first": atoms, "last": atoms})
+    evaluated = Simulation.evaluate
+    with monkeypatch.context() as patched:
+        patched.setattr(Simulation, "evaluate", evaluate)
+        report = check_energy(build(system), {"first": atoms, "last": atoms})
     assert "sum over species" in report.reference
     assert report.ok and asked == [False, False] and len(report.frames) == 4
     assert len({frame.frame.split()[-1] for frame in report.frames}) == 4
     # of two groups of nine in one frame there are eighteen at most
     assert report.sampled is not None and 18 < report.sampled <= 36
-    off = Faulty(build(system), energies=lambda energies: energies * (1 + 1e-9))
+    off = faulty(build(system), energies=lambda energies: energies * (1 + 1e-9))
     assert not check_energy(off, {"initial": atoms}).ok

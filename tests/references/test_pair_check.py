@@ -25,6 +25,7 @@ from mdnum.references.pair_check import (
     effective_cutoff,
     own_searches,
 )
+from mdnum.systems import build
 from mdnum.verbs.check import pair_findings
 
 HARD = {"kind": "hard", "radius": 2.5}
@@ -138,7 +139,7 @@ def test_all_agree_on_a_rattled_crystal():
     system = make(crystal(), LENNARD_JONES, HARD)
     report = check_pairs(system, effective=False)
     assert report.ok and codes(report) == []
-    assert {one.name for one in report.results} == {one.name for one in all_searches(system)}
+    assert {one.name for one in report.results} == {one.name for one in all_searches(build(system))}
     # an optional library that is not installed cannot be asked; mdnum's own and its dependencies can
     asked = [one for one in report.results if one.note != "not installed"]
     assert len(asked) >= 13
@@ -150,7 +151,9 @@ def test_all_agree_on_a_rattled_crystal():
 
 def test_a_radius_for_each_pair_of_species():
     system = make(mixture(), KOB_ANDERSEN, {"kind": "hard", "in_sigma": 2.5})
-    report = check_pairs(system, searches=[*own_searches(system)[:2], Search(load("vesin"))], effective=False)
+    report = check_pairs(
+        system, searches=[*own_searches(build(system))[:2], Search(load("vesin"))], effective=False
+    )
     assert {one.verdict for one in report.results} == {"agrees"}
     expected, symbols = 0, np.array(system.atoms.get_chemical_symbols())
     for a, b, sigma in (("Ni", "Ni", 1.0), ("Ni", "P", 0.8), ("P", "P", 0.88)):
@@ -175,7 +178,7 @@ def test_the_force_loop_follows_the_convention(compare: str, counted: int):
     atoms = crystal(3, rattle=0.0)[:2]
     atoms.positions = [[0.0, 0, 0], [2.5, 0, 0]]
     system = make(atoms, LENNARD_JONES, {**HARD, "compare": compare})
-    own = [Search(replace(one.listed, affords=0.05)) for one in own_searches(system)[:2]]
+    own = [Search(replace(one.listed, affords=0.05)) for one in own_searches(build(system))[:2]]
     report = check_pairs(system, searches=own)
     assert [one.pairs for one in report.results] == [counted, counted]
     assert report.pairs == counted and report.decided_exactly == 1

@@ -23,8 +23,8 @@ from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs
 from mdnum.rollout.run import RunResult, run
 from mdnum.store import RunFolder
-from mdnum.systems.build import Simulation
 from mdnum.systems.load import System, load
+from mdnum.systems.simulation import Simulation
 
 CRYSTAL = "argon/crystal-108"
 
@@ -165,11 +165,11 @@ def radii(simulation) -> Any:
     """The cutoff as a function of two atoms' indices, from the system file's own tables."""
     from mdnum.systems import pairs
 
-    spec = simulation.system.spec
+    spec = simulation.origin.system.spec
     if spec.cutoff is None:
         return simulation.r_cut
-    symbols = simulation.system.atoms.get_chemical_symbols()
-    species = simulation.system.species
+    symbols = simulation.origin.system.atoms.get_chemical_symbols()
+    species = simulation.origin.system.species
     table, _ = pairs.cutoff_radii(spec, species)
     index = np.array([species.index(symbol) for symbol in symbols])
     return lambda i, j: table[index[i], index[j]]
@@ -178,13 +178,15 @@ def radii(simulation) -> Any:
 def assert_ledger_is_complete(result: RunResult, folder: RunFolder) -> int:
     """flips.parquet and the counts in series.parquet equal a recomputation from the frames; returns flips."""
     simulation = result.simulation
-    spec = simulation.system.spec
+    spec = simulation.origin.system.spec
     compare = "r <" if spec.cutoff is None else spec.cutoff.compare
-    cell = simulation.system.atoms.cell.array
+    cell = simulation.origin.system.atoms.cell.array
     frames = frames_of(folder)
     series, flips = folder.read("series"), folder.read("flips")
     assert len(frames) == len(series["step"])
-    rows, counts = recomputed_flips(frames, cell, simulation.system.atoms.pbc, radii(simulation), compare)
+    rows, counts = recomputed_flips(
+        frames, cell, simulation.origin.system.atoms.pbc, radii(simulation), compare
+    )
     found = list(zip(*(flips[name].tolist() for name in ("step", "i", "j", "entered")), strict=True))
     assert found == [row[:4] for row in rows]
     assert series["pairs"].tolist() == counts

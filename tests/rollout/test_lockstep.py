@@ -20,7 +20,8 @@ from mdnum.rollout.flips import true_pairs
 from mdnum.rollout.lockstep import Counterfactual, lockstep
 from mdnum.rollout.program import pair_margin
 from mdnum.rollout.tracks import Handed, Overridden, Rows
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 FLOAT32 = {f"precision.{role}": "float32" for role in ("force", "decision", "accumulate")}
 LANGEVIN = {"dynamics.kind": "langevin", "dynamics.friction": 1.0}

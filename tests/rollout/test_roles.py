@@ -53,7 +53,7 @@ def test_everything_narrow(path, tmp_path):
     wide = replace(result.simulation.decider, dtype="float64", state="float64")
     # and some more, where the box or the threshold are no numbers of single precision
     assert 0.999 * 2.0**29 < flips["bound"][0] / wide.bounds[0] < 2.0**30
-    frames, box = frames_of(folder), float(result.simulation.system.atoms.cell.array[0, 0])
+    frames, box = frames_of(folder), float(result.simulation.origin.system.atoms.cell.array[0, 0])
     assert all(np.array_equal(x, x.astype(np.float32)) for x in frames)
     before, rows = None, []
     for step, positions in enumerate(frames):

@@ -20,6 +20,7 @@ from mdnum import systems
 from mdnum.errors import InputError
 from mdnum.systems import System, load, pairs, schema, shipped_folder, structures
 from mdnum.systems.load import BALL_SCHEMA, json_schema
+from mdnum.systems.structures import species_of
 
 ARGON = "argon/liquid-864"
 MIXTURE = "binary/kob-andersen-1000"
@@ -33,8 +34,8 @@ def same_bits(a: System, b: System) -> bool:
         and np.array_equal(np.asarray(a.atoms.cell), np.asarray(b.atoms.cell))
         and np.array_equal(a.atoms.pbc, b.atoms.pbc)
         and np.array_equal(a.atoms.get_masses(), b.atoms.get_masses())
-        and (a.velocities is None) == (b.velocities is None)
-        and (a.velocities is None or np.array_equal(a.velocities, b.velocities))
+        and a.atoms.has("momenta") == b.atoms.has("momenta")
+        and np.array_equal(a.atoms.get_momenta(), b.atoms.get_momenta())
     )
 
 
@@ -71,8 +72,9 @@ def test_a_name_and_a_path_mean_the_same():
 def test_species_and_tables_of_a_mixture():
     system = load(MIXTURE)
     assert system.species == ("Ni", "P")
-    assert np.bincount(system.species_index).tolist() == [800, 200]
-    assert np.array_equal(system.species_index == 1, system.atoms.symbols == "P")
+    _, species = species_of(system.atoms)
+    assert np.bincount(species).tolist() == [800, 200]
+    assert np.array_equal(species == 1, system.atoms.symbols == "P")
     tables = pairs.pair_constants(system.spec, system.species)
     assert tables["sigma"].tolist() == [[1.0, 0.8], [0.8, 0.88]]
     assert tables["epsilon"].tolist() == [[1.0, 1.5], [1.5, 0.5]]
@@ -135,7 +137,7 @@ def test_another_kind_drops_the_keys_it_does_not_have():
     ],
 )
 def test_a_temperature_asked_for_is_not_ignored(name: str, changes: dict[str, str], stored: bool):
-    assert (load(name, changes).velocities is not None) == stored
+    assert load(name, changes).atoms.has("momenta") == stored
 
 
 @pytest.mark.parametrize("name", [ARGON, MIXTURE, "pair/leaving-well", "silicon/tersoff-512"])
@@ -155,7 +157,7 @@ def test_overrides_are_part_of_what_is_written(tmp_path: Path):
     again = load(changed.write(tmp_path))
     assert again.spec.cutoff == changed.spec.cutoff
     assert again.spec.skin == 0.7
-    assert again.velocities is None
+    assert not again.atoms.has("momenta")
     assert tomllib.loads(changed.to_toml())["structure"]["velocities"] == "drawn"
 
 

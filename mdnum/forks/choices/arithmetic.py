@@ -8,7 +8,7 @@ order they must change nothing.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,12 +18,11 @@ from mdnum.forks.choices.base import (
     Choice,
     Summed,
     applies,
-    built,
     check,
     choice,
-    is_pairwise,
     number,
     simulations,
+    summed,
     summing,
     world_of,
 )
@@ -31,8 +30,10 @@ from mdnum.forks.worlds import ROLES, program_of, twin, varied
 from mdnum.numerics import reductions
 from mdnum.numerics.roles import ALL, WIDE, check_role
 from mdnum.program import Twin
-from mdnum.systems import System
 from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 #: What "precision" without a role means: of molecular dynamics all but what is carried from step to step.
 _DEFAULT = {"md": ("force", "decision", "accumulate"), "ball": ROLES["ball"]}
@@ -91,12 +92,13 @@ class PrecisionChoice(Choice):
         return f"{', '.join(self._roles(world))} in {self.dtype}"
 
     def make(self, system: Any) -> Twin:
-        world, own = world_of(system), system.spec.precision
+        world = world_of(system)
+        own = system.policy if world == "md" else system.spec.precision
         roles = self._roles(world)
         missing = [role for role in roles if role not in ROLES[world]]
         applies(not missing, f"it has no role {'.'.join(missing)}; there are {', '.join(ROLES[world])}")
         if world == "md":
-            applies(is_pairwise(system), "many-body potentials are evaluated in float64 only")
+            applies(system.pairwise, "many-body potentials are evaluated in float64 only")
         before = {getattr(own, role) for role in roles}
         verb = "is" if len(roles) == 1 else "are"
         applies(before != {self.dtype}, f"{', '.join(roles)} {verb} {self.dtype} already")
@@ -124,16 +126,18 @@ class Summation(Choice):
         return f"{'force sums' if world == 'md' else 'the residuals of all balls summed'} {self.word}"
 
     def make(self, system: Any) -> Twin:
-        is_ball, before = world_of(system) == "ball", system.spec.precision.reduction
-        if is_ball:
-            sums_residuals(system)
-            applies(system.balls > 1, "the residual of one ball is no sum")
-        b = None if is_ball else built(system, self.word)
+        if world_of(system) == "md":
+            from mdnum.systems.describe import reduction_word
+
+            before, b = reduction_word(system.reduction), summed(system, self.word)
+            applies(b.reduction != system.reduction, f"the system sums {self.word} already")
+            return simulations(system, b, f"force sums {self.word}, not {before}")
+        before = system.spec.precision.reduction
+        sums_residuals(system)
+        applies(system.balls > 1, "the residual of one ball is no sum")
         applies(self.word != before, f"the system sums {self.word} already")
-        if is_ball:
-            values = {"precision.reduction": self.word}
-            return twin(system, values, self.name, f"residuals summed {self.word}, not {before}")
-        return simulations(built(system), b, f"force sums {self.word}, not {before}")
+        values = {"precision.reduction": self.word}
+        return twin(system, values, self.name, f"residuals summed {self.word}, not {before}")
 
 
 def sums_residuals(system: Any) -> None:
@@ -186,7 +190,7 @@ class Order(Summed):
         from mdnum.forks.reordered import ReorderedSimulation
 
         applies(self.both != "alone", "@alone is for balls")
-        a = built(system, self.both)
+        a = summed(system, self.both)
         b = ReorderedSimulation.of(a, self.seed)
         return self.twin(a, b, f"neighbors of each atom shuffled with seed {self.seed}")
 
@@ -244,12 +248,13 @@ class FormatChoice(Summed):
     def describe(self, world: str = "md") -> str:
         return f"pair terms added in the order of {self.word} lists{summing(self.both)}"
 
-    def make(self, system: System) -> Twin:
+    def make(self, system: Simulation) -> Twin:
         from mdnum.forks.reordered import ReorderedSimulation
+        from mdnum.systems.describe import reduction_word
 
-        a, own = built(system, self.both), system.spec.precision.reduction
+        a, own = summed(system, self.both), reduction_word(system.reduction)
         if self.both is None:
-            applies(is_pairwise(system), "a many-body potential has a format of its own")
+            applies(system.pairwise, "a many-body potential has a format of its own")
             applies(own == "sequential", f"a format is the order of a loop, and sums are {own} here")
         b = ReorderedSimulation.of(a, self.word)
         return self.twin(a, b, f"pair terms in the order of {self.word} lists, not of the search's")
@@ -269,13 +274,13 @@ class Builder(Summed):
         known = f"no list builder {self.word!r}; there are {', '.join(BUILDERS)}"
         check(self.word is None or self.word in BUILDERS, known, "builder")
 
-    def make(self, system: System) -> Twin:
+    def make(self, system: Simulation) -> Twin:
         from mdnum.md.neighbors import BUILDERS
 
-        a = built(system, self.both)
+        a = summed(system, self.both)
         word = self.word or next(name for name in BUILDERS if name != a.builder)
         applies(word != a.builder, f"the lists are {word}'s already")
-        b = built(varied(system, {"neighbors.builder": word}), self.both)
+        b = summed(varied(system, {"neighbors.builder": word}), self.both)
         return self.twin(a, b, f"lists by {word}, not {a.builder}")
 
 
@@ -292,13 +297,13 @@ class Skin(Summed):
         good = self.length is None or self.length >= 0
         check(good, f"skin = {self.length}; expected a length of 0 or more", "skin")
 
-    def make(self, system: System) -> Twin:
-        a, own, length = built(system, self.both), system.spec.skin, self.length
+    def make(self, system: Simulation) -> Twin:
+        a, own, length = summed(system, self.both), system.rule.skin, self.length
         if length is None:
             room = float(np.min(a.cell.widths)) / 2 - a.r_cut
             length = 1.5 * own if 1.5 * own <= room else 0.75 * own
         applies(length != own, f"the skin is {own:g} already")
-        b = built(varied(system, {"neighbors.skin": length}), self.both)
+        b = summed(varied(system, {"neighbors.skin": length}), self.both)
         return self.twin(a, b, f"skin {length:g}, not {own:g}")
 
 
@@ -340,11 +345,11 @@ class RebuildChoice(Summed):
             return "when half the skin is used up"
         return "at every step" if self.every == 1 else f"blindly every {self.every} steps"
 
-    def make(self, system: System) -> Twin:
-        own, every = system.spec.neighbors.rebuild, self.every or 1
+    def make(self, system: Simulation) -> Twin:
+        own, every = system.rule, self.every or 1
         # where nothing is checked, a delay holds back a rebuild like an interval does
         same = own.check and own.delay <= 1 if self.every is None else not own.check and own.delay <= every
         applies(not (same and own.every == every), f"lists are rebuilt {self._when} already")
         rule = {"every": every, "delay": 0, "check": self.every is None}
         other = varied(system, {f"neighbors.rebuild.{key}": value for key, value in rule.items()})
-        return self.twin(built(system, self.both), built(other, self.both), f"lists rebuilt {self._when}")
+        return self.twin(summed(system, self.both), summed(other, self.both), f"lists rebuilt {self._when}")

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import dataclass_transform
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import changes, program_of, varied
+from mdnum.forks.worlds import changes, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry, nearest
-from mdnum.systems import BallSystem, System
-from mdnum.systems.load import world_of
+from mdnum.systems import BallSystem
+from mdnum.systems.load import opened, world_of
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
@@ -83,7 +86,7 @@ class Choice:
         return cls(**values)
 
     def make(self, system: Any) -> Twin:
-        """The two programs, of a system of one of its worlds.
+        """The two programs, of a `Simulation` of molecular dynamics or of the `BallSystem` of a ball.
 
         Raises:
             InputError: it does not apply to the system; the message is the reason.
@@ -123,24 +126,31 @@ def shipped(world: str) -> dict[str, Choice]:
     return {choice.name: choice for kind in kinds for choice in of_family(kind)}
 
 
-def unavailable(choice: Choice, system: Any) -> str | None:
+def unavailable(choice: Choice, system: Simulation | BallSystem) -> str | None:
     """Why a choice does not apply to a system; None where it does."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 
 
-def twin_or_reason(choice: Choice, system: System | BallSystem) -> Twin | str:
+def twin_or_reason(choice: Choice, system: Simulation | BallSystem) -> Twin | str:
     """The two programs of a choice, or why it does not apply to the system."""
     if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
     try:
-        return choice.make(system)
+        return choice.make(opened(system))
+    except AttributeError as error:
+        if error.name != "spec":
+            raise
+        message = f"{type(choice).__module__} reads the tables of a system file, and is given a Simulation"
+        raise InputError(
+            message, where=choice.name, remedy="See `mdnum.choices` in docs/extending.md"
+        ) from error
     except InputError as error:
         # the choice is named where this is printed
         return error.message.removeprefix(f"variant {choice.name!r}: ")
 
 
-def twin_of(choice: Choice, system: System | BallSystem) -> Twin:
+def twin_of(choice: Choice, system: Simulation | BallSystem) -> Twin:
     """The two programs of a choice.
 
     Raises:
@@ -229,14 +239,11 @@ def plural(count: int, noun: str) -> str:
     return noun if abs(count) == 1 else f"{noun}s"
 
 
-def is_pairwise(system: System) -> bool:
-    """Whether a pair potential, whose sums and precision can be chosen, holds the system together."""
-    return system.spec.cutoff is not None
-
-
-def is_langevin(system: System) -> bool:
+def is_langevin(simulation: Simulation) -> bool:
     """Whether the run has a thermostat, and so noise."""
-    return system.spec.dynamics.kind == "langevin"
+    from mdnum.md.integrators import Langevin
+
+    return isinstance(simulation.integrator, Langevin)
 
 
 def summing(both: str | None) -> str:
@@ -244,27 +251,25 @@ def summing(both: str | None) -> str:
     return "" if both is None else f" (both with {both} sums)"
 
 
-def built(system: System, both: str | None = None) -> Any:
-    """A system's simulation, with another order of its force sums, such as "exact" or "permuted:3".
+def summed(simulation: Simulation, both: str | None = None) -> Simulation:
+    """A simulation with another order of its force sums, such as "exact" or "permuted:3".
 
     A many-body potential has none: an `InputError`.
     """
-    if both is not None:
-        applies(is_pairwise(system), "the sums of a many-body potential have one order")
-    program: Any = program_of(system)
     if both is None:
-        return program.simulation
+        return simulation
+    applies(simulation.pairwise, "the sums of a many-body potential have one order")
     if ":" not in both:
-        # the system then says what runs; a file has no words for the number of a reduction
-        system = varied(system, {"precision.reduction": both})
-    return replace(program.simulation, system=system, reduction=reductions.parse(both))
+        # a file has no words for the number of a reduction
+        simulation = varied(simulation, {"precision.reduction": both})
+    return replace(simulation, reduction=reductions.parse(both))
 
 
 def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
     """The twin of two simulations of molecular dynamics."""
     from mdnum.rollout.program import MdProgram
 
-    return Twin(MdProgram(a), MdProgram(b, frame=frame), difference, changes(a.system, b.system))
+    return Twin(MdProgram(a), MdProgram(b, frame=frame), difference, changes(a, b))
 
 
 @choice(None)

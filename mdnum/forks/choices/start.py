@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +17,6 @@ from mdnum.forks.choices.base import (
     Choice,
     Summed,
     applies,
-    built,
     check,
     choice,
     is_langevin,
@@ -25,13 +24,16 @@ from mdnum.forks.choices.base import (
     plural,
     simulations,
     some,
+    summed,
     summing,
     world_of,
 )
 from mdnum.forks.worlds import as_used, floats, program_of, twin, varied
 from mdnum.numerics.rounding import neighbor
 from mdnum.program import Twin
-from mdnum.systems import System
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 #: Exchanges of axes, half turns about one, and the inversion that every box has.
 _SYMMETRIES = ("yzx", "yxz", "xzy", "zyx", "-x-yz", "x-y-z", "-xy-z", "-x-y-z")
@@ -70,13 +72,19 @@ class Relabel(Summed):
         super().__post_init__()
         check(self.seed >= 0, f"seed {self.seed} is negative", "relabel")
 
-    def make(self, system: System) -> Twin:
+    def make(self, system: Simulation) -> Twin:
         applies(not is_langevin(system), "the thermostat's noise belongs to labels: other atoms would get it")
-        a = built(system, self.both)
+        a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
-        b = built(replace(system, atoms=system.atoms[labels]), self.both)
-        # drawn velocities would go by label, and a drift taken out would be rounded in another order
-        b = replace(b, positions=a.positions[labels], velocities=a.velocities[labels])
+        b = replace(
+            a,
+            structure=a.structure[labels],
+            masses=a.masses[labels],
+            species=a.species[labels],
+            # drawn velocities would go by label, and a drift taken out would be rounded in another order
+            positions=a.positions[labels],
+            velocities=a.velocities[labels],
+        )
         return self.twin(a, b, f"atoms in another order, seed {self.seed}", _frame(a, labels=labels))
 
 
@@ -103,12 +111,12 @@ class Rotate(Summed):
             "rotate",
         )
 
-    def make(self, system: System) -> Twin:
+    def make(self, system: Simulation) -> Twin:
         applies(not is_langevin(system), "the thermostat's noise belongs to axes: others would get it")
         known = _SYMMETRIES if self.axes is None else (self.axes,)
-        word = next((word for word in known if _is_symmetry(word, system.atoms)), "")
+        word = next((word for word in known if _is_symmetry(word, system.structure)), "")
         applies(bool(word), f"the box is not the same with axes {self.axes} in place of xyz")
-        a = built(system, self.both)
+        a = summed(system, self.both)
         axes, signs = (np.array(part) for part in _read(word))
         b = replace(a, positions=a.positions[:, axes] * signs, velocities=a.velocities[:, axes] * signs)
         back = np.argsort(axes)
@@ -152,9 +160,9 @@ class Translate(Summed):
     def describe(self, world: str = "md") -> str:
         return f"moved by {self.share:g} of each lattice vector{summing(self.both)}"
 
-    def make(self, system: System) -> Twin:
-        applies(any(system.atoms.pbc), "no axis is periodic")
-        a = built(system, self.both)
+    def make(self, system: Simulation) -> Twin:
+        applies(any(system.pbc), "no axis is periodic")
+        a = summed(system, self.both)
         shift = self.share * np.asarray(a.cell.matrix)[list(a.cell.pbc)].sum(axis=0)
         b, frame = replace(a, positions=a.positions + shift), _frame(a, shift=shift)
         return self.twin(a, b, f"moved by {self.share:g} of each lattice vector", frame)
@@ -192,9 +200,9 @@ class Images(Choice):
             return "moved by every lattice vector, exactly"
         return "started from unwrapped positions, exactly"
 
-    def make(self, system: System) -> Twin:
-        applies(any(system.atoms.pbc), "no axis is periodic")
-        a = built(system)
+    def make(self, system: Simulation) -> Twin:
+        applies(any(system.pbc), "no axis is periodic")
+        a = system
         images = np.ones(a.positions.shape, np.int64)
         if self.seed is not None:
             images = np.random.default_rng(self.seed).integers(-1, 2, a.positions.shape)
@@ -255,18 +263,12 @@ class Ulps(Choice):
         before, dtype = as_used(system, self.key)
         after = float(neighbor(before, self.ulps, np.dtype(dtype)))
         difference = f"{self.key} = {after!r}, not {before!r}"
-        if self.key == "dynamics.temperature" and not is_langevin(system) and system.velocities is not None:
-            system = _drawn(system)
+        if self.key == "dynamics.temperature" and not is_langevin(system) and not system.draw.drawn:
+            from mdnum.systems.parameters import redrawn
+
+            system = redrawn(system)
             difference += " (both with drawn velocities)"
         return twin(system, {self.key: after}, self.name, difference)
-
-
-def _drawn(system: System) -> System:
-    """The system without the velocities of its structure."""
-    atoms = system.atoms.copy()
-    del atoms.arrays["momenta"]
-    structure = system.spec.structure.model_copy(update={"velocities": "drawn"})
-    return replace(system, spec=system.spec.model_copy(update={"structure": structure}), atoms=atoms)
 
 
 @choice("start")
@@ -307,17 +309,16 @@ class StartUlp(Choice):
 
     def make(self, system: Any) -> Twin:
         is_md = world_of(system) == "md"
-        count, noun = (len(system.atoms), "atom") if is_md else (system.balls, "ball")
+        count, noun = (system.atoms, "atom") if is_md else (system.balls, "ball")
         there = self.which is None or 0 <= self.which < count
         applies(there, f"there is no {noun} {self.which} among {count}")
         fits = self.what is None or isinstance(self.what, int) == is_md
         applies(fits, f"there is no coordinate {self.what}")
         return self._of_atoms(system) if is_md else self._of_balls(system)
 
-    def _of_atoms(self, system: System) -> Twin:
+    def _of_atoms(self, a: Simulation) -> Twin:
         from mdnum.md.cell import wrap_positions
 
-        a = built(system)
         dtype = a.policy.dtype("state")
         x = wrap_positions(a.cell, a.positions)[0].astype(dtype)
         if self.which is None:
@@ -359,15 +360,15 @@ class NoiseChoice(Choice):
     def __post_init__(self):
         check(self.seed is None or self.seed >= 0, f"seed {self.seed} is negative", "noise")
 
-    def make(self, system: System) -> Twin:
+    def make(self, system: Simulation) -> Twin:
         import equinox as eqx
         import jax
 
         applies(is_langevin(system), "there is no noise at constant energy (dynamics.kind is nve)")
-        own = system.spec.dynamics.seed
+        own = system.draw.seed
         seed = own + 1 if self.seed is None else self.seed
         applies(seed != own, f"the seed is {seed} already")
-        a = built(system)
+        a = system
         integrator = eqx.tree_at(lambda one: one.key, a.integrator, jax.random.key(seed))
         return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
 
@@ -382,11 +383,11 @@ class EnergyShift(Choice):
     worlds = ("md",)
     must_hold = True
 
-    def make(self, system: System) -> Twin:
-        if system.spec.cutoff is None:
+    def make(self, system: Simulation) -> Twin:
+        if not system.pairwise:
             raise InputError("the potential carries its own cutoff")
-        kind = system.spec.cutoff.kind
+        kind = system.cutoff.name
         applies(kind in ("hard", "shifted"), f"a {kind} cutoff changes the force too")
         other = "shifted" if kind == "hard" else "hard"
-        b = built(varied(system, {"cutoff.kind": other}))
-        return simulations(built(system), b, f"cutoff {other}, not {kind}: the same forces")
+        b = varied(system, {"cutoff.kind": other})
+        return simulations(system, b, f"cutoff {other}, not {kind}: the same forces")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,10 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.program import Decision, Program
-from mdnum.systems import BallSystem, System
+from mdnum.systems import BallSystem
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Roles = Mapping[str, str]
@@ -93,7 +96,7 @@ class Certificate:
 
 
 def certify(
-    system: System | BallSystem,
+    system: Simulation | BallSystem,
     steps: int | None = None,
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
@@ -115,7 +118,7 @@ def certify(
         InputError: the system cannot be certified, or steps below 1.
     """
     is_ball = isinstance(system, BallSystem)
-    own = system.spec.integrator.steps if is_ball else system.spec.dynamics.steps
+    own = system.spec.integrator.steps if isinstance(system, BallSystem) else system.steps
     last = own if steps is None else steps
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1", remedy="Ask for one step or more")
@@ -140,7 +143,7 @@ def _row(
     return PolicyHorizon(name, roles, decision, separation, fit, failed)
 
 
-def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: Progress):
+def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], note: Progress):
     from mdnum.forks.exact.program import ExactProgram
     from mdnum.forks.tape import first_difference, taped
     from mdnum.md.cell import HostCell

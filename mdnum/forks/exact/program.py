@@ -27,7 +27,7 @@ from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
 from mdnum.numerics import gamma
 from mdnum.rollout.engine import first_state
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: All pairs are looked at in every step.
 MOST_ATOMS = 108

@@ -28,7 +28,7 @@ from mdnum.gradients.tape import listed
 from mdnum.md.cell import HostCell
 from mdnum.program import Number
 from mdnum.rollout.program import MdProgram
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 SMOOTH, ENTERS, LEAVES = "smooth", "pair enters", "pair leaves"
 #: How far from the parameter a boundary is looked for, as a share of its value.

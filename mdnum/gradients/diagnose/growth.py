@@ -32,7 +32,7 @@ from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.
 CLOCK_STEPS = 30
@@ -312,9 +312,7 @@ class Jacobian:
 
     def __init__(self, tape: RunTape, clock: float):
         if not isinstance(tape.simulation.force, PairForce):
-            raise InputError(
-                "the Jacobian of a step is one of pair potentials", where=tape.simulation.system.name
-            )
+            raise InputError("the Jacobian of a step is one of pair potentials", where=tape.simulation.name)
         self.tape, self.clock = tape, clock
         self.force: PairForce = tape.simulation.force
         self.coordinates = 6 * tape.simulation.atoms

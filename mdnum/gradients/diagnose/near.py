@@ -24,7 +24,7 @@ from mdnum.gradients.parameters import directions
 from mdnum.gradients.tangents import StretchTangents
 from mdnum.gradients.tape import Pace, TapeStretch, listed
 from mdnum.md.cell import HostCell
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: Turning points are listed up to so far from the cutoff, as a share of it; a run whose distances move
 #: further at another time step is another run.

@@ -38,7 +38,7 @@ from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
-from mdnum.systems.build import Simulation
+from mdnum.systems.simulation import Simulation
 
 #: The parameter by which derivatives at half the time step are twice as large.
 TIMESTEP = "dynamics.timestep"

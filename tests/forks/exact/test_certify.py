@@ -17,7 +17,8 @@ from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems import System, load
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 NARROW = PrecisionPolicy("float32", "float32", "float32", "float32")
 

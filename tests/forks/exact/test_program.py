@@ -18,7 +18,8 @@ from mdnum.forks.exact.program import ExactProgram, unsupported
 from mdnum.forks.tape import DecisionTape, first_difference, taped
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.program import MdProgram
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 
 pytest.importorskip("flint", reason="exact runs need python-flint")
 

@@ -1,0 +1,188 @@
+"""mdnum as an ASE calculator, for anything in ASE that wants one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import Parameters
+from ase.stress import full_3x3_to_voigt_6_stress
+
+from mdnum import systems, units
+from mdnum.errors import InputError, NumericalError
+from mdnum.md.potentials import PairPotential
+from mdnum.references.independent import ClassicalCalculator
+from mdnum.systems import System
+from mdnum.systems.build import interaction, model_of
+from mdnum.systems.construct import Cut, cut, of_atoms, with_atoms
+from mdnum.systems.describe import described
+from mdnum.systems.evaluate import Evaluator
+from mdnum.systems.schema import DEFAULT_SKIN
+from mdnum.systems.simulation import Simulation
+from mdnum.systems.structures import species_of
+
+# a change of either is another program; positions and cell are arguments of it
+_REBUILD = {"numbers", "pbc"}
+_SAID = {"potential", "cutoff", "units"}
+
+
+class _Recipe(NamedTuple):
+    """How a simulation is made for atoms."""
+
+    make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
+    skin: float  # length
+    tables: Mapping[str, Any]  # what it says of itself
+    pairwise: bool  # whether energies belong to atoms
+
+
+def _recipe(system: Any, overrides: Any, potential: Any, cutoff: Any, unit: str) -> _Recipe:
+    if isinstance(system, Simulation):
+        tables = {key: table for key, table in described(system).items() if key in _SAID}
+        return _Recipe(
+            lambda atoms: with_atoms(system, atoms, 0.0), system.rule.skin, tables, system.pairwise
+        )
+    if system is not None:
+        loaded = system if isinstance(system, System) else systems.load(str(system), overrides, world="md")
+        return _Recipe(
+            lambda atoms: systems.build(replace(loaded.without_skin, atoms=atoms)),
+            loaded.spec.skin,
+            loaded.spec.model_dump(exclude_none=True, include=_SAID),
+            loaded.spec.cutoff is not None,
+        )
+    skin = DEFAULT_SKIN[units.get(unit).name]
+    if isinstance(potential, Mapping):
+        made = interaction(potential, cutoff)
+        compare = "r <" if made.cutoff is None else made.cutoff.compare
+        tables = {
+            name: table.model_dump(exclude_none=True) for name, table in made._asdict().items() if table
+        }
+        return _Recipe(
+            lambda atoms: of_atoms(atoms, model_of(made, atoms, Path(), "MdnumCalculator"), compare, unit),
+            skin,
+            {**tables, "units": unit},
+            made.cutoff is not None,
+        )
+    pairwise, tables = isinstance(potential, PairPotential), {"potential": potential, "units": unit}
+    if pairwise != isinstance(cutoff, Cut):
+        message = "a pair potential needs cutoff=mdnum.Cut(kind, radius), and no other takes one"
+        raise InputError(message, where="MdnumCalculator")
+    if not pairwise:
+        return _Recipe(
+            lambda atoms: of_atoms(atoms, replace(potential, pbc=tuple(map(bool, atoms.pbc))), units=unit),
+            skin,
+            tables,
+            False,
+        )
+    return _Recipe(
+        lambda atoms: of_atoms(atoms, cut(potential, cutoff, species_of(atoms)[0]), cutoff.compare, unit),
+        skin,
+        {**tables, "cutoff": cutoff},
+        True,
+    )
+
+
+class MdnumCalculator(ClassicalCalculator):
+    """What mdnum computes for a potential, wherever ASE takes a calculator.
+
+    For relaxing with ase.optimize, for stress and equations of state, and for holding mdnum's forces
+    against ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its
+    skin; for molecular dynamics use mdnum's rollout, which records its flips.
+
+    Args:
+        system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may be others.
+        overrides: keys of the system file to change, as `--set` does.
+        potential, cutoff: instead of a system: objects as for `mdnum.simulation`, or the tables of a system
+            file as dictionaries.
+        units: "metal" (Å, eV) or "lj".
+    Raises:
+        InputError: neither or both of system and potential; tables that a system file could not hold. At the
+            first use: species without constants, a cell narrower than two cutoffs; a coordinate that is not
+            finite.
+        NumericalError: an energy or a force that is not finite, as of two atoms at one place.
+        TypeError: another keyword.
+
+    Example:
+        >>> argon = MdnumCalculator(
+        ...     potential=mdnum.LennardJones(sigma=3.405, epsilon=0.0103235),
+        ...     cutoff=mdnum.Cut("switched", 8.5, onset=7.0),
+        ... )
+    """
+
+    def __init__(
+        self,
+        system: Simulation | System | str | None = None,
+        *,
+        overrides: Mapping[str, Any] | None = None,
+        potential: Any = None,
+        cutoff: Any = None,
+        units: str = "metal",
+    ):
+        super().__init__()
+        self._evaluator: Evaluator | None = None
+        where = "MdnumCalculator"
+        if (system is None) == (potential is None):
+            remedy = "Say MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
+            raise InputError("give either a system or a potential", remedy=remedy, where=where)
+        if isinstance(system, System | Simulation) and overrides:
+            remedy = "Pass the name of the system, or load it with the overrides"
+            raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
+        self._recipe = _recipe(system, overrides, potential, cutoff, units)
+        self._given = system if isinstance(system, Simulation) else None
+        self.parameters = Parameters(self._recipe.tables)
+        if not self._recipe.pairwise:
+            # a potential of many bodies need not split its energy by atom
+            self.implemented_properties = [one for one in self.implemented_properties if one != "energies"]
+
+    @property
+    def simulation(self) -> Simulation | None:
+        """What was evaluated last; None before the first call."""
+        return None if self._evaluator is None else self._evaluator.simulation
+
+    def set(self, **changes: Any) -> dict[str, Any]:
+        """Changes nothing: another potential is another calculator.
+
+        Raises:
+            TypeError: something is to be changed.
+        """
+        if changes:
+            raise TypeError(f"MdnumCalculator has no {', '.join(changes)} to set; make another calculator")
+        return {}
+
+    def evaluated(self, atoms, changes):
+        numbers = {"atom": atoms.positions, "lattice vector": np.asarray(atoms.cell)}
+        for what, rows in numbers.items():
+            if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
+                place = f"{what} {bad[0]} is {rows[bad[0]].tolist()}"
+                raise InputError(f"{place}; expected finite numbers", where="MdnumCalculator")
+        if self._evaluator is None or _REBUILD & set(changes):
+            self._evaluator = self._made_for(atoms)
+        evaluation = self._evaluator(atoms.get_positions(), np.asarray(atoms.cell))
+        results = {"energy": float(evaluation.energy), "forces": np.array(evaluation.forces)}
+        if not all(np.isfinite(value).all() for value in results.values()):
+            pair = ""
+            if len(r := evaluation.distance):
+                near = int(np.argmin(r))
+                pair = f"; the closest pair is {evaluation.i[near]}-{evaluation.j[near]} at {r[near]:.4g}"
+            raise NumericalError(
+                f"an energy or a force is not finite{pair}", where="MdnumCalculator",
+                remedy="Relax the structure with a softer potential, or move the atoms apart",
+            )  # fmt: skip
+        if "energies" in self.implemented_properties:
+            results["energies"] = np.array(evaluation.energies)
+        if atoms.cell.rank == 3 and atoms.pbc.any():
+            results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(evaluation.stress))
+        return results
+
+    def _made_for(self, atoms: Atoms) -> Evaluator:
+        """What evaluates these atoms, wherever they are and in whatever box."""
+        # only what the forces depend on: constraints and the like stay with ASE
+        bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+        if self._given is not None:
+            own = self._given.structure
+            if np.array_equal(own.numbers, bare.numbers) and np.array_equal(own.pbc, bare.pbc):
+                return Evaluator(self._given)
+        return Evaluator(self._recipe.make(bare), skin=self._recipe.skin)

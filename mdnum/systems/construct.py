@@ -1,0 +1,326 @@
+"""From objects to a simulation: what fits together is put together, what does not is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from mdnum import units as unit_systems
+from mdnum.errors import InputError
+from mdnum.md.cell import Cell
+from mdnum.md.cutoffs import CUTOFFS
+from mdnum.md.decide import PairDecider
+from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.lattice import Lattice, LatticeDecider
+from mdnum.md.manybody import ManyBody
+from mdnum.md.neighbors import RebuildRule, check_radius
+from mdnum.md.potentials import CutPotential, PairPotential, pair_type
+from mdnum.numerics import PrecisionPolicy, check_not_forked
+from mdnum.numerics.reductions import REDUCTIONS
+from mdnum.numerics.roles import LATTICE
+from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, pair_key
+from mdnum.systems.simulation import Origin, Simulation
+from mdnum.systems.structures import Draw, check, smallest_distance, species_of
+from mdnum.units import Units
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+DOUBLE_ONLY = "many-body potentials are evaluated in float64 only"
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Where a pair potential ends, and how.
+
+    Example:
+        >>> Cut("switched", 8.5, onset=7.0)
+        >>> Cut("hard", {"Ni-Ni": 2.5, "Ni-P": 2.0, "P-P": 2.2})
+
+    Args:
+        kind: a name of `mdnum.md.cutoffs.CUTOFFS`, such as "hard", "shifted" or "switched".
+        radius: length; one for all pairs, or one for each pair of species.
+        onset: where switching begins, length, given like the radius; default 0.9 of the radius.
+        compare: what inside means, one of "r2 <", "r2 <=", "r <", "r <=".
+    """
+
+    kind: str
+    radius: float | Mapping[str, float]
+    onset: float | Mapping[str, float] | None = None
+    compare: str = "r2 <"
+
+
+def simulation(
+    atoms: Atoms,
+    potential: PairPotential | ManyBody,
+    cutoff: Cut | None = None,
+    *,
+    timestep: float,
+    units: str = "metal",
+    temperature: float = 0.0,
+    friction: float | None = None,
+    integrator: Integrator | None = None,
+    seed: int = 0,
+    remove_drift: bool = True,
+    drawn: bool | None = None,
+    steps: int = 1000,
+    save_every: int = 0,
+    skin: float | None = None,
+    rebuild: tuple[int, int, bool] = (1, 0, True),
+    builder: str = "auto",
+    precision: PrecisionPolicy = PrecisionPolicy(),
+    reduction: str = "sequential",
+    name: str = "simulation",
+    about: str = "",
+) -> Simulation:
+    """A simulation from a structure and a potential.
+
+    Example:
+        >>> atoms = ase.build.bulk("Ar", "fcc", a=5.26, cubic=True).repeat(4)
+        >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
+        >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002, temperature=90)
+        >>> mdnum.run(sim, steps=500)
+
+    Args:
+        atoms: positions, cell and periodicity; masses default to ASE's, in reduced units to 1.
+        potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; or one of
+            `mdnum.md.manybody`.
+        cutoff: of a pair potential; one of many bodies has its own.
+        timestep: in ps, or in reduced time.
+        units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
+        temperature: of velocities that are drawn, and of a thermostat.
+        friction: of Langevin dynamics, one over time; default constant energy.
+        integrator: another one; its numbers are in internal time, length * sqrt(mass / energy).
+        seed: of drawn velocities and of a thermostat's noise.
+        remove_drift: whether the velocity of the center of mass is taken out at the start.
+        drawn: whether velocities are drawn; default where the atoms have no momenta.
+        steps, save_every: last step of a run, and steps from frame to frame, 0 for none.
+        skin: of the Verlet list, length; default that of the units.
+        rebuild: every, delay and check of the list's rebuild rule.
+        builder: which search makes lists.
+        precision: dtype by role.
+        reduction: order of the force sums.
+        name, about: for people.
+
+    Raises:
+        InputError: a structure that cannot be simulated, parameters that do not fit its species, a box too
+            small for the cutoff and the skin, a cutoff that is missing or has no use.
+    """
+    system = unit_systems.get(units)
+    atoms = atoms.copy()
+    atoms.calc = None
+    if units == "lj" and not atoms.has("masses"):
+        atoms.set_array("masses", np.ones(len(atoms)), float, ())
+    symbols = species_of(atoms)[0]
+    pairwise = isinstance(potential, PairPotential)
+    if pairwise != (cutoff is not None):
+        message = "has no cutoff" if pairwise else "carries its own cutoff"
+        remedy = "Add cutoff=mdnum.Cut(kind, radius)" if pairwise else "Leave the cutoff out"
+        raise InputError(f"the potential {message}", where=name, remedy=remedy)
+    model: Any = cut(potential, cutoff, symbols) if pairwise else potential  # type: ignore[arg-type]
+    r_cut = float(np.max(model.r_cut))
+    skin = DEFAULT_SKIN[units] if skin is None else float(skin)
+    sigmas = np.asarray(model.potential.leaves.get("sigma", ())).tolist() if pairwise else ()
+    check(atoms, r_cut, skin, smallest_distance(potential.name, units, sigmas), system.length)
+    if integrator is None:
+        step = jax.device_put(np.float64(timestep * system.time_factor))
+        if friction is None:
+            integrator = VelocityVerlet(step)
+        else:
+            rate = jax.device_put(np.float64(friction / system.time_factor))
+            kT = jax.device_put(np.float64(system.k_B * temperature))
+            integrator = Langevin(step, rate, kT, jax.random.key(seed))
+    drawn = not atoms.has("momenta") if drawn is None else drawn
+    return assembled(
+        Origin(name, about), atoms, system, model, "r <" if cutoff is None else cutoff.compare,
+        RebuildRule(skin, *rebuild), builder, precision, REDUCTIONS.parse(reduction), integrator,
+        Draw(float(temperature), seed, remove_drift, drawn), steps, save_every,
+    )  # fmt: skip
+
+
+def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:
+    """A potential for atoms as they lie, with nothing to move them: what a calculator evaluates."""
+    return assembled(
+        Origin("calculator"), atoms, unit_systems.get(units), model, compare, RebuildRule(0.0), "auto",
+        PrecisionPolicy(), REDUCTIONS.parse("sequential"), VelocityVerlet(jax.device_put(np.float64(1.0))),
+        Draw(0.0), 0, 0,
+    )  # fmt: skip
+
+
+def cut(potential: PairPotential, cutoff: Cut, symbols: Sequence[str]) -> CutPotential:
+    """A potential with its end, everything with one entry per pair type."""
+
+    def table(value: Any, what: str):
+        return jax.device_put(by_type(value, symbols, what))
+
+    kind = CUTOFFS.parse(cutoff.kind)
+    radius = table(cutoff.radius, "cutoff.radius")
+    onset = radius
+    if kind.switches:
+        onset = ONSET_FRACTION * radius if cutoff.onset is None else table(cutoff.onset, "cutoff.onset")
+    leaves = {key: table(value, f"potential.{key}") for key, value in potential.leaves.items()}
+    return CutPotential(potential.with_leaves(leaves), kind, radius, onset)
+
+
+def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
+    """One number per pair type, from one for all or one for each pair of species.
+
+    Raises:
+        InputError: a pair has none, or it is no finite number.
+    """
+    names = [f"{a}-{b}" for k, a in enumerate(symbols) for b in symbols[k:]]
+    if isinstance(value, Mapping):
+        given = {pair_key(*key.split("-")): number for key, number in value.items()}
+        missing = [one for one in names if pair_key(*one.split("-")) not in given]
+        if missing:
+            remedy = "Give one for every pair of species, or one number for all"
+            raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
+        value = [given[pair_key(*one.split("-"))] for one in names]
+    numbers = np.broadcast_to(np.asarray(value, np.float64), (len(names),)).copy()
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{value!r}; expected finite numbers", where=what)
+    return numbers
+
+
+def assembled(
+    origin: Origin,
+    atoms: Atoms,
+    units: Units,
+    model: CutPotential | Any,
+    compare: str,
+    rule: RebuildRule,
+    builder: str,
+    policy: PrecisionPolicy,
+    reduction: Any,
+    integrator: Integrator,
+    draw: Draw,
+    steps: int,
+    save_every: int,
+) -> Simulation:
+    """A simulation from its parts, arguments as its attributes.
+
+    Args:
+        atoms: with momenta, unless velocities are drawn.
+        compare: what inside means.
+        builder: "auto" for the search that is fastest here.
+
+    Raises:
+        InputError: the cutoff and skin do not fit the box, or the state cannot be one of whole numbers.
+    """
+    check_not_forked()
+    cell = Cell.create(np.asarray(atoms.cell), atoms.pbc)
+    positions = np.asarray(atoms.positions, np.float64)
+    masses = np.asarray(atoms.get_masses(), np.float64)
+    symbols, species = species_of(atoms)
+    pairwise = isinstance(model, CutPotential)
+    radii = tuple(float(r) for r in np.asarray(model.r_cut)) if pairwise else (float(model.r_cut),)
+    decider = PairDecider(radii, compare, policy.decision, cell.reach(positions), policy.state)
+    check_radius(cell, max(radii), rule.skin)
+    if builder == "auto":
+        # a search on the host wins on a CPU; on an accelerator the positions would have to travel
+        builder = "host" if jax.default_backend() == "cpu" else "device"
+    velocities = draw.velocities(masses, units, None if draw.drawn else atoms.get_velocities())
+    made = Simulation(
+        origin, atoms, units, symbols, cell, positions, velocities, masses, species, model, decider, rule,
+        builder, policy, reduction, integrator, draw, steps, save_every,
+    )  # fmt: skip
+    made = in_whole_numbers(made) if policy.state == LATTICE else made
+    if origin.system is None:
+        return made
+    # from now on another part is a change
+    parts = {one.name: getattr(made, one.name) for one in fields(made) if one.name != "origin"}
+    return replace(made, origin=replace(made.origin, parts=parts))
+
+
+def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
+    """The same potential and settings for other atoms of the same species, or of some of them.
+
+    Args:
+        skin: of the Verlet list, length.
+
+    Raises:
+        InputError: a species that the simulation does not have; a box that is too small.
+    """
+    symbols, old = species_of(atoms)[0], simulation.symbols
+    if unknown := [one for one in symbols if one not in old]:
+        raise InputError(
+            f"the potential has nothing for {', '.join(unknown)}; it is one for {', '.join(old)}",
+            where=simulation.name,
+            remedy="Give a potential for all species",
+        )
+    model = simulation.model
+    if simulation.pairwise:
+        places = np.array([old.index(one) for one in symbols])
+        first, second = np.triu_indices(len(places))
+        kinds = pair_type(places[first], places[second], len(old))
+        model = jax.tree.map(lambda leaf: leaf[kinds], model)
+    else:
+        model = replace(model, pbc=tuple(bool(flag) for flag in atoms.pbc))
+    return assembled(
+        Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,
+        simulation.decider.compare, replace(simulation.rule, skin=skin), simulation.builder,
+        simulation.policy, simulation.reduction, simulation.integrator,
+        replace(simulation.draw, drawn=not atoms.has("momenta")), simulation.steps, simulation.save_every,
+    )  # fmt: skip
+
+
+def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:
+    """The system with another potential: any energy over a neighbor list, such as one of jax-md's.
+
+    Args:
+        simulation: the system as objects; in float64.
+        potential: an `EnergyFunction`, or another of `mdnum.md.manybody`.
+
+    Raises:
+        InputError: its radius and the skin do not fit the box, or the system is not in float64 throughout.
+    """
+    if simulation.policy != PrecisionPolicy():
+        raise InputError(DOUBLE_ONLY, remedy="Remove the [precision] table")
+    radius = float(potential.r_cut)  # type: ignore[attr-defined]
+    check_radius(simulation.cell, radius, simulation.rule.skin)
+    decider = PairDecider((radius,), "r <", "float64", simulation.decider.reach)
+    return replace(simulation, model=potential, decider=decider)
+
+
+def in_whole_numbers(simulation: Simulation) -> Simulation:
+    """The simulation on a lattice, in a box that fits it."""
+    masses, policy, units = simulation.masses, simulation.policy, simulation.units
+    if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
+        raise InputError(
+            'state = "lattice" decides and sums in whole numbers, from forces in float64',
+            where="precision",
+            remedy="Leave out force, decision and accumulate",
+        )
+    kT = units.k_B * simulation.draw.temperature
+    own = masses * np.linalg.norm(simulation.velocities, axis=1)
+    lattice = Lattice.create(
+        simulation.cell,
+        simulation.r_cut + simulation.rule.skin,
+        simulation.model,
+        np.maximum(np.sqrt(masses * kT), own / 4),
+        kT,
+        float(simulation.integrator.timestep),
+    )
+    cell, old = lattice.cell(simulation.cell), simulation.decider
+    atoms, origin = simulation.structure.copy(), simulation.origin
+    atoms.set_cell(np.asarray(cell.matrix))
+    if origin.system is not None:
+        origin = replace(origin, system=replace(origin.system, atoms=atoms))
+    made = replace(
+        simulation,
+        origin=origin,
+        structure=atoms,
+        cell=cell,
+        decider=LatticeDecider(
+            old.r_cut, old.compare, "float64", cell.reach(simulation.positions), spacing=lattice.spacing
+        ),
+        lattice=lattice,
+    )
+    # made here, so that a friction that a lattice cannot have is refused before the run
+    assert made.propagator is not None
+    return made

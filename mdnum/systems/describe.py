@@ -1,0 +1,191 @@
+"""What a simulation is, in words and numbers: for its folder, its digest, and what two of them differ in.
+
+The tables and keys are those of a system file, whether there was one or not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.md.integrators import Langevin
+from mdnum.numerics.reductions import BY_NAME
+from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, write_text
+from mdnum.store.folder import system_tables
+from mdnum.systems.build import build
+from mdnum.systems.load import GIVE_OBJECTS, STRUCTURE_FILE, load
+from mdnum.systems.simulation import Simulation
+from mdnum.systems.structures import to_extxyz
+from mdnum.systems.toml import flat
+
+#: Of a description, what says nothing about what is computed.
+_WORDS = ("name", "about")
+_ASKED = (*_WORDS, "dynamics.steps", "record.save_every")
+
+
+def described(simulation: Simulation) -> dict[str, Any]:
+    """Tables of plain values, ready for JSON: what the objects of a simulation are."""
+    rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
+    tables: dict[str, Any] = {
+        "name": simulation.name,
+        "about": simulation.origin.about,
+        "units": simulation.units.name,
+        "structure": {"formula": simulation.structure.get_chemical_formula(), "digest": _start(simulation)},
+        "potential": {"kind": simulation.potential.name, **_constants(simulation)},
+        "cutoff": _cutoff(simulation),
+        "neighbors": {
+            "skin": rule.skin,
+            "builder": simulation.builder,
+            "rebuild": {"every": rule.every, "delay": rule.delay, "check": rule.check},
+        },
+        "dynamics": {
+            "kind": simulation.integrator.name,
+            "timestep": simulation.timestep,
+            "steps": simulation.steps,
+            "seed": draw.seed,
+            "remove_drift": draw.remove_drift,
+            "temperature": draw.temperature,
+            **_dynamics(simulation),
+        },
+        "precision": {
+            **{role: getattr(policy, role) for role in ("state", "force", "decision", "accumulate")},
+            "reduction": reduction_word(simulation.reduction),
+        },
+        "record": {"save_every": simulation.save_every},
+    }
+    return {key: table for key, table in tables.items() if table is not None}
+
+
+def write(simulation: Simulation, folder: Path) -> None:
+    """Write what a simulation is into a folder: its file's, or simulation.json and structure.extxyz."""
+    if simulation.file is not None:
+        simulation.file.write(folder)
+        return
+    atoms = simulation.structure.copy()
+    atoms.set_positions(simulation.positions)
+    atoms.set_velocities(simulation.velocities)
+    write_text(folder / STRUCTURE_FILE, to_extxyz(atoms))
+    text = json.dumps(described(simulation), indent=1, ensure_ascii=False)
+    write_text(folder / SIMULATION_FILE, text + "\n")
+
+
+def again(folder: Path, given: Simulation | None = None) -> Simulation:
+    """The simulation that ran in a folder.
+
+    Args:
+        given: needed where it was made of objects, of which a folder holds only what they were.
+
+    Raises:
+        InputError: it is needed, not needed, or another one than ran there.
+    """
+    if not (folder / SIMULATION_FILE).is_file():
+        if given is not None:
+            message = "this run came from a system file and keeps it"
+            raise InputError(message, where=str(folder), remedy="Leave the simulation out")
+        return build(load(folder / SYSTEM_FILE))
+    if given is None:
+        load(folder)
+    assert given is not None
+    there, here = (flat(tables) for tables in (system_tables(folder / SIMULATION_FILE), described(given)))
+    keys = [key for key in dict.fromkeys((*there, *here)) if key not in _ASKED]
+    other = [key for key in keys if there.get(key) != here.get(key)]
+    if other:
+        seen = f"{other[0]} was {there.get(other[0])!r} and is {here.get(other[0])!r}"
+        more = f", and so on: {', '.join(other[1:5])}" * (len(other) > 1)
+        raise InputError(
+            f"this is not the simulation that ran there: {seen}{more}", where=str(folder), remedy=GIVE_OBJECTS
+        )
+    return given
+
+
+def program(simulation: Simulation) -> dict[str, Any]:
+    """Every number and choice of a simulation but its structure."""
+    return {key: table for key, table in described(simulation).items() if key not in (*_WORDS, "structure")}
+
+
+def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The tables of two simulations that are to be compared: of their files where both have one."""
+    files = [one.origin.system for one in (a, b)]
+    if a.file is not None and None not in files:
+        first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
+        return first, second
+    first, second = ({**described(one), "structure": None} for one in (a, b))
+    return first, second
+
+
+def reduction_word(reduction: Any) -> str:
+    """The word of a system file for an order of sums; its numbers as Python writes them where it has none."""
+    return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
+
+
+def plain_leaf(leaf: Any) -> Any:
+    """A number, a list of a few, or the digest of many."""
+    array = np.asarray(leaf)
+    if array.size == 1:
+        return array.reshape(()).item()
+    if array.size <= 64:
+        return array.tolist()
+    return f"sha256:{hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()} {array.shape}"
+
+
+def by_pair(simulation: Simulation, leaf: Any) -> Any:
+    """A number of each pair type: one where all are the same, else by pair of species."""
+    values = np.asarray(leaf, np.float64)
+    if len(set(values.tolist())) == 1:
+        return float(values[0])
+    rows, columns = np.triu_indices(len(simulation.symbols))
+    names = simulation.symbols
+    pairs = zip(rows, columns, strict=True)
+    return {f"{names[a]}-{names[b]}": float(x) for (a, b), x in zip(pairs, values, strict=True)}
+
+
+def _start(simulation: Simulation) -> str:
+    """SHA-256 of what step 0 is made of."""
+    sums = hashlib.sha256()
+    arrays = (
+        simulation.structure.numbers, simulation.masses, simulation.positions, simulation.velocities,
+        np.asarray(simulation.cell.matrix), np.array(simulation.pbc),
+    )  # fmt: skip
+    for array in arrays:
+        sums.update(f"{array.dtype.str} {array.shape}".encode())
+        sums.update(np.ascontiguousarray(array).tobytes())
+    return sums.hexdigest()
+
+
+def _constants(simulation: Simulation) -> dict[str, Any]:
+    if simulation.pairwise:
+        return {name: by_pair(simulation, leaf) for name, leaf in simulation.potential.leaves.items()}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(simulation.model)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): plain_leaf(leaf)
+        for path, leaf in leaves
+        if eqx.is_array_like(leaf)
+    }
+
+
+def _cutoff(simulation: Simulation) -> dict[str, Any] | None:
+    if not simulation.pairwise:
+        return None
+    model = simulation.model
+    onset = {"onset": by_pair(simulation, model.r_onset)} if model.cutoff.switches else {}
+    radius = by_pair(simulation, model.r_cut)
+    return {"kind": model.cutoff.name, "radius": radius, **onset, "compare": simulation.decider.compare}
+
+
+def _dynamics(simulation: Simulation) -> dict[str, Any]:
+    integrator = simulation.integrator
+    if isinstance(integrator, Langevin):
+        return {"friction": float(integrator.friction) * simulation.units.time_factor}
+    numbers = eqx.filter(integrator, eqx.is_inexact_array)
+    return {
+        name: plain_leaf(leaf)
+        for name, leaf in vars(numbers).items()
+        if name != "timestep" and eqx.is_inexact_array(leaf)
+    }

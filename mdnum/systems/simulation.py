@@ -1,0 +1,320 @@
+"""A simulation as objects: structure, potential, list rule, integrator, precision, start, units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.md.cell import Cell, displacement
+from mdnum.md.cutoffs import CUTOFFS, Cutoff
+from mdnum.md.decide import PairDecider, Tables
+from mdnum.md.integrators import Integrator, Langevin
+from mdnum.md.lattice import Lattice, LatticeForce, LatticeStep, on_lattice
+from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
+from mdnum.md.pairforce import ManyBodyForce, PairForce
+from mdnum.md.potentials import CutPotential, pair_type
+from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.systems.structures import Draw
+from mdnum.units import Units
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+    from mdnum.systems.evaluate import Evaluation
+    from mdnum.systems.load import System
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a simulation came from."""
+
+    name: str  # what it is called
+    about: str = ""  # a sentence for people
+    system: System | None = None  # the system file that it was built from
+    fork: Mapping[str, Any] = field(default_factory=dict)  # what a question about forks asks by default
+    # of one built from a file its fields as they were then; one that differs was changed since
+    parts: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A simulation as objects: what every verb, reference and calculator works with.
+
+    `mdnum.simulation` makes one from a structure and a potential, `mdnum.build` from a system file.
+
+    Attributes:
+        origin: where it came from.
+        structure: atoms as they were given; positions and velocities of step 0 are those below.
+        units: of everything that a person reads or writes.
+        symbols: chemical symbols present, sorted.
+        cell: the box.
+        positions: shape (atoms, 3), length, as the structure has them (not wrapped).
+        velocities: shape (atoms, 3), length per internal time.
+        masses: shape (atoms,).
+        species: index into symbols, shape (atoms,).
+        model: CutPotential, or a many-body potential.
+        decider: the pair decision.
+        rule: when lists are rebuilt.
+        builder: name of the list builder.
+        policy: dtype by role.
+        reduction: order of the force sum.
+        integrator: the dynamics.
+        draw: how the velocities of step 0 were made.
+        steps, save_every: last step of a run, and steps from one frame of its trajectory to the next (0:
+            none), unless a run is asked for others.
+        lattice: units of a state in whole numbers; None where it is one of floats.
+    """
+
+    origin: Origin
+    structure: Atoms
+    units: Units
+    symbols: tuple[str, ...]
+    cell: Cell
+    positions: Float[np.ndarray, "atoms 3"]
+    velocities: Float[np.ndarray, "atoms 3"]
+    masses: Float[np.ndarray, "atoms"]
+    species: Int[np.ndarray, "atoms"]
+    model: Any
+    decider: PairDecider
+    rule: RebuildRule
+    builder: str
+    policy: PrecisionPolicy
+    reduction: Any
+    integrator: Integrator
+    draw: Draw
+    steps: int
+    save_every: int
+    lattice: Lattice | None = None
+
+    @property
+    def name(self) -> str:
+        """Such as "argon/liquid-864"."""
+        return self.origin.name
+
+    @property
+    def file(self) -> System | None:
+        """The system file that says all of it; None of one made of objects, or changed since it was read."""
+        its = self.origin.parts
+        same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
+        return self.origin.system if same else None
+
+    @property
+    def in_sigma(self) -> bool:
+        """Whether its file gives the cutoff in units of sigma, so that it follows sigma."""
+        system = self.origin.system
+        return (
+            system is not None and system.spec.cutoff is not None and system.spec.cutoff.in_sigma is not None
+        )
+
+    @property
+    def timestep(self) -> float:
+        """The time step in the unit of time of `units`."""
+        step, factor = float(self.integrator.timestep), self.units.time_factor
+        # the shortest number that makes this step, which is what a person wrote
+        short = float(f"{step / factor:.15g}")
+        return short if short * factor == step else step / factor
+
+    @property
+    def atoms(self) -> int:
+        """Number of atoms."""
+        return len(self.masses)
+
+    @property
+    def pairwise(self) -> bool:
+        """Whether the fast pair path serves it (else the general path does)."""
+        return isinstance(self.model, CutPotential)
+
+    @property
+    def pbc(self) -> tuple[bool, bool, bool]:
+        """Periodicity per axis."""
+        return self.cell.pbc
+
+    @property
+    def potential(self) -> Any:
+        """The bare pair potential, or the many-body potential."""
+        return self.model.potential if self.pairwise else self.model
+
+    @property
+    def cutoff(self) -> Any:
+        """The cutoff of a pair potential; None where the potential carries its own."""
+        return self.model.cutoff if self.pairwise else None
+
+    @property
+    def r_cut(self) -> float:
+        """The longest interaction radius, length."""
+        return max(self.decider.r_cut)
+
+    @cached_property
+    def force(self) -> PairForce | ManyBodyForce:
+        """Forces and decisions over a list, for use in jit."""
+        # kept for later calls, so it must hold no tracer even where its first use is inside a jit
+        with jax.ensure_compile_time_eval():
+            parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
+            if self.lattice is not None:
+                return LatticeForce.on(self.lattice, *parts)
+            if self.pairwise:
+                return PairForce.create(*parts)
+            return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
+
+    @cached_property
+    def propagator(self) -> Integrator:
+        """The dynamics as the state needs it: the integrator, or its twin in whole numbers.
+
+        Raises:
+            InputError: a friction that a lattice cannot have.
+        """
+        if self.lattice is None:
+            return self.integrator
+        with jax.ensure_compile_time_eval():
+            return on_lattice(self.integrator, self.lattice)
+
+    @property
+    def smooth(self) -> Simulation:
+        """The same system in floats: what is linearized, since a whole number has no derivative."""
+        return self if self.lattice is None else replace(self, lattice=None)
+
+    @property
+    def has_bath(self) -> bool:
+        """Whether a state remembers what friction has forgotten."""
+        return self.lattice is not None and isinstance(self.integrator, Langevin)
+
+    @property
+    def path(self) -> Path | None:
+        """Its file's; None for one made of objects."""
+        return None if self.file is None else self.file.path
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """Every number and choice but the structure, plain values: what is hashed."""
+        from mdnum.systems.describe import program
+
+        return self.file.program if self.file is not None else program(self)
+
+    def write(self, folder: str | Path) -> None:
+        """Write what it is into a folder: its file and structure, or the objects' description."""
+        from mdnum.systems.describe import write
+
+        write(self, Path(folder))
+
+    def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+        """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
+        if self.lattice is None:
+            return self.positions, self.velocities
+        scheme, masses = self.propagator, jnp.asarray(self.masses)
+        assert isinstance(scheme, LatticeStep)
+        v = scheme.velocity(scheme.momentum(jnp.asarray(self.velocities.T), masses), masses)
+        # an integer has no negative zero
+        return self.lattice.positions(self.positions) + 0.0, np.asarray(v).T + 0.0
+
+    @property
+    def pair_types(self) -> int:
+        """How many kinds of pairs there are."""
+        return len(self.decider.r_cut)
+
+    def type_of(self, i, j) -> Int[np.ndarray, "..."]:
+        """Pair type of atoms i and j."""
+        if self.pair_types == 1:
+            return np.zeros(np.broadcast(i, j).shape, np.int64)
+        return pair_type(self.species[i], self.species[j], len(self.symbols))
+
+    def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
+        """Energy and radial force that a pair brings when it enters, per pair type."""
+        if self.pairwise:
+            return self.model.jumps()
+        smoothness = self.model.smoothness
+        return np.array([smoothness.energy_jump]), np.array([smoothness.force_jump])
+
+    @property
+    def lists(self) -> tuple[Any, ...]:
+        """What decides which lists a run has and in which order they are: equal here, equal lists."""
+        return self.rule, self.builder
+
+    def verlet_list(self, skin: float | None = None) -> VerletList:
+        """A new Verlet list for this system, with another skin where one is given."""
+        rule = self.rule if skin is None else replace(self.rule, skin=skin)
+        return VerletList(BUILDERS.parse(self.builder), rule, self.r_cut, guard=self._guard)
+
+    @property
+    def _guard(self) -> float:
+        """Room for rounding of the displacements that are compared with the skin, length."""
+        coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
+        return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
+
+    def tables(self, table: PairTable) -> Tables:
+        """A pair table on the device, with pair types."""
+        index, order = table.found, table.sorting
+        atoms = index.shape[1]
+        shape = (-1, SLOTS, atoms)
+        types = None
+        if self.pair_types > 1:
+            own = self.species if isinstance(index, np.ndarray) else jax.device_put(self.species)
+            # padding borrows the last atom's species; its decision is no whatever its type
+            species = own[index.__array_namespace__().append(order, order[-1:])]
+            kinds = pair_type(species[index], species[:atoms], len(self.symbols))
+            types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
+        # not jnp.asarray, which compiles a program for every shape
+        return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
+
+    def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
+        """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
+        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
+        return replace(self, model=replace(self.model, cutoff=made))
+
+    @property
+    def continuous(self) -> Simulation:
+        """The same forces from an energy that does not jump at the cutoff."""
+        if not self.pairwise or self.cutoff.continuous is self.cutoff:
+            return self
+        return self.with_cutoff(self.cutoff.continuous)
+
+    def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
+        """The same system in floats of these roles, by default float64 throughout."""
+        decider = replace(self.decider, dtype=policy.decision, state=policy.state)
+        return replace(self, policy=policy, decider=decider, lattice=None)
+
+    def with_cell(self, cell: Cell) -> Simulation:
+        """The same system in another box."""
+        check_radius(cell, self.r_cut, 0.0)
+        cell = cell if self.lattice is None else self.lattice.cell(cell)
+        return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
+
+    def evaluate(
+        self,
+        positions: Float[np.ndarray, "atoms 3"] | None = None,
+        cell: Float[np.ndarray, "3 3"] | None = None,
+        stress: bool = True,
+    ) -> Evaluation:
+        """`Evaluator.__call__` for one configuration, with a list of its own."""
+        from mdnum.systems.evaluate import Evaluator
+
+        return Evaluator(self, skin=0.0)(positions, cell, stress)
+
+    def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
+        """The potential energy of one configuration alone, with a list of its own, and the numbers behind it.
+
+        Args:
+            positions: shape (atoms, 3), length; default the structure's.
+
+        Returns:
+            energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
+            type and largest of all, length², `pair`: bare energies at the smallest; 0 for none.
+        """
+        from mdnum.systems.evaluate import Evaluator
+
+        return Evaluator(self, skin=0.0).numbers(positions)
+
+    def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs i < j whose decision is yes, sorted, with their distances."""
+        i, j = table.decided(bits)
+        order = np.lexsort((j, i))
+        i, j = i[order], j[order]
+        dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
+        return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
