@@ -15,7 +15,8 @@ from mdnum.gradients.losses import Loss
 from mdnum.numerics import Ledger, Threshold, gamma
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System, SystemSpec
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import build
+from mdnum.systems.simulation import Simulation
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 A, SPEED, DT, STEPS, EPSILON = 1.11, 10.0, 0.004, 100, "potential.epsilon"

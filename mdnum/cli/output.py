@@ -99,9 +99,16 @@ def refuse_beside_resume(given: Mapping[str, Any], what: str) -> None:
     refuse(asked, f"of a new {what}", "Leave it out beside --resume, or begin in a new folder")
 
 
-def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
-    """Changes to a system file, as a verb takes them."""
-    return {"overrides": parse_overrides(settings)}
+def changed(
+    settings: list[str] | None = SET_OPTION, potential: str | None = None, allow_code: bool = False
+) -> dict[str, Any]:
+    """Changes to a system file, as a verb takes them; whoever names code on the command line allows it."""
+    overrides = parse_overrides(settings)
+    if potential is not None:
+        file, colon, name = potential.rpartition(":")
+        function = f"{Path(file).resolve()}{colon}{name}"
+        overrides = {"potential.kind": "python", "potential.function": json.dumps(function), **overrides}
+    return {"overrides": overrides, "allow_code": allow_code or potential is not None}
 
 
 def of_a_folder(

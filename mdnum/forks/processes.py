@@ -33,6 +33,7 @@ from mdnum.errors import InputError, MdnumError
 from mdnum.forks.worlds import program_of, varied
 from mdnum.safe_path import environment, python
 from mdnum.systems import BallSystem
+from mdnum.systems.code import allow_code, is_allowed
 from mdnum.systems.load import opened
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def variants(
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {"path": _written(system, folder), "steps": steps}
+        question = {"path": _written(system, folder), "steps": steps, "code": is_allowed()}
         done, count = 0, Lock()
 
         def ran(k: int) -> tuple[Ran, np.ndarray | None]:
@@ -378,7 +379,7 @@ def digests_elsewhere(
         progress(0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {"path": _written(system, folder), "key": key, "steps": steps}
+        question = {"path": _written(system, folder), "key": key, "steps": steps, "code": is_allowed()}
         asked = [value.hex() for value in values]
         failed = _ask({**question, "values": asked}, folder / "question.json", heard)
     if failed or len(found) != len(asked):
@@ -455,7 +456,8 @@ def _ask(
 def main() -> None:
     """Answer the question in the file that the last argument names."""
     question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
-    system = opened(question["path"])
+    with allow_code(question["code"]):
+        system = opened(question["path"])
     if "values" in question:
         for value in question["values"]:
             print(*digests(system, question["key"], question["steps"], [float.fromhex(value)]), flush=True)

@@ -77,8 +77,14 @@ def _recipe(system: Any, overrides: Any, potential: Any, cutoff: Any, unit: str)
             tables,
             False,
         )
+    at = cutoff.radius, cutoff.onset
+
+    def make(atoms: Atoms) -> Simulation:
+        model = cut(potential, cutoff.kind, species_of(atoms)[0], *at)
+        return of_atoms(atoms, model, cutoff.compare, unit)
+
     return _Recipe(
-        lambda atoms: of_atoms(atoms, cut(potential, cutoff, species_of(atoms)[0]), cutoff.compare, unit),
+        make,
         skin,
         {**tables, "cutoff": cutoff},
         True,

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 from typing import Any, cast
 
 import numpy as np
@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff
-from mdnum.md.potentials import PairPotential
+from mdnum.md.potentials import CutPotential, PairPotential
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,7 @@ def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dic
         compare: what inside means, as in a system file.
     """
     forms = {}
-    for kind, (x, y) in enumerate(zip(*np.triu_indices(len(symbols)), strict=True)):
-        a, b = symbols[x], symbols[y]
+    for kind, (a, b) in enumerate(combinations_with_replacement(symbols, 2)):
         forms[a, b] = forms[b, a] = PairForm(
             (a, b),
             model.potential,

@@ -15,11 +15,11 @@ from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.neighbors import RebuildRule
-from mdnum.md.potentials import POTENTIALS, CutPotential
+from mdnum.md.potentials import POTENTIALS, CutPotential, PairFunction
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.reductions import REDUCTIONS
-from mdnum.systems import pairs, schema
-from mdnum.systems.construct import DOUBLE_ONLY, assembled
+from mdnum.systems import code, pairs, schema
+from mdnum.systems.construct import DOUBLE_ONLY, assembled, cut
 from mdnum.systems.load import System, load
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import species_of
@@ -68,6 +68,12 @@ def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder:
     if spec.cutoff is None:
         return _many_body_model(spec.potential, atoms, folder, name)
     species, _ = species_of(atoms)
+    if isinstance(spec.potential, schema.PythonTable):
+        own = PairFunction(code.function(spec.potential.function, folder), **spec.potential.parameters)
+        radius, onset = pairs.cutoff_radii(spec, species)
+        return cut(
+            own, spec.cutoff.kind, species, _per_type(radius), onset if onset is None else _per_type(onset)
+        )
     tables = pairs.pair_constants(spec, species)
     constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
     radius, onset = pairs.cutoff_radii(spec, species)

@@ -122,7 +122,9 @@ def simulation(
         message = "has no cutoff" if pairwise else "carries its own cutoff"
         remedy = "Add cutoff=mdnum.Cut(kind, radius)" if pairwise else "Leave the cutoff out"
         raise InputError(f"the potential {message}", where=name, remedy=remedy)
-    model: Any = cut(potential, cutoff, symbols) if pairwise else potential  # type: ignore[arg-type]
+    model: Any = potential
+    if isinstance(potential, PairPotential) and cutoff is not None:
+        model = cut(potential, cutoff.kind, symbols, cutoff.radius, cutoff.onset)
     r_cut = float(np.max(model.r_cut))
     skin = DEFAULT_SKIN[units] if skin is None else float(skin)
     sigmas = np.asarray(model.potential.leaves.get("sigma", ())).tolist() if pairwise else ()
@@ -152,19 +154,20 @@ def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal
     )  # fmt: skip
 
 
-def cut(potential: PairPotential, cutoff: Cut, symbols: Sequence[str]) -> CutPotential:
-    """A potential with its end, everything with one entry per pair type."""
+def cut(
+    potential: PairPotential, kind: str, symbols: Sequence[str], radius: Any, onset: Any = None
+) -> CutPotential:
+    """A potential with its end, everything with one entry per pair type; arguments as those of `Cut`."""
 
     def table(value: Any, what: str):
         return jax.device_put(by_type(value, symbols, what))
 
-    kind = CUTOFFS.parse(cutoff.kind)
-    radius = table(cutoff.radius, "cutoff.radius")
-    onset = radius
-    if kind.switches:
-        onset = ONSET_FRACTION * radius if cutoff.onset is None else table(cutoff.onset, "cutoff.onset")
+    cutoff, r_cut = CUTOFFS.parse(kind), table(radius, "cutoff.radius")
+    r_onset = r_cut
+    if cutoff.switches:
+        r_onset = ONSET_FRACTION * r_cut if onset is None else table(onset, "cutoff.onset")
     leaves = {key: table(value, f"potential.{key}") for key, value in potential.leaves.items()}
-    return CutPotential(potential.with_leaves(leaves), kind, radius, onset)
+    return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset)
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:

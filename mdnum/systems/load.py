@@ -7,6 +7,7 @@ import shutil
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -15,7 +16,7 @@ from mdnum.errors import InputError, expect_path
 from mdnum.reading import whole_text
 from mdnum.registry import nearest
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, disk_errors, replacing, write_text
-from mdnum.systems import pairs, schema, structures, toml
+from mdnum.systems import code, pairs, schema, structures, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
 from mdnum.systems.toml import Source, apply_overrides, checked, read_overrides
 
@@ -176,12 +177,17 @@ class System:
     @property
     def program(self) -> dict[str, Any]:
         """Every number and choice but the structure, plain values: what is hashed."""
-        return self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
+        made = self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
+        if isinstance(self.spec.potential, schema.PythonTable):
+            made["potential"]["code"] = [sha256(file.read_bytes()).hexdigest() for file in self.tables]
+        return made
 
     @property
     def tables(self) -> set[Path]:
-        """Files the potential reads."""
+        """Files the potential reads, or executes."""
         potential = self.spec.potential
+        if isinstance(potential, schema.PythonTable):
+            return {code.parts(potential.function, self.folder)[0]}
         return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtomTable) else set()
 
     def to_toml(self, *, beside: bool = True) -> str:
@@ -195,14 +201,20 @@ class System:
         spec = self.spec.model_dump(mode="python", exclude_none=True)
         structure = spec["structure"]
         if not beside:
-            for table in (structure, spec["potential"]):
-                if "file" in table:
-                    table["file"] = str((self.folder / table["file"]).resolve())
+            for table, key in (
+                (structure, "file"),
+                (spec["potential"], "file"),
+                (spec["potential"], "function"),
+            ):
+                if key in table:
+                    table[key] = str((self.folder / table[key]).resolve())
             return toml.dump({"name": self.name, **spec})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
         if isinstance(self.spec.potential, schema.EmbeddedAtomTable):
             spec["potential"]["file"] = Path(self.spec.potential.file).name
+        if isinstance(self.spec.potential, schema.PythonTable):
+            spec["potential"]["function"] = Path(self.spec.potential.function).name
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:

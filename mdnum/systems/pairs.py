@@ -37,6 +37,9 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
     potential = spec.potential
     if not isinstance(potential, schema.PairPotentialTable):
         raise TypeError(f"{potential.kind} is not a pair potential")
+    if isinstance(potential, schema.PythonTable):
+        # its function says what it needs, once it may be executed
+        return {}
     given = {pair_key(*name.split("-")): row for name, row in (potential.pairs or {}).items()}
     tables = {name: np.zeros((len(species), len(species))) for name in potential.constants}
     missing = []

@@ -140,8 +140,23 @@ class EmbeddedAtomTable(ManyBodyTable):
     file: str = Field(description="setfl table (.eam.alloy), relative to this file")
 
 
+class PythonTable(PairPotentialTable):
+    """A pair potential as a function u(r, ...) or u(r2, ...) in a Python file, executed where allowed."""
+
+    kind: Literal["python"]
+    function: str = Field(description='file and name, "mine.py:morse", relative to this file')
+    parameters: dict[str, float | dict[str, float]] = Field(
+        default_factory=dict, description='by name: a number, or one for each pair of species such as "Ni-P"'
+    )
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """Names of its parameters, which its function checks."""
+        return ()
+
+
 _MANY_BODY = (StillingerWeberTable, TersoffTable, EmbeddedAtomTable)
-_PAIRS = (LennardJonesTable, MorseTable, SoftSphereTable)
+_PAIRS = (LennardJonesTable, MorseTable, SoftSphereTable, PythonTable)
 
 
 class OtherRow(TomlTable):

@@ -35,6 +35,7 @@ from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder, read_text
+from mdnum.systems import code
 
 if TYPE_CHECKING:
     from mdnum.units import Units
@@ -187,6 +188,7 @@ class Keep(TypedDict, total=False):
     report: bool  # write report.html; default True
     # called now and then with what is done, of how much, and a dictionary that names the phase
     progress: Progress | None
+    allow_code: bool  # whether Python that the system file names may be executed; default False
 
 
 class UnknownKeyword(InputError, TypeError):
@@ -212,14 +214,15 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
         known += [*Keep.__annotations__, *more]
 
     @functools.wraps(verb)
-    def checked(*args: Any, **kwargs: Any) -> Any:
+    def checked(*args: Any, allow_code: bool = False, **kwargs: Any) -> Any:
         for word in kwargs:
             if word not in known:
                 close = nearest(word, known)
                 hint = f"Did you mean {close!r}? " if close else ""
                 message = f"{name or verb.__name__}() has no keyword {word!r}"
                 raise UnknownKeyword(message, remedy=f"{hint}It takes {', '.join(known)}")
-        return verb(*args, **kwargs)
+        with code.allow_code(allow_code):
+            return verb(*args, **kwargs)
 
     return cast(V, checked)
 
@@ -246,12 +249,13 @@ def answering(
     overrides: Mapping[str, Any] | None = None,
     report: bool = True,
     progress: Progress | None = None,
+    allow_code: bool = False,
 ) -> Iterator[Answer]:
     """A new folder that is filled, then stored with the seconds that it took, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
-        overrides: are in the system already.
+        overrides, allow_code: have had their effect on the system already.
         out, report, progress: see `Keep`; named one by one, so that what is misspelled is refused.
 
     Raises:

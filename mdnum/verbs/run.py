@@ -64,6 +64,7 @@ def run(
     check: bool = True,
     report: bool = True,
     progress: Progress | None = None,
+    allow_code: bool = False,
 ) -> Outcome:
     """Simulate a system, record every flip, compare the first and last frame with ASE, and write a report.
 
@@ -77,6 +78,7 @@ def run(
         check: compare with ASE (or with plain numpy where ASE has no such potential).
         report: write report.html.
         progress: called now and then with step, steps and a dictionary of figures.
+        allow_code: execute the Python that a system file names.
 
     Returns:
         folder, summary and page; its result is a `mdnum.rollout.run.RunResult`.

@@ -109,7 +109,7 @@ def test_ambiguous_pairs_are_counted_where_a_shell_sits_at_the_cutoff(tmp_path):
         )  # fmt: skip
 
     first = build(load(written(dict.fromkeys(shells, 0.0))))
-    species, decider = first.system.species, first.decider
+    species, decider = first.symbols, first.decider
     of_type = dict(zip(itertools.combinations_with_replacement(species, 2), decider.bounds, strict=True))
     bounds = {kind: of_type[tuple(kind.split("-"))] for kind in shells}
     assert bounds["Ar-Ar"] > 1.4 * bounds["Ne-Ne"]

@@ -1,0 +1,80 @@
+"""Code that a system file names: read where somebody said so, and never unasked."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+from mdnum.errors import InputError
+
+_ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
+
+
+@contextmanager
+def allow_code(allow: bool = True) -> Iterator[None]:
+    """In here the Python that a system file names is executed.
+
+    Args:
+        allow: False leaves it as it was.
+    """
+    before = _ALLOWED.set(allow or _ALLOWED.get())
+    try:
+        yield
+    finally:
+        _ALLOWED.reset(before)
+
+
+def is_allowed() -> bool:
+    """Whether code that a file names may be executed here."""
+    return _ALLOWED.get()
+
+
+def parts(place: str, folder: Path) -> tuple[Path, str]:
+    """File and name of "mine.py:morse", in a folder.
+
+    Raises:
+        InputError: it is not of that form.
+    """
+    file, _, name = place.rpartition(":")
+    if not file.endswith(".py") or not name.isidentifier():
+        raise InputError(f"{place!r} is not of the form FILE.py:NAME", where="potential.function")
+    return folder / file, name
+
+
+def function(place: str, folder: Path) -> Callable[..., Any]:
+    """The function that a system file names; its file is executed.
+
+    Args:
+        place: "mine.py:morse", relative to folder.
+
+    Raises:
+        InputError: it is not allowed here, or the file has no such function or cannot be executed.
+    """
+    file, name = parts(place, folder)
+    if not is_allowed():
+        raise InputError(
+            f"the system file names Python code ({file}:{name}), which is not executed unasked",
+            where="potential.function",
+            remedy="Read it, then add --allow-code, or allow_code=True in Python",
+        )
+    if not file.is_file():
+        raise InputError("no such file", where=str(file), remedy="Correct potential.function")
+    spec = importlib.util.spec_from_file_location(f"mdnum_code_{file.stem}", file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # for inspect, which reads the source of what is defined there
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        message = " ".join(str(error).split())
+        raise InputError(f"cannot be executed: {type(error).__name__}: {message}", where=str(file)) from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        raise InputError(f"has no function {name!r}", where=str(file), remedy="Correct potential.function")
+    return found
