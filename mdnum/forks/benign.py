@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.special import betaincinv
@@ -32,7 +31,6 @@ from mdnum.forks.ensemble import (
     starts,
     steps_to_diverge,
 )
-from mdnum.md.integrators import Langevin
 from mdnum.program import Twin
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.build import Simulation
@@ -389,13 +387,8 @@ def benign(
 def _check(twin: Twin) -> None:
     """Refuse programs that an ensemble of one cannot judge the other by."""
     twin.a.check(twin.b)
-    keys = [
-        np.asarray(jax.random.key_data(one.simulation.integrator.key))
-        if isinstance(one.simulation.integrator, Langevin)
-        else np.empty(0)
-        for one in (twin.a, twin.b)
-    ]
-    if not np.array_equal(keys[0], keys[1]):
+    a, b = (one.simulation.integrator.noise for one in (twin.a, twin.b))
+    if not np.array_equal(a, b):
         raise InputError(
             "the runs have different noise, so they diverge at the first step whatever else they do",
             where="dynamics.seed",

@@ -26,6 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md.integrators import check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics.verdicts import Growth
 from mdnum.rollout.engine import FAILURES, Engine, Segment
@@ -88,9 +89,10 @@ def tangents(
         reach: whether to ask for the amplitudes at which decisions flip.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
     """
     force = simulation.smooth.force
+    check_kick(simulation.integrator)
     if not isinstance(force, PairForce):
         raise InputError(
             "decisions cannot be imposed on a many-body potential",

@@ -29,7 +29,7 @@ from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
 from mdnum.md import kernel
 from mdnum.md.decide import Tables, halves_of, unpacked
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import KickDrift, check_kick
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
 
@@ -240,7 +240,7 @@ def reverse(
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential with its flips.
+        InputError: a many-body potential with its flips, or an integrator that is no linear `KickDrift`.
 
     Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
     """
@@ -268,6 +268,7 @@ class StretchReversal:
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
         force = simulation.force
+        check_kick(simulation.integrator)
         if guard is not None and not isinstance(force, PairForce):
             raise InputError(
                 "what flips add is known for pair potentials only",
@@ -316,7 +317,7 @@ class StretchReversal:
 @partial(jax.jit, static_argnames=("wanted",))
 def transposed(
     force: PairForce | ManyBodyForce,
-    integrator: Integrator,
+    integrator: KickDrift,
     masses: Float[Array, "atoms"],
     tables,
     rows,
@@ -386,9 +387,8 @@ def transposed(
             model = jax.tree.map(jnp.add, model, made.model)
         if FORCE in wanted:
             acceleration = made.force / mass_row
-            _, back = jax.vjp(
-                lambda numbers, scale: drift(x, v + half * acceleration, numbers, scale, number), numbers, one
-            )
+            kicked = integrator.kick(v, half, acceleration)
+            _, back = jax.vjp(lambda numbers, scale: drift(x, kicked, numbers, scale, number), numbers, one)
             by_numbers, by_scale = back((carry.x, carry.v))
             kick = jnp.sum(onto_kicked * acceleration) + jnp.where(
                 number == 0, 0, jnp.sum(onto_v * acceleration)

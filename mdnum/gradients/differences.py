@@ -18,7 +18,6 @@ from itertools import pairwise
 from math import factorial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +28,6 @@ from mdnum.gradients import parameters
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, scalars_only
 from mdnum.gradients.recorded import EventAware
 from mdnum.gradients.tape import RunTape, TapeStretch
-from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.roles import LATTICE
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
@@ -304,11 +302,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
     v = random.standard_normal((len(masses), 3)) * np.sqrt(kT / masses)[:, None]
     # a velocity that all atoms share is no temperature
     v -= masses @ v / masses.sum()
-    made = replace(simulation, velocities=v)
-    bath = simulation.integrator
-    if isinstance(bath, Langevin):
-        key = jax.random.fold_in(bath.key, seed)
-        made = replace(made, integrator=eqx.tree_at(lambda one: one.key, bath, key))
+    made = replace(simulation, velocities=v, integrator=simulation.integrator.with_noise(seed))
     return settled(made, settle) if settle else made
 
 

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int, Real
 
 from mdnum.errors import NumericalError
 from mdnum.gradients.losses import NOT_REAL, Loss, LossContext, LossFrame
-from mdnum.md.lattice import LatticeLangevin
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
@@ -267,9 +266,9 @@ class ReversibleTape(RunTape):
         x, v, images = (segment.rows_of(name) for name in ("x", "v", "images"))
         for row in np.flatnonzero(steps % self._every == 0):
             self._prints[int(steps[row])] = fingerprint(segment.table.order, x[row], v[row], images[row])
-        state, scheme = segment.state, self.simulation.propagator
-        if isinstance(scheme, LatticeLangevin) and int(state.step) % int(scheme.period) == 0:
-            self.baths[int(state.step)] = np.array(state.bath)
+        state, period = segment.state, self.simulation.propagator.period
+        if period is not None and int(state.step) % int(period) == 0:
+            self.baths[int(state.step)] = np.array(state.extra.value)
         self._end = state
 
     def __len__(self) -> int:

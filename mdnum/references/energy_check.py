@@ -378,7 +378,7 @@ class DynamicsReport:
 def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
     """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
 
-    A Langevin system is run without its bath. A hard cutoff has the forces of ASE's shifted one, so the
+    A thermostat is left out. A hard cutoff has the forces of ASE's shifted one, so the
     trajectories must agree although the energies have different zeros.
 
     Args:
@@ -422,7 +422,7 @@ def _without_bath(system: System) -> System:
     dynamics = system.spec.dynamics
     if isinstance(dynamics, schema.NVETable):
         return system
-    shared = dynamics.model_dump(exclude={"kind", "friction"})
+    shared = dynamics.model_dump(include=schema.NVETable.model_fields.keys() - {"kind"})
     nve = schema.NVETable(kind="nve", **shared)
     return replace(system, spec=system.spec.model_copy(update={"dynamics": nve}))
 

@@ -119,16 +119,19 @@ class Start:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays for a checkpoint."""
-        parts = {name: value for name, value in self.state._asdict().items() if value is not None}
+        parts = self.state._asdict()
+        parts |= {f"extra_{k}": leaf for k, leaf in enumerate(jax.tree.leaves(parts.pop("extra")))}
         arrays = {f"state_{name}": np.asarray(value) for name, value in parts.items()}
         numbers = {"built": self.built, "epoch": self.epoch, "slots": self.slots}
         return arrays | {"reference": self.reference} | {k: np.asarray(v) for k, v in numbers.items()}
 
     @classmethod
-    def from_arrays(cls, arrays) -> Start:
+    def from_arrays(cls, arrays, simulation: Simulation) -> Start:
         """The inverse of `to_arrays`, bit for bit."""
-        held = {name: f"state_{name}" for name in EpochState._fields}
-        state = EpochState(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
+        places = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-1])
+        leaves, structure = jax.tree.flatten(first_state(simulation).state.extra)
+        extra = [jnp.asarray(arrays[f"state_extra_{k}"]) for k in range(len(leaves))]
+        state = EpochState(*places, jax.tree.unflatten(structure, extra))
         return cls(
             state,
             jnp.asarray(arrays["reference"].T, state.x.dtype),
@@ -145,10 +148,11 @@ def first_state(simulation: Simulation) -> Start:
     wrapped, images = wrap_positions(simulation.cell, positions)
     wrapped = wrapped.astype(dtype)
     x = np.ascontiguousarray(wrapped.T)
-    bath = np.zeros((3, simulation.atoms), np.int64) if simulation.has_bath else None
     v, taken_off = velocities.T.astype(dtype), images.T.astype(np.int32)
     # numpy's arrays: jnp would compile a program for each
-    state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0), bath)))
+    state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0))))
+    extra = simulation.propagator.init(state.x, state.v, jax.device_put(simulation.masses))
+    state = state._replace(extra=jax.device_put(jax.tree.map(np.asarray, extra)))
     return Start(state, state.x)
 
 

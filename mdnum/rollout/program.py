@@ -10,11 +10,10 @@ from functools import cached_property
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt64
+from jaxtyping import Float, Int, UInt64
 
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
-from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import check_radius
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 from mdnum.registry import nearest
@@ -367,34 +366,27 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def _fixed(simulation: Simulation) -> dict[str, Dial]:
-    factor = simulation.units.time_factor
-    integrator = simulation.integrator
+    integrator, units = simulation.integrator, simulation.units
+    # velocities that are drawn are drawn at the temperature: then it is more than one number
+    drawn = simulation.system.velocities is None
+    keys = [key for key in integrator.numbers() if not (drawn and key == "temperature")]
+    first, *others = [
+        Dial(f"dynamics.{key}", integrator.number(key, units), _integrator(key)) for key in keys
+    ]
     dials = [
-        Dial("dynamics.timestep", float(integrator.timestep) / factor, _integrator("timestep", factor)),
+        first,
         Dial("velocity.scale", 1.0, _scaled),
         Dial("neighbors.skin", simulation.rule.skin, _skin),
+        *others,
     ]
-    if isinstance(integrator, Langevin):
-        k_B = simulation.units.k_B
-        friction = float(integrator.friction) * factor
-        dials.append(Dial("dynamics.friction", friction, _integrator("friction", factor, inverse=True)))
-        # velocities that are drawn are drawn at the temperature: then it is more than one number
-        if simulation.system.velocities is not None:
-            dials.append(Dial("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)))
     if simulation.pairwise:
         dials += _constants(simulation) + _radii(simulation)
     return {one.key: one for one in dials}
 
 
-def _number(value: float) -> Float[Array, ""]:
-    # of a numpy number: a Python one would make another compiled program (a weak type)
-    return jnp.asarray(np.float64(value))
-
-
-def _integrator(name: str, factor: float, *, inverse: bool = False) -> Turn:
+def _integrator(key: str) -> Turn:
     def turn(simulation: Simulation, value: float) -> Simulation:
-        inner = value / factor if inverse else value * factor
-        changed = eqx.tree_at(lambda part: getattr(part, name), simulation.integrator, _number(inner))
+        changed = simulation.integrator.with_number(key, value, simulation.units)
         return replace(simulation, integrator=changed)
 
     return turn

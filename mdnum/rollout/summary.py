@@ -14,7 +14,6 @@ from mdnum.numerics import Ledger, unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
-from mdnum.systems import schema
 from mdnum.systems.build import Simulation
 
 
@@ -195,9 +194,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 def degrees_of_freedom(simulation: Simulation) -> int:
     """3 N, less the three of a center of mass that nothing moves."""
-    conserved = simulation.system.spec.dynamics.remove_drift and not isinstance(
-        simulation.system.spec.dynamics, schema.LangevinTable
-    )
+    conserved = simulation.system.spec.dynamics.remove_drift and simulation.integrator.keeps_momentum
     return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
 
 

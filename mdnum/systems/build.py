@@ -17,7 +17,7 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
-from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.integrators import INTEGRATORS, Integrator
 from mdnum.md.lattice import Lattice, LatticeDecider, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.manybody import ManyBody
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
@@ -119,7 +119,7 @@ class Simulation:
         """The dynamics as the state needs it: the integrator, or its twin in whole numbers.
 
         Raises:
-            InputError: a friction that a lattice cannot have.
+            InputError: an integrator, or a friction, that a lattice cannot have.
         """
         if self.lattice is None:
             return self.integrator
@@ -130,11 +130,6 @@ class Simulation:
     def smooth(self) -> Simulation:
         """The same system in floats: what is linearized, since a whole number has no derivative."""
         return self if self.lattice is None else replace(self, lattice=None)
-
-    @property
-    def has_bath(self) -> bool:
-        """Whether a state remembers what friction has forgotten."""
-        return self.lattice is not None and isinstance(self.integrator, Langevin)
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
         """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
@@ -340,12 +335,6 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     check_radius(cell, max(decider.r_cut), spec.skin)
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
-    timestep = jax.device_put(np.float64(spec.dynamics.timestep * units.time_factor))
-    integrator: Integrator = VelocityVerlet(timestep)
-    if isinstance(spec.dynamics, schema.LangevinTable):
-        friction = jax.device_put(np.float64(spec.dynamics.friction / units.time_factor))
-        kT = jax.device_put(np.float64(units.k_B * spec.dynamics.temperature))
-        integrator = Langevin(timestep, friction, kT, jax.random.key(spec.dynamics.seed))
     simulation = Simulation(
         system,
         cell,
@@ -360,7 +349,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         ("host" if jax.default_backend() == "cpu" else "device") if builder == "auto" else builder,
         policy,
         REDUCTIONS.parse(precision.reduction),
-        integrator,
+        INTEGRATORS[spec.dynamics.kind].of_file(spec.dynamics.model_dump(), units),
     )
     return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation
 

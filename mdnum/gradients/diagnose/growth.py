@@ -29,7 +29,7 @@ from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import passed, tape_of
 from mdnum.gradients.tape import RunTape, TapeStretch, over_rows, unsorted
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import KickDrift, check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
 from mdnum.systems.build import Simulation
@@ -307,10 +307,11 @@ class Jacobian:
     A state is positions and velocities times `clock`, an internal time, flat.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
     """
 
     def __init__(self, tape: RunTape, clock: float):
+        check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
             raise InputError(
                 "the Jacobian of a step is one of pair potentials", where=tape.simulation.system.name
@@ -366,7 +367,7 @@ def _orthonormal(block):
 @partial(jax.jit, static_argnames=("backward",))
 def _carried(
     force: PairForce,
-    integrator: Integrator,
+    integrator: KickDrift,
     masses: Float[Array, "atoms"],
     tables: Tables,
     rows,
