@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.special import betaincinv
@@ -387,8 +388,8 @@ def benign(
 def _check(twin: Twin) -> None:
     """Refuse programs that an ensemble of one cannot judge the other by."""
     twin.a.check(twin.b)
-    a, b = (one.simulation.integrator.noise for one in (twin.a, twin.b))
-    if not np.array_equal(a, b):
+    keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
+    if not np.array_equal(*(key if key is None else np.asarray(jax.random.key_data(key)) for key in keys)):
         raise InputError(
             "the runs have different noise, so they diverge at the first step whatever else they do",
             where="dynamics.seed",

@@ -26,12 +26,13 @@ from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
 from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md import kernel
 from mdnum.md.decide import Tables, halves_of, unpacked
-from mdnum.md.integrators import KickDrift, check_kick
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
+from mdnum.rollout.epoch import over_rows
 
 #: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
 #: all distances, the forces themselves (for the derivatives by the integrator's numbers).

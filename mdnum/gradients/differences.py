@@ -18,6 +18,7 @@ from itertools import pairwise
 from math import factorial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -302,7 +303,10 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
     v = random.standard_normal((len(masses), 3)) * np.sqrt(kT / masses)[:, None]
     # a velocity that all atoms share is no temperature
     v -= masses @ v / masses.sum()
-    made = replace(simulation, velocities=v, integrator=simulation.integrator.with_noise(seed))
+    made = replace(simulation, velocities=v)
+    if (key := made.integrator.random) is not None:
+        key = jax.random.fold_in(key, seed)
+        made = replace(made, integrator=eqx.tree_at(lambda one: one.random, made.integrator, key))
     return settled(made, settle) if settle else made
 
 

@@ -335,8 +335,8 @@ def names(simulation: Simulation) -> tuple[str, ...]:
     # without one there is nothing that a temperature would scale
     if simulation.system.spec.dynamics.temperature:
         found += ["dynamics.temperature"]
-    others = simulation.integrator.numbers().keys() - {"timestep", "temperature"}
-    found += [f"dynamics.{key}" for key in sorted(others)]
+    others = [key for key in simulation.integrator.numbers() if key not in ("timestep", "temperature")]
+    found += [f"dynamics.{key}" for key in others]
     return (*found, "initial.positions", "initial.velocities", "box.scale")
 
 

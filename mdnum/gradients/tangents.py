@@ -28,10 +28,11 @@ from mdnum.gradients.parameters import (
     quantities,
     with_quantities,
 )
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import KickDrift, check_kick
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import Forces, ManyBodyForce, PairForce
+from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):

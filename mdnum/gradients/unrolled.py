@@ -29,9 +29,9 @@ from mdnum.gradients import parameters
 from mdnum.gradients.losses import LossContext, LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings, unsorted
+from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import by_atom, one_step
+from mdnum.md.integrators import by_atom, one_step, unsorted
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.flips import fingerprint_of_bits
@@ -136,8 +136,7 @@ def chunk(
     origin = LossFrame(jnp.zeros((), jnp.int64), whole, inputs.v, nan, nan)
 
     def used_up(x, step):
-        d = lax.stop_gradient(cell).minimum_image(*(lax.stop_gradient(x) - home))
-        largest = jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
+        largest = lax.stop_gradient(cell).farthest(lax.stop_gradient(x) - home)
         age = step - place.built
         allowed = (age >= delay) & (age % every == 0)
         return allowed & (largest > fixed.half_skin) if check else allowed

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Real
 
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.errors import InputError
@@ -26,11 +26,16 @@ from mdnum.md.cell import Cell
 from mdnum.registry import Registry
 from mdnum.units import Units
 
-Vectors = Float[Array, "3 atoms"]
+Vector = Float[Array, "3 atoms"]
 Masses = Float[Array, "atoms"]
 Number = Float[Array, ""]
 Step = Int[Array, ""]
 Order = Int[Array, "atoms"]
+
+
+def unsorted(a: Real[Array, "*rest atoms"], order: Order) -> Real[Array, "*rest atoms"]:
+    """An array over the atoms of a list, in the user's order."""
+    return jnp.zeros_like(a).at[..., order].set(a)
 
 
 class ByAtom(NamedTuple):
@@ -84,7 +89,7 @@ class Integrator(eqx.Module):
     #: Whether the center of mass moves on undisturbed.
     keeps_momentum: ClassVar[bool] = True
     #: Steps after which the loop hands its state to the host, where the extra state needs that.
-    period: ClassVar[Any] = None
+    pause: ClassVar[Any] = None
     timestep: Float[Array, ""] = quantity("time")
 
     @classmethod
@@ -94,35 +99,27 @@ class Integrator(eqx.Module):
         return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
     @classmethod
-    def numbers(cls) -> dict[str, Field[Any]]:
-        """Those that are numbers which may be differentiated by."""
-        return {
-            key: one for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")
-        }
+    def numbers(cls) -> list[str]:
+        """The keys of its numbers, which it may be differentiated by."""
+        return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]
 
     @classmethod
     def of_file(cls, table: Mapping[str, Any], units: Units) -> Integrator:
         """The integrator that a table of a system file describes."""
-        made, numbers = {}, cls.numbers()
+        made = {}
         for key, field in cls.keys().items():
-            if key in numbers and key in table:
-                made[field.name] = jax.device_put(np.float64(converted(field, table[key], units)))
-            elif key in table:
-                made[field.name] = jax.random.key(table[key]) if key == "seed" else table[key]
+            if (value := table.get(key)) is None:
+                continue
+            if key in cls.numbers():
+                value = jax.device_put(np.float64(converted(field, value, units)))
+            made[field.name] = jax.random.key(value) if key == "seed" else value
         return cls(**made)
 
     @property
-    def noise(self) -> np.ndarray:
-        """What tells its random numbers from others; empty without any."""
+    def random(self) -> Array | None:
+        """Its random key; None without noise."""
         field = self.keys().get("seed")
-        return np.empty(0) if field is None else np.asarray(jax.random.key_data(getattr(self, field.name)))
-
-    def with_noise(self, seed: int) -> Integrator:
-        """The integrator with the random numbers of a repetition; itself where it has none."""
-        if (field := self.keys().get("seed")) is None:
-            return self
-        key = jax.random.fold_in(getattr(self, field.name), seed)
-        return eqx.tree_at(lambda one: getattr(one, field.name), self, key)
+        return None if field is None else getattr(self, field.name)
 
     def number(self, key: str, units: Units) -> float:
         """What a system file says by a key."""
@@ -136,7 +133,7 @@ class Integrator(eqx.Module):
         inner = jnp.asarray(np.float64(converted(field, value, units)))
         return eqx.tree_at(lambda one: getattr(one, field.name), self, inner)
 
-    def init(self, x: Vectors, v: Vectors, masses: Masses) -> Any:
+    def init(self, x: Vector, v: Vector, masses: Masses) -> Any:
         """The extra state at the start: any pytree of arrays of numbers, those of atoms as `ByAtom`.
 
         Args:
@@ -146,8 +143,8 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def finish(
-        self, v: Vectors, extra: Any, acceleration: Vectors, masses: Masses, time: Number
-    ) -> tuple[Vectors, Any]:
+        self, v: Vector, extra: Any, acceleration: Vector, masses: Masses, time: Number
+    ) -> tuple[Vector, Any]:
         """Full-step velocities and the extra state then.
 
         Args:
@@ -159,14 +156,14 @@ class Integrator(eqx.Module):
     @abstractmethod
     def begin(
         self,
-        x: Vectors,
-        v: Vectors,
+        x: Vector,
+        v: Vector,
         extra: Any,
-        acceleration: Vectors,
+        acceleration: Vector,
         masses: Masses,
         step: Step,
         order: Order,
-    ) -> tuple[Vectors, Vectors, Any, Number]:
+    ) -> tuple[Vector, Vector, Any, Number]:
         """Positions, velocities and extra state before the next force evaluation, and the heat taken up.
 
         Args:
@@ -175,7 +172,7 @@ class Integrator(eqx.Module):
             order: sorted atom k is atom order[k]; noise belongs to the atom, not to its place.
         """
 
-    def kinetic(self, v: Vectors, masses: Masses) -> Number:
+    def kinetic(self, v: Vector, masses: Masses) -> Number:
         """Kinetic energy."""
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
         return 0.5 * jnp.sum(masses * speed2)
@@ -189,13 +186,13 @@ class StepEnd(NamedTuple):
     """What a step has made, in the order that it was given."""
 
     # v, extra: full-step velocities and the extra state with them
-    v: Vectors
+    v: Vector
     extra: Any
     # x, kicked, ahead: wrapped positions of the next step, velocities and extra state that lead there
-    x: Vectors
-    kicked: Vectors
+    x: Vector
+    kicked: Vector
     ahead: Any
-    images: Vectors  # lattice vectors that wrapping has just taken off
+    images: Vector  # lattice vectors that wrapping has just taken off
     heat: Number  # energy taken up on the way
 
 
@@ -205,10 +202,10 @@ def one_step(
     masses: Masses,
     order: Order,
     step: Step,
-    x: Vectors,
-    v: Vectors,
+    x: Vector,
+    v: Vector,
     extra: Any,
-    force: Vectors,
+    force: Vector,
 ) -> StepEnd:
     """One step of molecular dynamics, from its forces to the positions of the next.
 
@@ -240,7 +237,7 @@ class KickDrift(Integrator):
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(f"{cls.__name__} has its own {other[0]}: make it an Integrator, not a KickDrift")
 
-    def kick(self, v: Vectors, time: Number, acceleration: Vectors) -> Vectors:
+    def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
         """Velocities after an acceleration has acted for a time."""
         return v + time * acceleration
 
@@ -254,8 +251,8 @@ class KickDrift(Integrator):
 
     @abstractmethod
     def drift(
-        self, x: Vectors, v: Vectors, masses: Masses, step: Step, order: Order
-    ) -> tuple[Vectors, Vectors, Number]:
+        self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
+    ) -> tuple[Vector, Vector, Number]:
         """As `begin`, after the kick; linear in x and v."""
 
 

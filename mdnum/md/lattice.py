@@ -296,7 +296,7 @@ class LatticeLangevin(LatticeStep):
     kept: Int[Array, ""] = eqx.field(kw_only=True)
     # size of the noise of an atom of unit mass, in units of momentum
     spread: Float[Array, ""] = eqx.field(kw_only=True)
-    period: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
+    pause: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
         """The momentum that noise adds after a step, from the counter alone: whole units."""
@@ -307,12 +307,12 @@ class LatticeLangevin(LatticeStep):
         return jnp.round(normal_quantile(u, self.zero) * (self.spread * jnp.sqrt(masses)))
 
     def init(self, x, v, masses):
-        return ByAtom(np.zeros(x.shape, np.int64))
+        return ByAtom(jnp.zeros(x.shape, jnp.int64))
 
     def drift(self, x, v, extra, masses, step, order):
         p = self.momentum(v, masses)
         x = self.glide(x, p, masses, 0.5, 1)
-        bath = jnp.where(step % self.period == 0, 0, extra.value)
+        bath = jnp.where(step % self.pause == 0, 0, extra.value)
         whole = p.astype(jnp.int64)
         filled = (bath << _SHIFT) | (whole & ((1 << _SHIFT) - 1))
         bath = filled // self.kept
@@ -369,7 +369,7 @@ def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | Latt
             key=integrator.key,
             kept=jnp.asarray(kept, jnp.int64),
             spread=jnp.asarray(spread, jnp.float64),
-            period=jnp.asarray(period, jnp.int64),
+            pause=jnp.asarray(period, jnp.int64),
             **common,
         )
     return LatticeVerlet(integrator.timestep, **common)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import ByAtom
+from mdnum.md.integrators import ByAtom, unsorted
 from mdnum.md.lattice import LatticeStep
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
@@ -82,10 +82,6 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
     here = Back(back.step, *jax.tree.map(lambda a: a[:, order], back[1:]))
     home = here.x
 
-    def moved(x):
-        d = program.cell.minimum_image(*(x - home))
-        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
-
     def body(carry):
         here, row, _, record = carry
         made = program.force(here.x, tables, decisions=True)  # type: ignore[operator]
@@ -107,20 +103,20 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
         earlier = _before(program, masses, order, here._replace(v=v))
         start = here._replace(step=here.step - 1, v=v)
         earlier = jax.tree.map(lambda a, b: jnp.where(here.step == 0, a, b), start, earlier)
-        return earlier, row + 1, moved(earlier.x) > program.half_skin, record
+        return earlier, row + 1, program.cell.farthest(earlier.x - home) > program.half_skin, record
 
     def go_on(carry):
         here, row, due, _ = carry
         more = (here.step >= 0) & (row < room) & ~due
-        if scheme.period is None:
+        if scheme.pause is None:
             return more
-        return more & ((row == 0) | (here.step % scheme.period != 0))
+        return more & ((row == 0) | (here.step % scheme.pause != 0))
 
     start = (here, jnp.zeros((), jnp.int64), jnp.zeros((), bool), record)
     here, rows, _, record = lax.while_loop(go_on, body, start)
 
-    unsorted = jax.tree.map(lambda a: jnp.zeros_like(a).at[:, order].set(a), here[1:])
-    return Back(here.step, *unsorted), rows, here.x, record
+    parts = jax.tree.map(lambda a: unsorted(a, order), here[1:])
+    return Back(here.step, *parts), rows, here.x, record
 
 
 class BackwardRun:
@@ -180,7 +176,7 @@ class BackwardRun:
 
     def _change_bath(self) -> None:
         """Where the run had put a bath aside, it is taken up again."""
-        step, period = int(self.back.step), self.simulation.propagator.period
+        step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
         self._check_bath()

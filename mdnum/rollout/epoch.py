@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Changes, Tables, zeros
-from mdnum.md.integrators import Integrator, by_atom, one_step
+from mdnum.md.integrators import Integrator, by_atom, one_step, unsorted
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
 
@@ -190,6 +190,31 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     )
 
 
+def over_rows(
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
+) -> tuple[Any, Any]:
+    """As `jax.lax.scan`, but over the first `used` rows alone, last one first where it goes `backward`.
+
+    Every stretch has the room of the longest, so that one program serves all; a loop over that room would
+    spend most of its time on rows that hold nothing. Outputs of unused rows are zero.
+    """
+    first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
+    _, out = jax.eval_shape(step, carry, first)
+    room = jax.tree.leaves(rows)[0].shape[0]
+    outputs = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), out)
+
+    def body(k, both):
+        carry, outputs = both
+        at = used - 1 - k if backward else k
+        row = jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, at, keepdims=False), rows)
+        carry, new = step(carry, row)
+        return carry, jax.tree.map(
+            lambda all, one: lax.dynamic_update_index_in_dim(all, one, at, 0), outputs, new
+        )
+
+    return lax.fori_loop(0, used, body, (carry, outputs))
+
+
 # the record is donated: two of them take turns, and no epoch pays for clearing one
 # flattening a program's many leaves anew costs a small system more than its step: it is done once
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
@@ -242,10 +267,6 @@ def run_epoch(
         )
         inside = inside_of(before)
 
-    def longest(start, end):
-        d = cell.minimum_image(*(end - start))
-        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
-
     def body(carry):
         step, x, v, images, _, heat, extra, row, _, _, _, largest, record, earlier = carry
         given = {} if told is None else {"given": told[row]}
@@ -277,7 +298,7 @@ def run_epoch(
         runaway = jnp.max(jnp.abs(end.images)) > 1
         images = images + end.images.astype(jnp.int32)
         step = step + 1
-        largest = longest(home, end.x)
+        largest = cell.farthest(end.x - home)
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
@@ -290,34 +311,20 @@ def run_epoch(
         more = (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
         if record.changes is not None:
             more &= record.changes.count[0] + program.most <= len(record.changes.pairs)
-        if integrator.period is None:
+        if integrator.pause is None:
             return more
-        return more & ((row == 0) | (step % integrator.period != 0))
+        return more & ((row == 0) | (step % integrator.pause != 0))
 
-    carry = (
-        state.step,
-        x,
-        v,
-        images,
-        state.x_before[:, order],
-        state.heat,
-        by_atom(lambda a: a[..., order], state.extra),
-        jnp.zeros((), jnp.int64),
-        jnp.zeros((), bool),
-        jnp.ones((), bool),
-        jnp.zeros((), bool),
-        longest(home, x),
-        record if record.changes is None else record._replace(changes=record.changes.emptied()),
-        None if program.rows else before,
-    )
+    extra, no, yes = by_atom(lambda a: a[..., order], state.extra), jnp.zeros((), bool), jnp.ones((), bool)
+    begun = state.step, x, v, images, state.x_before[:, order], state.heat, extra
+    empty = record if record.changes is None else record._replace(changes=record.changes.emptied())
+    row, largest = jnp.zeros((), jnp.int64), cell.farthest(x - home)
+    carry = (*begun, row, no, yes, no, largest, empty, None if program.rows else before)
     done = lax.while_loop(go_on, body, carry)
     step, x, v, images, x_before, heat, extra, rows, due, finite, runaway, largest, record, earlier = done
 
-    def unsorted(a):
-        return jnp.zeros_like(a).at[..., order].set(a)
-
-    places = map(unsorted, (x, v, images, x_before))
-    end = EpochState(step, *places, heat, by_atom(unsorted, extra))
+    x, v, images, x_before = (unsorted(part, order) for part in (x, v, images, x_before))
+    end = EpochState(step, x, v, images, x_before, heat, by_atom(lambda a: unsorted(a, order), extra))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    leap = longest(state.x_before, state.x)
+    leap = cell.farthest(state.x - state.x_before)
     return EpochOutcome(end, flags, largest, before, inside, leap, earlier), record

@@ -150,7 +150,7 @@ def _kinds(*tables: type[TomlTable]) -> list[str]:
 
 def _other_than(*tables: type[TomlTable]) -> Any:
     """A kind that an editor does not take for that of one of these tables."""
-    return Field(json_schema_extra={"not": {"enum": _kinds(*tables)}})
+    return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
 
 
 class OtherRow(TomlTable):

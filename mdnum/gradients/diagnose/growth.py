@@ -27,11 +27,12 @@ from mdnum.gradients.adjoint import AdjointCarry, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import passed, tape_of
-from mdnum.gradients.tape import RunTape, TapeStretch, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import KickDrift, check_kick
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
+from mdnum.rollout.epoch import over_rows
 from mdnum.systems.build import Simulation
 
 #: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.
