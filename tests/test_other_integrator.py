@@ -79,6 +79,16 @@ def test_what_it_conserves_is_bounded_and_of_second_order():
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)
 
 
+def test_the_thermostat_of_the_documents_is_the_same():
+    text = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
+    (source,) = (part.partition("```")[0] for part in text.split("```python") if "class Thermostat" in part)
+    known: dict[str, Any] = {}
+    exec(source, known)
+    ours, theirs = (columns(held(kind), 100) for kind in (NoseHoover, known["Thermostat"]))
+    for name in ours:
+        assert np.abs(ours[name] - theirs[name]).max() < 1e-9, name
+
+
 def test_a_state_of_each_atom_is_sorted_with_the_atoms():
     """Against a loop in numpy, over several lists, each in another order."""
     simulation, steps = held(PerAtom, neighbors={"skin": 0.1}), 60
@@ -111,9 +121,13 @@ def test_a_state_of_each_atom_is_sorted_with_the_atoms():
 
 def test_from_a_file_it_is_that_from_objects(site):
     """In units whose time is not that inside mdnum: the bits of both are the same."""
-    start = {"dynamics.temperature": 40.0, "structure.velocities": "drawn"}
-    made = build("argon/crystal-108", {**CHAIN, **start, "dynamics.relaxation": 0.2})
-    plain, units = build("argon/crystal-108", start), made.units
+    atoms, argon = crystal(lattice_constant=5.4), {"kind": "lennard-jones", "sigma": 3.4, "epsilon": 0.0104}
+    dynamics = {"timestep": 0.002, "temperature": 40.0, "seed": 3}
+    made, plain = (
+        build(make(atoms, argon, {"kind": "hard", "radius": 7.0}, "metal", dynamics={**dynamics, **kind}))
+        for kind in ({"kind": "nose-hoover", "relaxation": 0.2}, {"kind": "nve"})
+    )
+    units = made.units
     own = NoseHoover(
         plain.integrator.timestep,
         jnp.float64(units.k_B * 40.0),
