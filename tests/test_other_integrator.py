@@ -136,6 +136,7 @@ def test_from_a_file_it_is_that_from_objects(site):
     ours, theirs = (columns(one, 100) for one in (replace(plain, integrator=own), made))
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
     assert parameters.names(made).count("dynamics.relaxation") == 1
+    assert parameters.unit(made, "dynamics.relaxation") == "ps"
     assert float(parameters.value(made, "dynamics.relaxation")) == pytest.approx(0.2, rel=1e-14)
     other = parameters.with_values(made, {"dynamics.temperature": 80.0})
     kT = [one.integrator.number("temperature", units) for one in (made, other)]

@@ -36,11 +36,11 @@ _INTEGERS = {
     "dynamics.steps": "it is a whole number",
     "neighbors.skin": "it changes which list is used, and no force",
 }
-#: Units by the last word of a name.
+#: Units by the last word of a name, or by what a field of an integrator is.
 _UNITS = {
     "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}",
-    "radius": "{length}", "onset": "{length}", "timestep": "{time}", "temperature": "{temperature}",
-    "friction": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})",
+    "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",
+    "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
 }  # fmt: skip
 
 
@@ -397,7 +397,9 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 def unit(simulation: Simulation, name: str) -> str:
     """The unit of a parameter: "" for none, its own name in brackets where none is known."""
     short = name.rpartition(".")[2]
-    return _UNITS.get(short, f"[{short}]").format_map(vars(simulation.units))
+    field = simulation.integrator.keys().get(name.removeprefix("dynamics."))
+    word = short if field is None else field.metadata.get("unit")
+    return _UNITS.get(word, f"[{short}]").format_map(vars(simulation.units))
 
 
 @dataclass(frozen=True)

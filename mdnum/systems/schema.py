@@ -174,9 +174,7 @@ class OtherTable(PairPotentialTable):
     @property
     def constants(self) -> tuple[str, ...]:
         """Names of the constants of one pair."""
-        from mdnum.md.potentials import POTENTIALS
-
-        return tuple(field.name for field in fields(POTENTIALS[self.kind]))
+        return tuple(field.name for field in fields(loaded(_POTENTIALS)[self.kind]))
 
     @model_validator(mode="after")
     def _known(self) -> Any:
@@ -204,7 +202,8 @@ def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registr
     return Annotated[Union[*options, Annotated[other, Tag("other")]], Discriminator(kind_of)]
 
 
-Potential = _or_other((*_PAIRS, *_MANY_BODY), OtherTable, "mdnum.md.potentials:POTENTIALS")
+_POTENTIALS = "mdnum.md.potentials:POTENTIALS"
+Potential = _or_other((*_PAIRS, *_MANY_BODY), OtherTable, _POTENTIALS)
 
 
 # --- cutoff -------------------------------------------------------------------------------------------
