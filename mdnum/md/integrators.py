@@ -33,7 +33,7 @@ Step = Int[Array, ""]
 Order = Int[Array, "atoms"]
 
 
-def unsorted(a: Real[Array, "*rest atoms"], order: Order) -> Real[Array, "*rest atoms"]:
+def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
     """An array over the atoms of a list, in the user's order."""
     return jnp.zeros_like(a).at[..., order].set(a)
 
