@@ -389,7 +389,8 @@ def _check(twin: Twin) -> None:
     """Refuse programs that an ensemble of one cannot judge the other by."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
-    if not np.array_equal(*(key if key is None else np.asarray(jax.random.key_data(key)) for key in keys)):
+    a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
+    if not np.array_equal(a, b):
         raise InputError(
             "the runs have different noise, so they diverge at the first step whatever else they do",
             where="dynamics.seed",
