@@ -32,7 +32,6 @@ from mdnum.forks.ensemble import (
     starts,
     steps_to_diverge,
 )
-from mdnum.md.integrators import Langevin
 from mdnum.program import Twin
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.simulation import Simulation
@@ -389,13 +388,9 @@ def benign(
 def _check(twin: Twin) -> None:
     """Refuse programs that an ensemble of one cannot judge the other by."""
     twin.a.check(twin.b)
-    keys = [
-        np.asarray(jax.random.key_data(one.simulation.integrator.key))
-        if isinstance(one.simulation.integrator, Langevin)
-        else np.empty(0)
-        for one in (twin.a, twin.b)
-    ]
-    if not np.array_equal(keys[0], keys[1]):
+    keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
+    a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
+    if not np.array_equal(a, b):
         raise InputError(
             "the runs have different noise, so they diverge at the first step whatever else they do",
             where="dynamics.seed",

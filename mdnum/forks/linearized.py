@@ -26,9 +26,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md.integrators import check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics.verdicts import Growth
 from mdnum.rollout.engine import FAILURES, Engine, Segment
+from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
 #: Share of a run in which the tangent turns to the direction that grows fastest.
@@ -88,9 +90,10 @@ def tangents(
         reach: whether to ask for the amplitudes at which decisions flip.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
     """
     force = simulation.smooth.force
+    check_kick(simulation.integrator)
     if not isinstance(force, PairForce):
         raise InputError(
             "decisions cannot be imposed on a many-body potential",
@@ -204,15 +207,7 @@ def _carry(
         _, after = jax.jvp(advance, (x, v), (dx, dv))
         return after, (length, furthest, *near)
 
-    def body(n, held):
-        carry, rows = held
-        carry, row = step(carry, (first + n, *(part[n] for part in recorded)))
-        return carry, jax.tree.map(lambda whole, one: whole.at[n].set(one), rows, row)
-
-    # a record has one length for every stretch, so that they share a program; not all of its rows are steps
-    one = jax.eval_shape(step, tangent, (first, *(part[0] for part in recorded)))[1]
-    rows = jax.tree.map(lambda leaf: jnp.zeros((len(recorded[0]), *leaf.shape), leaf.dtype), one)
-    return lax.fori_loop(0, count, body, (tangent, rows))
+    return over_rows(step, tangent, (first + jnp.arange(len(recorded[0])), *recorded), count)
 
 
 # --- Lyapunov exponents -------------------------------------------------------------------------------

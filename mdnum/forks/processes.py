@@ -297,6 +297,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
     import jax.numpy as jnp
     from jax import lax
 
+    from mdnum.md.integrators import by_atom
     from mdnum.md.pairforce import MdState, PairDynamics
     from mdnum.rollout.engine import first_state
 
@@ -308,7 +309,9 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
         jnp.asarray(simulation.masses[table.order]),
         simulation.tables(table),
     )
-    state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
+    x, v = start.state.x[:, table.order], start.state.v[:, table.order]
+    extra = by_atom(lambda a: a[..., table.order], start.state.extra)
+    state = MdState(jnp.zeros((), jnp.int64), x, v, extra)
     leaves, structure = jax.tree.flatten(dynamics)
 
     # the dynamics comes in as an argument: its fence is a number that the compiler must not know
@@ -319,7 +322,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
             state = dynamics.step(state, dynamics.decide(state))
             return state, state.x
 
-        return lax.scan(body, MdState(state.step, x, v), None, length=count)[1]
+        return lax.scan(body, state._replace(x=x, v=v), None, length=count)[1]
 
     def loss(x, v, leaves):
         path = trajectory(leaves, x, v, steps)

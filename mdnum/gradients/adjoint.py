@@ -26,12 +26,13 @@ from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
 from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md import kernel
 from mdnum.md.decide import Tables, halves_of, unpacked
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
+from mdnum.rollout.epoch import over_rows
 
 #: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
 #: all distances, the forces themselves (for the derivatives by the integrator's numbers).
@@ -240,7 +241,7 @@ def reverse(
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential with its flips.
+        InputError: a many-body potential with its flips, or an integrator that is no linear `KickDrift`.
 
     Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
     """
@@ -268,6 +269,7 @@ class StretchReversal:
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
         force = simulation.force
+        check_kick(simulation.integrator)
         if guard is not None and not isinstance(force, PairForce):
             raise InputError(
                 "what flips add is known for pair potentials only",
@@ -316,7 +318,7 @@ class StretchReversal:
 @partial(jax.jit, static_argnames=("wanted",))
 def transposed(
     force: PairForce | ManyBodyForce,
-    integrator: Integrator,
+    integrator: KickDrift,
     masses: Float[Array, "atoms"],
     tables,
     rows,
@@ -362,9 +364,7 @@ def transposed(
         return back(onto_total)
 
     def blind(row):
-        one = jnp.ones((), jnp.float64)
-        seen = (row[1], row[2], row[4], row[5], (origin.x, origin.v), one, one)
-        return jax.tree.map(jnp.zeros_like, seen)
+        return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(look, row))
 
     def step(carry: AdjointCarry, given):
         row, told, see, span = given
@@ -386,9 +386,8 @@ def transposed(
             model = jax.tree.map(jnp.add, model, made.model)
         if FORCE in wanted:
             acceleration = made.force / mass_row
-            _, back = jax.vjp(
-                lambda numbers, scale: drift(x, v + half * acceleration, numbers, scale, number), numbers, one
-            )
+            kicked = integrator.kick(v, half, acceleration)
+            _, back = jax.vjp(lambda numbers, scale: drift(x, kicked, numbers, scale, number), numbers, one)
             by_numbers, by_scale = back((carry.x, carry.v))
             kick = jnp.sum(onto_kicked * acceleration) + jnp.where(
                 number == 0, 0, jnp.sum(onto_v * acceleration)

@@ -29,7 +29,6 @@ from mdnum.gradients import parameters
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, scalars_only
 from mdnum.gradients.recorded import EventAware
 from mdnum.gradients.tape import RunTape, TapeStretch
-from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.roles import LATTICE
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
@@ -305,10 +304,9 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
     # a velocity that all atoms share is no temperature
     v -= masses @ v / masses.sum()
     made = replace(simulation, velocities=v)
-    bath = simulation.integrator
-    if isinstance(bath, Langevin):
-        key = jax.random.fold_in(bath.key, seed)
-        made = replace(made, integrator=eqx.tree_at(lambda one: one.key, bath, key))
+    if (key := made.integrator.random) is not None:
+        key = jax.random.fold_in(key, seed)
+        made = replace(made, integrator=eqx.tree_at(lambda one: one.random, made.integrator, key))
     return settled(made, settle) if settle else made
 
 

@@ -6,7 +6,6 @@ the derivatives by all that a rollout is made of, and what of a rollout moves wi
 
 from __future__ import annotations
 
-import operator
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -20,7 +19,7 @@ from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
-from mdnum.md.integrators import Integrator, Langevin
+from mdnum.md.integrators import Integrator, converted
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.registry import nearest
 from mdnum.systems.simulation import Simulation
@@ -37,11 +36,11 @@ _INTEGERS = {
     "dynamics.steps": "it is a whole number",
     "neighbors.skin": "it changes which list is used, and no force",
 }
-#: Units by the last word of a name.
+#: Units by the last word of a name, or by what a field of an integrator is.
 _UNITS = {
     "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}",
-    "radius": "{length}", "onset": "{length}", "timestep": "{time}", "temperature": "{temperature}",
-    "friction": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})",
+    "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",
+    "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
 }  # fmt: skip
 
 
@@ -221,35 +220,28 @@ class _Constant(Parameter):
 
 
 class _Number(Parameter):
-    """A time of the integrator; `inside` and `outside` turn its unit of time into that of files and back."""
-
-    inside: Any = staticmethod(operator.mul)
-    outside: Any = staticmethod(operator.truediv)
+    """A number of the integrator."""
 
     def value(self):
-        number = float(getattr(self.simulation.integrator, self.key))
-        return np.asarray(self.outside(number, self.simulation.units.time_factor))
+        return np.asarray(self.simulation.integrator.number(self.key, self.simulation.units))
 
     def changed(self, new):
-        return _integrated(self.simulation, self.key, self.inside(new, self.simulation.units.time_factor))
+        simulation = self.simulation
+        return replace(
+            simulation, integrator=simulation.integrator.with_number(self.key, new, simulation.units)
+        )
 
     def gradient(self, parts):
-        number = float(getattr(parts.integrator, self.key))
-        return np.asarray(self.inside(number, self.simulation.units.time_factor))
+        field = parts.integrator.keys()[self.key]
+        return np.asarray(
+            converted(field, float(getattr(parts.integrator, field.name)), self.simulation.units)
+        )
 
     def moved(self, still, index):
-        by = self.inside(1.0, self.simulation.units.time_factor)
-        return still._replace(integrator=_moved(still.integrator, self.key, by))
+        return still._replace(integrator=still.integrator.with_number(self.key, 1.0, self.simulation.units))
 
 
-class _Rate(_Number):
-    """One over a time."""
-
-    inside: Any = staticmethod(operator.truediv)
-    outside: Any = staticmethod(operator.mul)
-
-
-class _Temperature(Parameter):
+class _Temperature(_Number):
     """It scales the velocities of step 0 with its root, and is that of a thermostat."""
 
     def value(self):
@@ -263,21 +255,20 @@ class _Temperature(Parameter):
             )
         v = simulation.velocities * np.sqrt(float(new) / float(old))
         simulation = replace(simulation, draw=replace(simulation.draw, temperature=float(new)), velocities=v)
-        if isinstance(simulation.integrator, Langevin):
-            simulation = _integrated(simulation, "kT", simulation.units.k_B * new)
-        return simulation
+        return _Number.changed(replace(self, simulation=simulation), new) if self._of_bath else simulation
+
+    @property
+    def _of_bath(self) -> bool:
+        return self.key in self.simulation.integrator.numbers()
 
     def gradient(self, parts):
         by_start = float(np.sum(parts.v * self.simulation.velocities.T)) / (2 * float(self.value()))
-        bath, k_B = parts.integrator, self.simulation.units.k_B
-        return np.asarray(by_start + (float(bath.kT) * k_B if isinstance(bath, Langevin) else 0.0))
+        return np.asarray(by_start + (super().gradient(parts) if self._of_bath else 0.0))
 
     def moved(self, still, index):
         v = self.simulation.velocities.T / (2 * float(self.value()))
         moved = still._replace(v=jnp.asarray(v, still.v.dtype))
-        if isinstance(self.simulation.integrator, Langevin):
-            moved = moved._replace(integrator=_moved(still.integrator, "kT", self.simulation.units.k_B))
-        return moved
+        return super().moved(moved, index) if self._of_bath else moved
 
 
 class _Start(Parameter):
@@ -317,15 +308,16 @@ class _Scale(Parameter):
 
 
 _KINDS: dict[str, type[Parameter]] = {
-    "cutoff.radius": _Radius, "cutoff.onset": _Onset, "dynamics.timestep": _Number,
-    "dynamics.friction": _Rate, "dynamics.temperature": _Temperature, "initial.positions": _Start,
-    "initial.velocities": _Start, "box.scale": _Scale,
+    "cutoff.radius": _Radius, "cutoff.onset": _Onset, "dynamics.temperature": _Temperature,
+    "initial.positions": _Start, "initial.velocities": _Start, "box.scale": _Scale,
 }  # fmt: skip
 
 
 def parameter(simulation: Simulation, name: str) -> Parameter:
     """The parameter of a full name."""
-    return _KINDS.get(name, _PairQuantity if simulation.pairwise else _Constant)(simulation, name)
+    of_potential = _PairQuantity if simulation.pairwise else _Constant
+    kind = _KINDS.get(name, _Number if name.startswith("dynamics.") else of_potential)
+    return kind(simulation, name)
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
@@ -341,8 +333,8 @@ def names(simulation: Simulation) -> tuple[str, ...]:
     # without one there is nothing that a temperature would scale
     if simulation.draw.temperature:
         found += ["dynamics.temperature"]
-    if isinstance(simulation.integrator, Langevin):
-        found += ["dynamics.friction"]
+    others = [key for key in simulation.integrator.numbers() if key not in ("timestep", "temperature")]
+    found += [f"dynamics.{key}" for key in others]
     return (*found, "initial.positions", "initial.velocities", "box.scale")
 
 
@@ -403,7 +395,9 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 def unit(simulation: Simulation, name: str) -> str:
     """The unit of a parameter: "" for none, its own name in brackets where none is known."""
     short = name.rpartition(".")[2]
-    return _UNITS.get(short, f"[{short}]").format_map(vars(simulation.units))
+    field = simulation.integrator.keys().get(name.removeprefix("dynamics."))
+    word = short if field is None else field.metadata.get("unit")
+    return _UNITS.get(word, f"[{short}]").format_map(vars(simulation.units))
 
 
 @dataclass(frozen=True)
@@ -454,14 +448,3 @@ def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Dir
 def _plain(leaf) -> Float[np.ndarray, "..."]:
     array = np.array(leaf, np.float64)
     return array.reshape(()) if array.shape == (1,) else array
-
-
-def _integrated(simulation: Simulation, name: str, new) -> Simulation:
-    number = jnp.asarray(new, jnp.float64)
-    changed = eqx.tree_at(lambda one: getattr(one, name), simulation.integrator, number)
-    return replace(simulation, integrator=changed)
-
-
-def _moved(integrator: Any, name: str, by: float) -> Any:
-    number = jnp.asarray(by, getattr(integrator, name).dtype)
-    return eqx.tree_at(lambda one: getattr(one, name), integrator, number)

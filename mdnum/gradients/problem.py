@@ -18,6 +18,7 @@ from mdnum.errors import InputError, NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
+from mdnum.md.integrators import without_kick
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
 from mdnum.systems.simulation import Simulation
@@ -50,6 +51,8 @@ class Problem:
     def __post_init__(self):
         if self.steps < 1:
             raise InputError(f"steps = {self.steps}; expected at least 1")
+        # a state that the integrator has no steps for is refused before anything is run
+        assert self.simulation.propagator is not None
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
                 f"the loss {self.loss.name} looks at no step up to {self.steps}",
@@ -222,7 +225,7 @@ def pairs_only(simulation: Simulation) -> str | None:
     """Why the reverse pass of pairs does not apply; None where it does."""
     if not isinstance(simulation.force, PairForce):
         return "it is for pair potentials"
-    return rounded(simulation)
+    return without_kick(simulation.integrator) or rounded(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:

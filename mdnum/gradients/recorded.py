@@ -26,10 +26,10 @@ from mdnum.gradients.problem import (
     in_phase,
     independent,
     pairs_only,
-    rounded,
 )
 from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
+from mdnum.md.integrators import without_kick
 from mdnum.md.lattice import forgotten_bits
 from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.simulation import Simulation
@@ -118,7 +118,8 @@ class Symmetric(Method):
     description = "the derivative of the steps that ran, their decisions held fixed"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        return rounded(problem.simulation) if problem.simulation.pairwise else None
+        simulation = problem.simulation
+        return pairs_only(simulation) if simulation.pairwise else without_kick(simulation.integrator)
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         made = passed(problem, names, saltation=False, budget=self.budget, progress=progress)
@@ -181,8 +182,10 @@ class Forward(Method):
             return "a fixed-point integer state has no tangent; the method reversible is for it"
         if self.saltation or simulation.pairwise:
             why = pairs_only(simulation)
-            if why is not None:
-                return why
+        else:
+            why = without_kick(simulation.integrator)
+        if why is not None:
+            return why
         many = len(columns_of(simulation, names))
         if many > self.most:
             return f"{many} numbers would need a tangent each, and at most {self.most} are carried"

@@ -28,10 +28,11 @@ from mdnum.gradients.parameters import (
     quantities,
     with_quantities,
 )
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import Forces, ManyBodyForce, PairForce
+from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
@@ -83,12 +84,13 @@ def tangents(
         states: whether to hand out the tangents of every step.
 
     Raises:
-        InputError: saltation with a tape without flips.
+        InputError: saltation with a tape without flips, or an integrator that is no linear `KickDrift`.
 
     Error: a rounding error times the growth of the tangent; none of truncation, for the program as it ran.
     """
     simulation = tape.simulation
     force = simulation.force
+    check_kick(simulation.integrator)
     columns = columns_of(simulation, names)
     along = directions(simulation, columns)
     total = jax.tree.map(lambda one: jnp.zeros((len(columns), *one.shape), one.dtype), tape.total)
@@ -136,7 +138,7 @@ def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values,
 @partial(jax.jit, static_argnames=("states",))
 def _stretch(
     force: PairForce | ManyBodyForce,
-    integrator: Integrator,
+    integrator: KickDrift,
     masses: Float[Array, "atoms"],
     tables: Tables,
     rows,
@@ -210,7 +212,7 @@ def _stretch(
         waiting = jnp.where(see, 0, waiting)
         _, (after_x, after_v) = jax.jvp(
             lambda x, v, numbers: drift(x, v, numbers, number),
-            (x, v + half * acceleration, numbers),
+            (x, integrator.kick(v, half, acceleration), numbers),
             (dx, dv + kick, along.integrator),
         )
         return TangentCarry(after_x, after_v, total, waiting), (dx, dv), dr

@@ -17,15 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Real
+from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
 from mdnum.gradients.losses import NOT_REAL, Loss, LossContext, LossFrame
-from mdnum.md.lattice import LatticeLangevin
+from mdnum.md.integrators import unsorted
 from mdnum.md.neighbors import PairTable
 from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point, room_for
+from mdnum.rollout.epoch import over_rows
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.simulation import Simulation
 
@@ -267,9 +268,9 @@ class ReversibleTape(RunTape):
         x, v, images = (segment.rows_of(name) for name in ("x", "v", "images"))
         for row in np.flatnonzero(steps % self._every == 0):
             self._prints[int(steps[row])] = fingerprint(segment.table.order, x[row], v[row], images[row])
-        state, scheme = segment.state, self.simulation.propagator
-        if isinstance(scheme, LatticeLangevin) and int(state.step) % int(scheme.period) == 0:
-            self.baths[int(state.step)] = np.array(state.bath)
+        state, period = segment.state, self.simulation.propagator.pause
+        if period is not None and int(state.step) % int(period) == 0:
+            self.baths[int(state.step)] = np.array(state.extra.value)
         self._end = state
 
     def __len__(self) -> int:
@@ -327,36 +328,6 @@ def fingerprint(order, *parts) -> bytes:
         out[:, order] = part
         digest.update((out + out.dtype.type(0)).tobytes())
     return digest.digest()
-
-
-def over_rows(
-    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
-) -> tuple[Any, Any]:
-    """As `jax.lax.scan`, but over the first `used` rows alone, last one first where it goes `backward`.
-
-    Every stretch has the room of the longest, so that one program serves all; a loop over that room would
-    spend most of its time on rows that hold nothing. Outputs of unused rows are zero.
-    """
-    first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
-    _, out = jax.eval_shape(step, carry, first)
-    room = jax.tree.leaves(rows)[0].shape[0]
-    outputs = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), out)
-
-    def body(k, both):
-        carry, outputs = both
-        at = used - 1 - k if backward else k
-        row = jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, at, keepdims=False), rows)
-        carry, new = step(carry, row)
-        return carry, jax.tree.map(
-            lambda all, one: lax.dynamic_update_index_in_dim(all, one, at, 0), outputs, new
-        )
-
-    return lax.fori_loop(0, used, body, (carry, outputs))
-
-
-def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
-    """An array over the atoms of a list, in the user's order."""
-    return jnp.zeros_like(a).at[..., order].set(a)
 
 
 def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -29,8 +29,9 @@ from mdnum.gradients import parameters
 from mdnum.gradients.losses import LossContext, LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings, unsorted
+from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings
 from mdnum.md.decide import Tables
+from mdnum.md.integrators import by_atom, one_step, unsorted
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.flips import fingerprint_of_bits
@@ -55,11 +56,12 @@ class Inputs(NamedTuple):
 
 class StepEnds(NamedTuple):
     """What one step hands to the next and a derivative goes through, user's order: wrapped positions,
-    half-kicked velocities, sums of the loss."""
+    half-kicked velocities, sums of the loss, what of the extra state is no integer."""
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
     total: Any
+    extra: Any
 
 
 class RunConstants(NamedTuple):
@@ -82,6 +84,7 @@ class Place(NamedTuple):
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
     home: Float[Array, "3 atoms"]  # wrapped positions at which the list was built
     built: Int[Array, ""]  # at which step
+    extra: Any  # the integers of the extra state
 
 
 class ChunkRecord(NamedTuple):
@@ -122,8 +125,6 @@ def chunk(
     integrator = eqx.combine(inputs.numbers, eqx.filter(fixed.integrator, eqx.is_inexact_array, inverse=True))
     cell = force.cell.astype(dtype)
     masses = fixed.masses[order]
-    mass_row = masses.astype(dtype)
-    half = (0.5 * integrator.timestep).astype(dtype)
     home = place.home[:, order]
     around = fixed.around._replace(
         matrix=fixed.around.matrix * scale,
@@ -135,8 +136,7 @@ def chunk(
     origin = LossFrame(jnp.zeros((), jnp.int64), whole, inputs.v, nan, nan)
 
     def used_up(x, step):
-        d = lax.stop_gradient(cell).minimum_image(*(lax.stop_gradient(x) - home))
-        largest = jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
+        largest = lax.stop_gradient(cell).farthest(lax.stop_gradient(x) - home)
         age = step - place.built
         allowed = (age >= delay) & (age % every == 0)
         return allowed & (largest > fixed.half_skin) if check else allowed
@@ -146,24 +146,20 @@ def chunk(
         return jax.tree.map(jnp.add, total, seen)
 
     def act(carry, see):
-        step, x, v, images, total, _, finite, rows = carry
+        step, x, v, images, extra, total, _, finite, rows = carry
         made = force(x, tables, decisions=True)
-        acceleration = made.force.astype(dtype) / mass_row
-        second = jnp.where(step == 0, jnp.zeros((), dtype), half)
-        v = v + second * acceleration
+        end = one_step(integrator, cell, masses, order, step, x, v, extra, made.force)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
         total = lax.cond(
-            see, observe, lambda total, _: total, total, (step, x, v, images, potential, made.virial)
+            see, observe, lambda total, _: total, total, (step, x, end.v, images, potential, made.virial)
         )
         assert made.decisions is not None
-        row = (x, v, made.decisions.bits)
-        after, kicked, _ = integrator.drift(x, v + half * acceleration, masses, step, order)
-        wrapped, n = cell.wrap(*after)
-        images = images + lax.stop_gradient(jnp.stack(n)).astype(jnp.int32)
-        x = jnp.stack(wrapped)
-        finite = finite & jnp.isfinite(potential) & jnp.isfinite(jnp.sum(jnp.square(v)))
+        row = (x, end.v, made.decisions.bits)
+        images = images + lax.stop_gradient(end.images).astype(jnp.int32)
+        finite = finite & jnp.isfinite(potential) & jnp.isfinite(jnp.sum(jnp.square(end.v)))
         step = step + 1
-        return (step, x, kicked, images, total, used_up(x, step), finite, rows + 1), row
+        at = step, end.x, end.kicked, images, end.ahead
+        return (*at, total, used_up(end.x, step), finite, rows + 1), row
 
     words, atoms = tables.index.shape[0], order.shape[0]
 
@@ -175,13 +171,15 @@ def chunk(
         *_, due, finite, rows = carry
         return lax.cond(~due & finite & (rows < limit), act, skip, carry, see)
 
-    start = (place.step, between.x[:, order], between.v[:, order], place.images[:, order], between.total)
-    start += (jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
-    (step, x, v, images, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, seen)
+    extra = by_atom(lambda a: a[..., order], eqx.combine(between.extra, place.extra))
+    start = (place.step, between.x[:, order], between.v[:, order], place.images[:, order], extra)
+    start += (between.total, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
+    (step, x, v, images, extra, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, seen)
     x, v, images = (unsorted(part, order) for part in (x, v, images))
-    new = Place(step, images, jnp.where(due, x, place.home), jnp.where(due, step, place.built))
+    extra, whole = eqx.partition(by_atom(lambda a: unsorted(a, order), extra), eqx.is_inexact_array)
+    new = Place(step, images, jnp.where(due, x, place.home), jnp.where(due, step, place.built), whole)
     record = ChunkRecord(new, rows, finite, xs, vs, bits)
-    return StepEnds(x, v, total), lax.stop_gradient(record)
+    return StepEnds(x, v, total, extra), lax.stop_gradient(record)
 
 
 @partial(jax.jit, static_argnames=("rule",))
@@ -222,9 +220,10 @@ class ChunkedProgram:
         origin = LossFrame(state.step, state.x, state.v, jnp.zeros(()), jnp.zeros(()))
         # the sums are kept as numbers; what the loss makes of them comes last
         total = no_sums(problem.loss, origin, self.fixed.around)
-        between = StepEnds(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total)
+        extra, whole = eqx.partition(state.extra, eqx.is_inexact_array)
+        between = StepEnds(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total, extra)
         zero = jnp.zeros((), jnp.int64)
-        self.start = Snapshot(between, Place(zero, state.images, between.x, zero), 0)
+        self.start = Snapshot(between, Place(zero, state.images, between.x, zero, whole), 0)
         self._verlet = simulation.verlet_list()
         # the list in use, by the step at which it was built and its capacity
         self._used: tuple[tuple[int, int], tuple[PairTable, Tables]] | None = None
@@ -264,6 +263,15 @@ class ChunkedProgram:
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
         """Derivatives by what a rollout is made of, from those of the inputs and of the first positions."""
+
+        def begun(numbers, x, v):
+            rest = eqx.filter(self.fixed.integrator, eqx.is_inexact_array, inverse=True)
+            return eqx.filter(eqx.combine(numbers, rest).init(x, v, self.fixed.masses), eqx.is_inexact_array)
+
+        _, back = jax.vjp(begun, self.inputs.numbers, self.start.between.x, self.inputs.v)
+        numbers, x, v = back(start.extra)
+        inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
+        start = start._replace(x=start.x + x, v=start.v + v)
         x = np.asarray(inputs.x + start.x, np.float64)
         v = np.asarray(inputs.v + start.v, np.float64)
         stretched = float(np.sum(np.asarray(start.x, np.float64) * np.asarray(self.inputs.x)))
@@ -313,7 +321,8 @@ class Unrolled(Method):
             at.between.total
         )
         nothing = jnp.zeros_like(at.between.x)
-        onto, inputs = StepEnds(nothing, nothing, by_total), jax.tree.map(jnp.zeros_like, program.inputs)
+        onto = StepEnds(nothing, nothing, by_total, jax.tree.map(jnp.zeros_like, at.between.extra))
+        inputs = jax.tree.map(jnp.zeros_like, program.inputs)
         own: Marks = {}
         for block in reversed(range(len(kept))):
             first, states = block * hop, [kept.pop()]

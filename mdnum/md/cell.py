@@ -120,6 +120,11 @@ class Cell(eqx.Module):
         lattice = (self.matrix, self.inverse, self.pbc, self.orthorhombic)
         return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
+    def farthest(self, moved):
+        """The largest length of displacements reduced to their nearest images, float64 (inside jit)."""
+        d = self.minimum_image(*moved)
+        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
+
     def wrap(self, x, y, z):
         """Components brought into the box, and the integer lattice coordinates that were taken off."""
         if not any(self.pbc):

@@ -1,64 +1,292 @@
-"""Integrators with one decision point a step: what happens between one force evaluation and the next.
+"""Integrators: what happens between one force evaluation and the next, and the one step that is made of it.
 
-A step is: forces at x_s, second half kick to v_s, first half kick, then `drift` to x_{s+1}. The state
-between steps is (x_{s+1}, half-kicked v), so a list that is used up is replaced before its forces are asked
-for, and a rollout can stop and resume at that point without evaluating anything twice.
+A step is: forces at x_s, the second half of the step before (`finish`) to the full-step v_s, then the first
+half of the next (`begin`) to x_{s+1}. The state between steps is (x_{s+1}, v between the halves, extra), so
+a list that is used up is replaced before its forces are asked for, and a rollout can stop and resume at that
+point without evaluating anything twice.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import Field, fields
+from operator import mul, truediv
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Float, Int, Real
 
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
+from mdnum.errors import InputError
+from mdnum.md.cell import Cell
+from mdnum.registry import Registry
+from mdnum.units import Units
+
+Vector = Float[Array, "3 atoms"]
+Masses = Float[Array, "atoms"]
+Number = Float[Array, ""]
+Step = Int[Array, ""]
+Order = Int[Array, "atoms"]
+
+
+def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
+    """An array over the atoms of a list, in the user's order."""
+    return jnp.zeros_like(a).at[..., order].set(a)
+
+
+class ByAtom(NamedTuple):
+    """A part of an extra state whose last axis is the atoms: it is sorted with them."""
+
+    value: Array
+
+
+def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
+    """An extra state with what belongs to atoms changed."""
+
+    def one(part: Any) -> Any:
+        return ByAtom(change(part.value)) if isinstance(part, ByAtom) else part
+
+    return jax.tree.map(one, extra, is_leaf=lambda part: isinstance(part, ByAtom))
+
+
+#: How a number of a file becomes one inside mdnum, by its unit; how it comes back; the factor of the units.
+_INSIDE = {
+    "time": (mul, truediv, "time_factor"),
+    "rate": (truediv, mul, "time_factor"),
+    "temperature": (mul, truediv, "k_B"),
+}
+
+
+def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False) -> Any:
+    """A number of a file for a field of an integrator; the other way round with `back`."""
+    if (unit := field.metadata.get("unit")) not in _INSIDE:
+        return value
+    *ways, factor = _INSIDE[unit]
+    return ways[back](value, getattr(units, factor))
+
+
+def quantity(unit: Literal["time", "rate", "temperature", "seed"], **options: Any) -> Any:
+    """A field of an integrator that a system file has in another unit: a time, one over a time, a temperature
+    (by the key `temperature`; an energy inside mdnum) or a random key (by `seed`)."""
+    return eqx.field(metadata={"unit": unit}, **options)
 
 
 class Integrator(eqx.Module):
-    """How positions and half-kicked velocities get to the next force evaluation."""
+    """How positions and velocities get from one force evaluation to the next.
+
+    A system file has its fields as keys; `quantity` says which are no pure numbers. A static field takes the
+    value in the file as it is.
+
+    Attributes:
+        timestep: internal time.
+    """
 
     name: ClassVar[str]
-    timestep: Float[Array, ""]
+    #: Whether the center of mass moves on undisturbed.
+    keeps_momentum: ClassVar[bool] = True
+    #: Steps after which the loop hands its state to the host, where the extra state needs that.
+    pause: ClassVar[Any] = None
+    timestep: Float[Array, ""] = quantity("time")
 
-    def kick(
-        self,
-        v: Float[Array, "3 atoms"],
-        time: Float[Array, ""],
-        acceleration: Float[Array, "3 atoms"],
-        masses: Float[Array, "atoms"],
-    ) -> Float[Array, "3 atoms"]:
-        """Velocities after an acceleration has acted for a time."""
-        return v + time * acceleration
+    @classmethod
+    def keys(cls) -> dict[str, Field[Any]]:
+        """Its fields, by the keys that a system file has for them."""
+        units = [(one.metadata.get("unit"), one) for one in fields(cls)]
+        return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
-    def kinetic(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, ""]:
-        """Kinetic energy."""
-        speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
-        return 0.5 * jnp.sum(masses * speed2)
+    @classmethod
+    def numbers(cls) -> list[str]:
+        """The keys of its numbers, which it may be differentiated by."""
+        return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]
 
-    @abstractmethod
-    def drift(
-        self,
-        x: Float[Array, "3 atoms"],
-        v: Float[Array, "3 atoms"],
-        masses: Float[Array, "atoms"],
-        step: Int[Array, ""],
-        order: Int[Array, "atoms"],
-    ) -> tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"], Float[Array, ""]]:
-        """Positions and velocities before the next force evaluation, and the heat taken up, energy.
+    @classmethod
+    def of_file(cls, table: Mapping[str, Any], units: Units) -> Integrator:
+        """The integrator that a table of a system file describes."""
+        made = {}
+        for key, field in cls.keys().items():
+            if (value := table.get(key)) is None:
+                continue
+            if key in cls.numbers():
+                value = jax.device_put(np.float64(converted(field, value, units)))
+            made[field.name] = jax.random.key(value) if key == "seed" else value
+        return cls(**made)
+
+    @property
+    def random(self) -> Array | None:
+        """Its random key; None without noise."""
+        field = self.keys().get("seed")
+        return None if field is None else getattr(self, field.name)
+
+    def number(self, key: str, units: Units) -> float:
+        """What a system file says by a key."""
+        field = self.keys()[key]
+        return converted(field, float(getattr(self, field.name)), units, back=True)
+
+    def with_number(self, key: str, value: Any, units: Units) -> Integrator:
+        """The integrator with another number by a key, without compiling anew."""
+        field = self.keys()[key]
+        # of a numpy number: a Python one would make another compiled program (a weak type)
+        inner = jnp.asarray(np.float64(converted(field, value, units)))
+        return eqx.tree_at(lambda one: getattr(one, field.name), self, inner)
+
+    def init(self, x: Vector, v: Vector, masses: Masses) -> Any:
+        """The extra state at the start: any pytree of arrays of numbers, those of atoms as `ByAtom`.
 
         Args:
-            x, v: sorted positions and velocities after the first half kick.
-            masses: sorted masses.
+            x, v: wrapped positions and velocities of step 0, user's order.
+        """
+        return ()
+
+    @abstractmethod
+    def finish(
+        self, v: Vector, extra: Any, acceleration: Vector, masses: Masses, time: Number
+    ) -> tuple[Vector, Any]:
+        """Full-step velocities and the extra state then.
+
+        Args:
+            v: sorted velocities, as `begin` left them. acceleration: at the positions that it led to.
+            masses: sorted masses, float64.
+            time: half a time step, in the dtype of v; 0 at step 0, which starts from full-step velocities.
+        """
+
+    @abstractmethod
+    def begin(
+        self,
+        x: Vector,
+        v: Vector,
+        extra: Any,
+        acceleration: Vector,
+        masses: Masses,
+        step: Step,
+        order: Order,
+    ) -> tuple[Vector, Vector, Any, Number]:
+        """Positions, velocities and extra state before the next force evaluation, and the heat taken up.
+
+        Args:
+            x, v: sorted positions and full-step velocities.
             step: the step that has just been evaluated.
             order: sorted atom k is atom order[k]; noise belongs to the atom, not to its place.
         """
 
+    def kinetic(self, v: Vector, masses: Masses) -> Number:
+        """Kinetic energy."""
+        speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
+        return 0.5 * jnp.sum(masses * speed2)
 
-class VelocityVerlet(Integrator):
+    def conserved(self, extra: Any, masses: Masses) -> Number | float:
+        """What the extra state adds to potential and kinetic energy for the quantity that is conserved."""
+        return 0.0
+
+
+class StepEnd(NamedTuple):
+    """What a step has made, in the order that it was given."""
+
+    # v, extra: full-step velocities and the extra state with them
+    v: Vector
+    extra: Any
+    # x, kicked, ahead: wrapped positions of the next step, velocities and extra state that lead there
+    x: Vector
+    kicked: Vector
+    ahead: Any
+    images: Vector  # lattice vectors that wrapping has just taken off
+    heat: Number  # energy taken up on the way
+
+
+def one_step(
+    integrator: Integrator,
+    cell: Cell,
+    masses: Masses,
+    order: Order,
+    step: Step,
+    x: Vector,
+    v: Vector,
+    extra: Any,
+    force: Vector,
+) -> StepEnd:
+    """One step of molecular dynamics, from its forces to the positions of the next.
+
+    Args:
+        cell: in the dtype of x. masses: float64. force: at x.
+        x, v, extra: wrapped positions, and what `begin` left; at step 0 the start.
+    """
+    dtype = x.dtype
+    acceleration = force.astype(dtype) / masses.astype(dtype)
+    half = (0.5 * integrator.timestep).astype(dtype)
+    # the first step of all starts from full-step velocities
+    second_half = jnp.where(step == 0, jnp.zeros((), dtype), half)
+    v, extra = integrator.finish(v, extra, acceleration, masses, second_half)
+    after, kicked, ahead, heat = integrator.begin(x, v, extra, acceleration, masses, step, order)
+    wrapped, n = cell.wrap(*after)
+    return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat)
+
+
+class KickDrift(Integrator):
+    """A kick by the forces, then what does not know them: what most derivatives are written out for.
+
+    Raises:
+        TypeError: a subclass has another kick, half step or extra state, which those would not see.
+    """
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        own = ("kick", "init", "finish", "begin")
+        if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
+            raise TypeError(f"{cls.__name__} has its own {other[0]}: make it an Integrator, not a KickDrift")
+
+    def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
+        """Velocities after an acceleration has acted for a time."""
+        return v + time * acceleration
+
+    def finish(self, v, extra, acceleration, masses, time):
+        return self.kick(v, time, acceleration), extra
+
+    def begin(self, x, v, extra, acceleration, masses, step, order):
+        v = self.kick(v, (0.5 * self.timestep).astype(v.dtype), acceleration)
+        x, v, heat = self.drift(x, v, masses, step, order)
+        return x, v, extra, heat
+
+    @abstractmethod
+    def drift(
+        self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
+    ) -> tuple[Vector, Vector, Number]:
+        """As `begin`, after the kick; linear in x and v."""
+
+
+def without_kick(integrator: Integrator) -> str | None:
+    """Why a derivative that is written out for a kick and a drift is not that of an integrator; else None."""
+    if type(integrator) in (VelocityVerlet, Langevin):
+        return None
+    if isinstance(integrator, KickDrift) and _is_linear(integrator):
+        return None
+    return (
+        f"it is written out for integrators of a kick and a linear drift, and {integrator.name} is another; "
+        "the method unrolled differentiates any integrator"
+    )
+
+
+def check_kick(integrator: Integrator) -> None:
+    """Refuse an integrator that a linearization would not see, with an `InputError`."""
+    if why := without_kick(integrator):
+        raise InputError(f"the run cannot be linearized here: {why}", where="dynamics.kind")
+
+
+def _is_linear(integrator: KickDrift) -> bool:
+    """Whether the drift has the same derivative by positions and velocities at two places."""
+    x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
+    zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
+
+    def drift(x, v):
+        return jnp.stack(integrator.drift(x, v, jnp.arange(1.0, 5.0), zero, order)[:2])
+
+    here, there = (jax.jvp(drift, at, (dx, dv))[1] for at in ((x, v), (v - x, 2 * x)))
+    return bool(jnp.allclose(here, there, rtol=1e-9, atol=1e-12))
+
+
+class VelocityVerlet(KickDrift):
     """NVE. Symplectic and time-reversible in exact arithmetic; local error O(dt³)."""
 
     name = "nve"
@@ -67,7 +295,7 @@ class VelocityVerlet(Integrator):
         return x + self.timestep.astype(x.dtype) * v, v, jnp.zeros((), jnp.float64)
 
 
-class Langevin(Integrator):
+class Langevin(KickDrift):
     """BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
     Noise comes from a counter-based key folded with the step, so two runs can share it and a resumed run
@@ -75,9 +303,10 @@ class Langevin(Integrator):
     """
 
     name = "langevin"
-    friction: Float[Array, ""]  # 1/time
-    kT: Float[Array, ""]  # temperature as an energy
-    key: Array  # counter-based random key
+    keeps_momentum = False
+    friction: Float[Array, ""] = quantity("rate")
+    kT: Float[Array, ""] = quantity("temperature")  # as an energy
+    key: Array = quantity("seed")  # counter-based random key
 
     def drift(self, x, v, masses, step, order):
         half = (0.5 * self.timestep).astype(x.dtype)
@@ -91,3 +320,9 @@ class Langevin(Integrator):
             * (jnp.square(kicked.astype(jnp.float64)) - jnp.square(v.astype(jnp.float64)))
         )
         return x + half * kicked, kicked, heat
+
+
+#: Integrators by the name that system files give them.
+INTEGRATORS: Registry[Integrator] = Registry("integrator", "mdnum.integrators", kind=Integrator)
+for _scheme in (VelocityVerlet, Langevin):
+    INTEGRATORS.add(_scheme.name, _scheme)

@@ -13,6 +13,7 @@ digit.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -37,7 +38,7 @@ from mdnum.md.decide import (
     packed,
     unpacked,
 )
-from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.integrators import ByAtom, Integrator, Langevin, VelocityVerlet
 from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, other_than, symmetric
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
@@ -243,9 +244,24 @@ class LatticeStep(Integrator):
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """As any kick, rounded to whole momenta."""
+        """Velocities after an acceleration has acted for a time, rounded to whole momenta."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
+
+    def finish(self, v, extra, acceleration, masses, time):
+        return self.kick(v, time, acceleration, masses), extra
+
+    def begin(self, x, v, extra, acceleration, masses, step, order):
+        v = self.kick(v, 0.5 * self.timestep, acceleration, masses)
+        return self.drift(x, v, extra, masses, step, order)
+
+    @abstractmethod
+    def drift(self, x, v, extra, masses, step, order):
+        """As `begin`, after the kick."""
+
+    @abstractmethod
+    def undrift(self, x, v, extra, masses, step, order):
+        """Places, velocities and extra state before the drift that follows a step."""
 
     def kinetic(self, v, masses):
         """The same in every order of atoms."""
@@ -257,26 +273,30 @@ class LatticeStep(Integrator):
         return x + direction * self.lattice.spacing * moved
 
 
-class LatticeVerlet(LatticeStep, VelocityVerlet):
+class LatticeVerlet(LatticeStep):
     """NVE in whole numbers."""
 
-    def drift(self, x, v, masses, step, order):
+    name = "nve"
+
+    def drift(self, x, v, extra, masses, step, order):
         p = self.momentum(v, masses)
-        return self.glide(x, p, masses, 1.0, 1), v, jnp.zeros((), jnp.float64)
+        return self.glide(x, p, masses, 1.0, 1), v, extra, jnp.zeros((), jnp.float64)
 
-    def undrift(self, x, v, bath, masses, step, order):
-        """Places, velocities and bath before the drift that follows a step."""
-        return self.glide(x, self.momentum(v, masses), masses, 1.0, -1), v, bath
+    def undrift(self, x, v, extra, masses, step, order):
+        return self.glide(x, self.momentum(v, masses), masses, 1.0, -1), v, extra
 
 
-class LatticeLangevin(LatticeStep, Langevin):
-    """BAOAB in whole numbers; what friction forgets goes into the bath."""
+class LatticeLangevin(LatticeStep):
+    """BAOAB in whole numbers; what friction forgets goes into the bath, its extra state."""
 
+    name = "langevin"
+    keeps_momentum = False
+    key: Array = eqx.field(kw_only=True)  # as Langevin's
     # numerator of the factor that friction leaves of a momentum in a step, over 2^24
     kept: Int[Array, ""] = eqx.field(kw_only=True)
     # size of the noise of an atom of unit mass, in units of momentum
     spread: Float[Array, ""] = eqx.field(kw_only=True)
-    period: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
+    pause: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
         """The momentum that noise adds after a step, from the counter alone: whole units."""
@@ -286,15 +306,13 @@ class LatticeLangevin(LatticeStep, Langevin):
         u = jax.random.uniform(jax.random.fold_in(self.key, step), shape, jnp.float64, low, 1.0)[:, order]
         return jnp.round(normal_quantile(u, self.zero) * (self.spread * jnp.sqrt(masses)))
 
-    def drift(self, x, v, masses, step, order):
-        """Refused: friction on a lattice needs the bath, which `exchange` takes and gives."""
-        raise InputError("a Langevin step on a lattice cannot be taken without its bath")
+    def init(self, x, v, masses):
+        return ByAtom(jnp.zeros(x.shape, jnp.int64))
 
-    def exchange(self, x, v, bath, masses, step, order):
-        """The drift with its thermostat: places, velocities, heat and bath."""
+    def drift(self, x, v, extra, masses, step, order):
         p = self.momentum(v, masses)
         x = self.glide(x, p, masses, 0.5, 1)
-        bath = jnp.where(step % self.period == 0, 0, bath)
+        bath = jnp.where(step % self.pause == 0, 0, extra.value)
         whole = p.astype(jnp.int64)
         filled = (bath << _SHIFT) | (whole & ((1 << _SHIFT) - 1))
         bath = filled // self.kept
@@ -302,26 +320,31 @@ class LatticeLangevin(LatticeStep, Langevin):
         after = whole.astype(jnp.float64) + self.noise(step, masses, order)
         kicked = self.velocity(after, masses)
         heat = self.kinetic(kicked, masses) - self.kinetic(v, masses)
-        return self.glide(x, after, masses, 0.5, 1), kicked, heat, bath
+        return self.glide(x, after, masses, 0.5, 1), kicked, ByAtom(bath), heat
 
-    def undrift(self, x, v, bath, masses, step, order):
-        """Places, velocities and bath before the drift that follows a step."""
+    def undrift(self, x, v, extra, masses, step, order):
         p = self.momentum(v, masses)
         x = self.glide(x, p, masses, 0.5, -1)
         whole = (p - self.noise(step, masses, order)).astype(jnp.int64)
         high = jnp.floor_divide(whole, self.kept)
-        filled = bath * self.kept + (whole - high * self.kept)
+        filled = extra.value * self.kept + (whole - high * self.kept)
         before = (high << _SHIFT) | (filled & ((1 << _SHIFT) - 1))
-        before = before.astype(jnp.float64)
-        return self.glide(x, before, masses, 0.5, -1), self.velocity(before, masses), filled >> _SHIFT
+        before, bath = before.astype(jnp.float64), ByAtom(filled >> _SHIFT)
+        return self.glide(x, before, masses, 0.5, -1), self.velocity(before, masses), bath
 
 
 def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | LatticeLangevin:
     """The scheme in whole numbers.
 
     Raises:
-        InputError: the friction is too small or too large for a step.
+        InputError: the friction is too small or too large for a step, or the integrator has no such twin.
     """
+    if type(integrator) not in (VelocityVerlet, Langevin):
+        raise InputError(
+            f"in whole numbers there are steps of nve and langevin, and none of {integrator.name}",
+            where="precision.state",
+            remedy='Use state = "float64"',
+        )
     timestep = float(integrator.timestep)
     impulse = lattice.force * (0.5 * timestep)
     common = {
@@ -343,15 +366,12 @@ def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | Latt
         spread = math.sqrt(float(integrator.kT) * (1 - decay * decay)) / impulse
         return LatticeLangevin(
             integrator.timestep,
-            integrator.friction,
-            integrator.kT,
-            integrator.key,
+            key=integrator.key,
             kept=jnp.asarray(kept, jnp.int64),
             spread=jnp.asarray(spread, jnp.float64),
-            period=jnp.asarray(period, jnp.int64),
+            pause=jnp.asarray(period, jnp.int64),
             **common,
         )
-    assert isinstance(integrator, VelocityVerlet)
     return LatticeVerlet(integrator.timestep, **common)
 
 

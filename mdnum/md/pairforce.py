@@ -33,7 +33,7 @@ from mdnum.md.decide import (
     halves_of,
     unpacked,
 )
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import Integrator, one_step
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import fence, rounded, zero_bits
@@ -387,6 +387,7 @@ class MdState(NamedTuple):
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
     # velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms)
     v: Float[Array, "3 atoms"]
+    extra: Any = ()  # of the integrator
 
 
 class PairDynamics(eqx.Module):
@@ -418,15 +419,8 @@ class PairDynamics(eqx.Module):
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """Forces from the pairs that are decided to be inside, both half kicks, and the drift."""
-        dtype = state.x.dtype
+        """One step, with the forces of the pairs that are decided to be inside."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
-        acceleration = made.force.astype(dtype) / self.masses.astype(dtype)
-        half = (0.5 * self.integrator.timestep).astype(dtype)
-        mass_row = self.masses.astype(dtype)
-        second_half = jnp.where(state.step == 0, jnp.zeros((), dtype), half)
-        v = self.integrator.kick(state.v, second_half, acceleration, mass_row)
-        v = self.integrator.kick(v, half, acceleration, mass_row)
-        x, v, _ = self.integrator.drift(state.x, v, self.masses, state.step, self.tables.order)
-        wrapped, _ = self.force.cell.astype(dtype).wrap(*x)
-        return MdState(state.step + 1, jnp.stack(wrapped), v)
+        cell, order = self.force.cell.astype(state.x.dtype), self.tables.order
+        end = one_step(self.integrator, cell, self.masses, order, *state, made.force)
+        return MdState(state.step + 1, end.x, end.kicked, end.ahead)

@@ -20,7 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md.decide import Tables
-from mdnum.md.lattice import LatticeLangevin
+from mdnum.md.integrators import ByAtom, unsorted
+from mdnum.md.lattice import LatticeStep
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import EpochProgram, EpochRecord, EpochState, write_row
@@ -34,7 +35,7 @@ class Back(NamedTuple):
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
     v: Float[Array, "3 atoms"]  # velocities after its first half kick; in the end, those of the start
     images: Int[Array, "3 atoms"]  # lattice vectors taken off by wrapping so far, shape (3, atoms)
-    bath: Int[Array, "3 atoms"] | None  # what friction had forgotten by then; None without a thermostat
+    extra: Any  # of the integrator: what friction had forgotten by then
 
 
 class Stretched(NamedTuple):
@@ -54,18 +55,18 @@ def _undrifted(leaves, structure, state: EpochState) -> Back:
     """Where a rollout stood before the last drift."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
-    return _before(program, program.masses, order, Back(state.step, *state[1:4], state.bath))
+    return _before(program, program.masses, order, Back(state.step, *state[1:4], state.extra))
 
 
 def _before(program: EpochProgram, masses, order, back: Back) -> Back:
-    """Undo the drift that led to a state: positions, velocities and bath of the step before."""
+    """Undo the drift that led to a state: positions, velocities and extra state of the step before."""
     step = back.step - 1
-    x, v, bath = program.integrator.undrift(  # type: ignore[attr-defined]
-        back.x, back.v, back.bath, masses, step, order
+    x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
+        back.x, back.v, back.extra, masses, step, order
     )
     wrapped, n = program.cell.wrap(*x)
     images = back.images + jnp.stack(n).astype(jnp.int32)
-    return Back(step, jnp.stack(wrapped), v, images, bath)
+    return Back(step, jnp.stack(wrapped), v, images, extra)
 
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
@@ -75,15 +76,11 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
     order = tables.order
 
     masses = program.masses[order]
-    scheme = program.integrator
+    scheme: LatticeStep = program.integrator  # type: ignore[assignment]
     half = 0.5 * scheme.timestep
     room = record.potential.shape[0]
     here = Back(back.step, *jax.tree.map(lambda a: a[:, order], back[1:]))
     home = here.x
-
-    def moved(x):
-        d = program.cell.minimum_image(*(x - home))
-        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
 
     def body(carry):
         here, row, _, record = carry
@@ -106,20 +103,20 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
         earlier = _before(program, masses, order, here._replace(v=v))
         start = here._replace(step=here.step - 1, v=v)
         earlier = jax.tree.map(lambda a, b: jnp.where(here.step == 0, a, b), start, earlier)
-        return earlier, row + 1, moved(earlier.x) > program.half_skin, record
+        return earlier, row + 1, program.cell.farthest(earlier.x - home) > program.half_skin, record
 
     def go_on(carry):
         here, row, due, _ = carry
         more = (here.step >= 0) & (row < room) & ~due
-        if here.bath is None:
+        if scheme.pause is None:
             return more
-        return more & ((row == 0) | (here.step % scheme.period != 0))  # type: ignore[attr-defined]
+        return more & ((row == 0) | (here.step % scheme.pause != 0))
 
     start = (here, jnp.zeros((), jnp.int64), jnp.zeros((), bool), record)
     here, rows, _, record = lax.while_loop(go_on, body, start)
 
-    unsorted = jax.tree.map(lambda a: jnp.zeros_like(a).at[:, order].set(a), here[1:])
-    return Back(here.step, *unsorted), rows, here.x, record
+    parts = jax.tree.map(lambda a: unsorted(a, order), here[1:])
+    return Back(here.step, *parts), rows, here.x, record
 
 
 class BackwardRun:
@@ -179,17 +176,17 @@ class BackwardRun:
 
     def _change_bath(self) -> None:
         """Where the run had put a bath aside, it is taken up again."""
-        step, scheme = int(self.back.step), self.simulation.propagator
-        if not isinstance(scheme, LatticeLangevin) or step % int(scheme.period):
+        step, period = int(self.back.step), self.simulation.propagator.pause
+        if period is None or step % int(period):
             return
         self._check_bath()
         if step not in self.baths:
             raise NumericalError(f"what friction had forgotten before step {step} was not kept")
-        self.back = self.back._replace(bath=jnp.asarray(self.baths[step]))
+        self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
         """A bath that was begun anew must have come back to nothing."""
-        if self.back.bath is not None and np.any(np.asarray(self.back.bath)):
+        if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
                 f"taken back, the run is not the one that was made: at step {step} the bath is not empty"

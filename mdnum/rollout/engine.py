@@ -119,16 +119,19 @@ class Start:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays for a checkpoint."""
-        parts = {name: value for name, value in self.state._asdict().items() if value is not None}
+        parts = self.state._asdict()
+        parts |= {f"extra_{k}": leaf for k, leaf in enumerate(jax.tree.leaves(parts.pop("extra")))}
         arrays = {f"state_{name}": np.asarray(value) for name, value in parts.items()}
         numbers = {"built": self.built, "epoch": self.epoch, "slots": self.slots}
         return arrays | {"reference": self.reference} | {k: np.asarray(v) for k, v in numbers.items()}
 
     @classmethod
-    def from_arrays(cls, arrays) -> Start:
+    def from_arrays(cls, arrays, simulation: Simulation) -> Start:
         """The inverse of `to_arrays`, bit for bit."""
-        held = {name: f"state_{name}" for name in EpochState._fields}
-        state = EpochState(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
+        places = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-1])
+        leaves, structure = jax.tree.flatten(first_state(simulation).state.extra)
+        extra = [jnp.asarray(arrays[f"state_extra_{k}"]) for k in range(len(leaves))]
+        state = EpochState(*places)._replace(extra=jax.tree.unflatten(structure, extra))
         return cls(
             state,
             jnp.asarray(arrays["reference"].T, state.x.dtype),
@@ -145,10 +148,11 @@ def first_state(simulation: Simulation) -> Start:
     wrapped, images = wrap_positions(simulation.cell, positions)
     wrapped = wrapped.astype(dtype)
     x = np.ascontiguousarray(wrapped.T)
-    bath = np.zeros((3, simulation.atoms), np.int64) if simulation.has_bath else None
     v, taken_off = velocities.T.astype(dtype), images.T.astype(np.int32)
     # numpy's arrays: jnp would compile a program for each
-    state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0), bath)))
+    state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0))))
+    extra = simulation.propagator.init(state.x, state.v, jax.device_put(simulation.masses))
+    state = state._replace(extra=jax.device_put(jax.tree.map(np.asarray, extra)))
     return Start(state, state.x)
 
 
@@ -197,18 +201,11 @@ class Engine:
         self.verlet: VerletList = simulation.verlet_list()
         self.verlet.slots = self.start.slots
         rule = simulation.rule
+        masses, half_skin = jax.device_put((simulation.masses, np.float64(rule.skin / 2)))
         self.program = EpochProgram(
-            simulation.force,
-            simulation.propagator,
-            simulation.cell.astype(np.float64),
-            jax.device_put(simulation.masses),
-            jax.device_put(np.float64(rule.skin / 2)),
-            rule.every,
-            rule.delay,
-            rule.check,
-            record,
-            self.rows,
-        )
+            simulation.force, simulation.propagator, simulation.cell.astype(np.float64), masses, half_skin,
+            rule.every, rule.delay, rule.check, record, self.rows,
+        )  # fmt: skip
         # a liquid has one change for ten atoms a step; where there are more, room is doubled
         self._room_for_changes(0 if self.rows else max(64, simulation.atoms // 4))
         self._records: list[EpochRecord | None] = [None, None]
@@ -296,17 +293,11 @@ class Engine:
             if self._unread is None or len(self._unread) != words:
                 self._unread = zeros((words, self.simulation.atoms), np.uint8)
             earlier = self._unread
+        numbers = jax.device_put((np.int64(start.built), np.int64(self.last), np.bool_(look_back)))
         return run_epoch(
-            self.leaves,
-            self.structure,
-            tables,
-            start.state,
-            start.home,
-            *jax.device_put((np.int64(start.built), np.int64(self.last), np.bool_(look_back))),
-            self.take(turn, words),
-            *told,
-            None if self.rows else earlier,
-        )
+            self.leaves, self.structure, tables, start.state, start.home, *numbers, self.take(turn, words),
+            *told, None if self.rows else earlier,
+        )  # fmt: skip
 
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
@@ -329,26 +320,11 @@ class Engine:
             last = outcome.held
         closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
         segment = Segment(
-            first,
-            rows,
-            record,
-            changes,
-            before,
-            table,
-            start.epoch,
-            start.built,
-            first == start.built,
-            closes,
-            bool(rebuild),
-            float(outcome.moved),
-            outcome.state,
-            start.home,
-            start.state,
-            outcome.inside,
-            outcome.leap,
-            outcome.held,
+            first, rows, record, changes, before, table, start.epoch, start.built, first == start.built,
+            closes, bool(rebuild), float(outcome.moved), outcome.state, start.home, start.state,
+            outcome.inside, outcome.leap, outcome.held,
             cache(partial(self._with_rows, replace(start, slots=table.slots), first + rows - 1)),
-        )
+        )  # fmt: skip
         return segment, last
 
     def _with_rows(self, start: Start, last: int) -> EpochRecord:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Changes, Tables, zeros
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import Integrator, by_atom, one_step, unsorted
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
 
@@ -108,8 +108,7 @@ class EpochState(NamedTuple):
     images: Int[Array, "3 atoms"]  # lattice vectors taken off by wrapping so far, shape (3, atoms)
     x_before: Float[Array, "3 atoms"]  # positions of the step before, shape (3, atoms)
     heat: Float[Array, ""]  # energy taken up from the thermostat so far
-    # what friction on a lattice has forgotten since it was last put aside, shape (3, atoms)
-    bath: Int[Array, "3 atoms"] | None = None
+    extra: Any = ()  # of the integrator, as `Integrator.init` makes it
 
 
 class EpochRecord(NamedTuple):
@@ -191,6 +190,31 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     )
 
 
+def over_rows(
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
+) -> tuple[Any, Any]:
+    """As `jax.lax.scan`, but over the first `used` rows alone, last one first where it goes `backward`.
+
+    Every stretch has the room of the longest, so that one program serves all; a loop over that room would
+    spend most of its time on rows that hold nothing. Outputs of unused rows are zero.
+    """
+    first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
+    _, out = jax.eval_shape(step, carry, first)
+    room = jax.tree.leaves(rows)[0].shape[0]
+    outputs = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), out)
+
+    def body(k, both):
+        carry, outputs = both
+        at = used - 1 - k if backward else k
+        row = jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, at, keepdims=False), rows)
+        carry, new = step(carry, row)
+        return carry, jax.tree.map(
+            lambda all, one: lax.dynamic_update_index_in_dim(all, one, at, 0), outputs, new
+        )
+
+    return lax.fori_loop(0, used, body, (carry, outputs))
+
+
 # the record is donated: two of them take turns, and no epoch pays for clearing one
 # flattening a program's many leaves anew costs a small system more than its step: it is done once
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
@@ -229,10 +253,8 @@ def run_epoch(
     dtype = state.x.dtype
     x, v, images = state.x[:, order], state.v[:, order], state.images[:, order]
     home = reference[:, order]
-    masses = program.masses[order]
+    masses, integrator = program.masses[order], program.integrator
     cell = program.cell.astype(dtype)
-    half_step = (0.5 * program.integrator.timestep).astype(dtype)
-    mass_row = masses.astype(dtype)
 
     before, inside = None, jnp.zeros((), jnp.int64)
     if program.record:
@@ -245,27 +267,20 @@ def run_epoch(
         )
         inside = inside_of(before)
 
-    def longest(start, end):
-        d = cell.minimum_image(*(end - start))
-        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
-
     def body(carry):
-        step, x, v, images, _, heat, bath, row, _, _, _, largest, record, earlier = carry
+        step, x, v, images, _, heat, extra, row, _, _, _, largest, record, earlier = carry
         given = {} if told is None else {"given": told[row]}
         if pinned is not None:
             given["where"] = pinned[row]
         made: Forces = program.force(x, tables, decisions=program.record, **given)  # type: ignore[operator]
-        acceleration = made.force.astype(dtype) / mass_row
-        # the first step of all starts from full-step velocities
-        second_half = jnp.where(step == 0, jnp.zeros((), dtype), half_step)
-        v = program.integrator.kick(v, second_half, acceleration, mass_row)
+        end = one_step(integrator, cell, masses, order, step, x, v, extra, made.force)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
-        kinetic = program.integrator.kinetic(v, masses)
+        kinetic = integrator.kinetic(end.v, masses)
         values = {
             "potential": potential,
             "kinetic": kinetic,
             "virial": made.virial,
-            "heat": heat,
+            "heat": heat - integrator.conserved(end.extra, masses),
             "moved": largest,
         }
         if program.record:
@@ -273,66 +288,43 @@ def run_epoch(
             assert d is not None
             values["nearest"] = d.nearest
             if program.rows:
-                values |= {"x": x, "v": v, "images": images, "bits": d.bits}
+                values |= {"x": x, "v": end.v, "images": images, "bits": d.bits}
             else:
-                changes, earlier = record.changes.noted(earlier, d.bits, tables, x, v, row, program.most)
+                changes, earlier = record.changes.noted(earlier, d.bits, tables, x, end.v, row, program.most)
                 values["inside"] = changes.count[2]
                 record = record._replace(changes=changes)
         record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
-        v = program.integrator.kick(v, half_step, acceleration, mass_row)
-        if bath is None:
-            after, v, taken = program.integrator.drift(x, v, masses, step, order)
-        else:
-            after, v, taken, bath = program.integrator.exchange(  # type: ignore[attr-defined]
-                x, v, bath, masses, step, order
-            )
-        wrapped, n = cell.wrap(*after)
-        runaway = jnp.max(jnp.abs(jnp.stack(n))) > 1
-        after, images = jnp.stack(wrapped), images + jnp.stack(n).astype(jnp.int32)
+        runaway = jnp.max(jnp.abs(end.images)) > 1
+        images = images + end.images.astype(jnp.int32)
         step = step + 1
-        largest = longest(home, after)
+        largest = cell.farthest(end.x - home)
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
         ended = due, finite, runaway, largest
-        return step, after, v, images, x, heat + taken, bath, row + 1, *ended, record, earlier
+        at = step, end.x, end.kicked, images, x, heat + end.heat, end.ahead
+        return *at, row + 1, *ended, record, earlier
 
     def go_on(carry):
-        step, _, _, _, _, _, bath, row, due, finite, runaway, _, record, _ = carry
+        step, _, _, _, _, _, _, row, due, finite, runaway, _, record, _ = carry
         more = (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
         if record.changes is not None:
             more &= record.changes.count[0] + program.most <= len(record.changes.pairs)
-        if bath is None:
+        if integrator.pause is None:
             return more
-        # a full bath is put aside by whoever wants to go back
-        return more & ((row == 0) | (step % program.integrator.period != 0))  # type: ignore[attr-defined]
+        return more & ((row == 0) | (step % integrator.pause != 0))
 
-    carry = (
-        state.step,
-        x,
-        v,
-        images,
-        state.x_before[:, order],
-        state.heat,
-        None if state.bath is None else state.bath[:, order],
-        jnp.zeros((), jnp.int64),
-        jnp.zeros((), bool),
-        jnp.ones((), bool),
-        jnp.zeros((), bool),
-        longest(home, x),
-        record if record.changes is None else record._replace(changes=record.changes.emptied()),
-        None if program.rows else before,
-    )
+    extra, no, yes = by_atom(lambda a: a[..., order], state.extra), jnp.zeros((), bool), jnp.ones((), bool)
+    begun = state.step, x, v, images, state.x_before[:, order], state.heat, extra
+    empty = record if record.changes is None else record._replace(changes=record.changes.emptied())
+    row, largest = jnp.zeros((), jnp.int64), cell.farthest(x - home)
+    carry = (*begun, row, no, yes, no, largest, empty, None if program.rows else before)
     done = lax.while_loop(go_on, body, carry)
-    step, x, v, images, x_before, heat, bath, rows, due, finite, runaway, largest, record, earlier = done
+    step, x, v, images, x_before, heat, extra, rows, due, finite, runaway, largest, record, earlier = done
 
-    def unsorted(a):
-        return jnp.zeros_like(a).at[:, order].set(a)
-
-    end = EpochState(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
-    if bath is not None:
-        end = end._replace(bath=unsorted(bath))
+    x, v, images, x_before = (unsorted(part, order) for part in (x, v, images, x_before))
+    end = EpochState(step, x, v, images, x_before, heat, by_atom(lambda a: unsorted(a, order), extra))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    leap = longest(state.x_before, state.x)
+    leap = cell.farthest(state.x - state.x_before)
     return EpochOutcome(end, flags, largest, before, inside, leap, earlier), record

@@ -104,7 +104,7 @@ class Rollout:
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Continue from a checkpoint's state instead of from the beginning."""
-        self.start = Start.from_arrays(saved)
+        self.start = Start.from_arrays(saved, self.simulation)
         done = saved["done"]
         self.done = _Progress(
             RunTally.from_dict(done["tally"]),

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.md.cell import displacement, wrap_positions
-from mdnum.md.integrators import Langevin
 from mdnum.numerics import Ledger, unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
@@ -195,7 +194,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 def degrees_of_freedom(simulation: Simulation) -> int:
     """3 N, less the three of a center of mass that nothing moves."""
-    conserved = simulation.draw.remove_drift and not isinstance(simulation.integrator, Langevin)
+    conserved = simulation.draw.remove_drift and simulation.integrator.keeps_momentum
     return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
 
 

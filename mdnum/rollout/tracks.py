@@ -251,18 +251,9 @@ class Handed:
         if held is None or held.bits.shape != told.shape:
             held = empty_record(told.shape[0], told.shape[1], simulation.atoms, dtype, True)
         leaves, structure = self._flat
-        outcome, record = run_epoch(
-            leaves,
-            structure,
-            tables,
-            self.state,
-            jnp.asarray(home, dtype),
-            jnp.asarray(built, jnp.int64),
-            jnp.asarray(segment.last, jnp.int64),
-            jnp.asarray(False),
-            held,
-            told,
-        )
+        numbers = jnp.asarray(built, jnp.int64), jnp.asarray(segment.last, jnp.int64), jnp.asarray(False)
+        home = jnp.asarray(home, dtype)
+        outcome, record = run_epoch(leaves, structure, tables, self.state, home, *numbers, held, told)
         count, due, finite, runaway = np.asarray(outcome.flags).tolist()
         self.state = outcome.state
         self.failed = "" if finite and not runaway else "runaway" if finite else "blow-up"
@@ -271,16 +262,8 @@ class Handed:
         first = segment.first + row
         x, v = (np.asarray(getattr(record, name))[:count] for name in "xv")
         energy = (np.asarray(record.potential) + np.asarray(record.kinetic))[:count]
-        note = Overridden(
-            *self._apart.overridden(
-                np.asarray(record.bits)[:count],
-                np.asarray(told)[:count],
-                table,
-                x,
-                simulation.species,
-                self._r_cut,
-            )
-        )
+        own, theirs = (np.asarray(bits)[:count] for bits in (record.bits, told))
+        note = Overridden(*self._apart.overridden(own, theirs, table, x, simulation.species, self._r_cut))
         # copies: the record is filled anew by the next stretch
         x, v = (in_user_order(part, table.order) for part in (x, v))
         self._record = record

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
-from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.integrators import INTEGRATORS
 from mdnum.md.neighbors import RebuildRule
 from mdnum.md.potentials import POTENTIALS, CutPotential, PairFunction
 from mdnum.numerics import PrecisionPolicy
@@ -128,12 +128,6 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
     policy = PrecisionPolicy(precision.state, precision.force, precision.decision, precision.accumulate)
     if spec.cutoff is None and policy != PrecisionPolicy():
         raise InputError(DOUBLE_ONLY, where="precision", remedy="Remove the [precision] table")
-    timestep = jax.device_put(np.float64(dynamics.timestep * units.time_factor))
-    integrator: Integrator = VelocityVerlet(timestep)
-    if isinstance(dynamics, schema.LangevinTable):
-        friction = jax.device_put(np.float64(dynamics.friction / units.time_factor))
-        kT = jax.device_put(np.float64(units.k_B * dynamics.temperature))
-        integrator = Langevin(timestep, friction, kT, jax.random.key(dynamics.seed))
     rebuild, fork = neighbors.rebuild, spec.fork
     return assembled(
         Origin(system.name, spec.about, system, {} if fork is None else fork.model_dump()),
@@ -145,7 +139,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
         neighbors.builder,
         policy,
         REDUCTIONS.parse(precision.reduction),
-        integrator,
+        INTEGRATORS[dynamics.kind].of_file(dynamics.model_dump(), units),
         system.draw,
         dynamics.steps,
         spec.record.save_every,

@@ -130,13 +130,9 @@ def simulation(
     sigmas = np.asarray(model.potential.leaves.get("sigma", ())).tolist() if pairwise else ()
     check(atoms, r_cut, skin, smallest_distance(potential.name, units, sigmas), system.length)
     if integrator is None:
-        step = jax.device_put(np.float64(timestep * system.time_factor))
-        if friction is None:
-            integrator = VelocityVerlet(step)
-        else:
-            rate = jax.device_put(np.float64(friction / system.time_factor))
-            kT = jax.device_put(np.float64(system.k_B * temperature))
-            integrator = Langevin(step, rate, kT, jax.random.key(seed))
+        kind = VelocityVerlet if friction is None else Langevin
+        numbers = {"timestep": timestep, "friction": friction, "temperature": temperature, "seed": seed}
+        integrator = kind.of_file(numbers, system)
     drawn = not atoms.has("momenta") if drawn is None else drawn
     return assembled(
         Origin(name, about), atoms, system, model, "r <" if cutoff is None else cutoff.compare,

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.md.integrators import Langevin
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, write_text
 from mdnum.store.folder import system_tables
@@ -180,12 +179,5 @@ def _cutoff(simulation: Simulation) -> dict[str, Any] | None:
 
 
 def _dynamics(simulation: Simulation) -> dict[str, Any]:
-    integrator = simulation.integrator
-    if isinstance(integrator, Langevin):
-        return {"friction": float(integrator.friction) * simulation.units.time_factor}
-    numbers = eqx.filter(integrator, eqx.is_inexact_array)
-    return {
-        name: plain_leaf(leaf)
-        for name, leaf in vars(numbers).items()
-        if name != "timestep" and eqx.is_inexact_array(leaf)
-    }
+    integrator, units = simulation.integrator, simulation.units
+    return {key: integrator.number(key, units) for key in integrator.numbers() if key != "timestep"}

@@ -13,11 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from pydantic import ValidationError
 
 from mdnum.errors import InputError
-from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import check_radius
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
@@ -97,16 +95,16 @@ def _with(simulation: Simulation, key: str, value: Any) -> Simulation:
     if key == "cutoff.compare":
         return replace(simulation, decider=replace(simulation.decider, compare=value))
     if key == "dynamics.seed":
-        draw = replace(draw, seed=value)
-        if isinstance(simulation.integrator, Langevin):
-            key_of = jax.random.key(value)
-            integrator = eqx.tree_at(lambda one: one.key, simulation.integrator, key_of)
+        draw, field = replace(draw, seed=value), simulation.integrator.keys().get("seed")
+        if field is not None:
+            at: Any = lambda one: getattr(one, field.name)  # noqa: E731
+            integrator = eqx.tree_at(at, simulation.integrator, jax.random.key(value))
             simulation = replace(simulation, integrator=integrator)
         return redrawn(replace(simulation, draw=draw)) if draw.drawn else replace(simulation, draw=draw)
     if key == "dynamics.temperature":
         draw = replace(draw, temperature=float(value))
-        if isinstance(simulation.integrator, Langevin):
-            simulation = _integrator("kT", simulation.units.k_B)(simulation, float(value))
+        if "temperature" in simulation.integrator.numbers():
+            simulation = _integrator("temperature")(simulation, float(value))
         return redrawn(replace(simulation, draw=draw)) if draw.drawn else replace(simulation, draw=draw)
     return dial(simulation, key).turn(simulation, float(value))
 
@@ -189,34 +187,27 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def _fixed(simulation: Simulation) -> dict[str, Dial]:
-    factor = simulation.units.time_factor
-    integrator = simulation.integrator
+    integrator, units = simulation.integrator, simulation.units
+    # velocities that are drawn are drawn at the temperature: then it is more than one number
+    drawn = simulation.draw.drawn
+    keys = [key for key in integrator.numbers() if not (drawn and key == "temperature")]
+    first, *others = [
+        Dial(f"dynamics.{key}", integrator.number(key, units), _integrator(key)) for key in keys
+    ]
     dials = [
-        Dial("dynamics.timestep", float(integrator.timestep) / factor, _integrator("timestep", factor)),
+        first,
         Dial("velocity.scale", 1.0, _scaled),
         Dial("neighbors.skin", simulation.rule.skin, _skin),
+        *others,
     ]
-    if isinstance(integrator, Langevin):
-        k_B = simulation.units.k_B
-        friction = float(integrator.friction) * factor
-        dials.append(Dial("dynamics.friction", friction, _integrator("friction", factor, inverse=True)))
-        # velocities that are drawn are drawn at the temperature: then it is more than one number
-        if not simulation.draw.drawn:
-            dials.append(Dial("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)))
     if simulation.pairwise:
         dials += _constants(simulation) + _radii(simulation)
     return {one.key: one for one in dials}
 
 
-def _number(value: float) -> Float[Array, ""]:
-    # of a numpy number: a Python one would make another compiled program (a weak type)
-    return jnp.asarray(np.float64(value))
-
-
-def _integrator(name: str, factor: float, *, inverse: bool = False) -> Turn:
+def _integrator(key: str) -> Turn:
     def turn(simulation: Simulation, value: float) -> Simulation:
-        inner = value / factor if inverse else value * factor
-        changed = eqx.tree_at(lambda part: getattr(part, name), simulation.integrator, _number(inner))
+        changed = simulation.integrator.with_number(key, value, simulation.units)
         return replace(simulation, integrator=changed)
 
     return turn

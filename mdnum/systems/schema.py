@@ -7,14 +7,14 @@ file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, from_array
+from mdnum.systems.toml import Key, Named, NonNegative, Positive, TomlTable, from_array, loaded
 
 Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
 Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
@@ -159,6 +159,15 @@ _MANY_BODY = (StillingerWeberTable, TersoffTable, EmbeddedAtomTable)
 _PAIRS = (LennardJonesTable, MorseTable, SoftSphereTable, PythonTable)
 
 
+def _kinds(*tables: type[TomlTable]) -> list[str]:
+    return [get_args(table.model_fields["kind"].annotation)[0] for table in tables]
+
+
+def _other_than(*tables: type[TomlTable]) -> Any:
+    """A kind that an editor does not take for that of one of these tables."""
+    return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
+
+
 class OtherRow(TomlTable):
     """Constants of one pair of species, of a potential that another package adds."""
 
@@ -172,7 +181,7 @@ class OtherTable(PairPotentialTable):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
 
-    kind: str
+    kind: str = _other_than(*_PAIRS, *_MANY_BODY)
     pairs: dict[str, OtherRow] | None = Field(
         default=None, description='constants of each pair of species, such as "Ni-P"'
     )
@@ -180,37 +189,36 @@ class OtherTable(PairPotentialTable):
     @property
     def constants(self) -> tuple[str, ...]:
         """Names of the constants of one pair."""
-        from mdnum.md.potentials import POTENTIALS
-
-        return tuple(field.name for field in fields(POTENTIALS[self.kind]))
+        return tuple(field.name for field in fields(loaded(_POTENTIALS)[self.kind]))
 
     @model_validator(mode="after")
     def _known(self) -> Any:
         for row in (self, *(self.pairs or {}).values()):
-            if unknown := set(row.__pydantic_extra__) - set(self.constants):
-                raise ValueError(f"unknown {', '.join(sorted(unknown))}; it has {', '.join(self.constants)}")
+            _check_names(row.__pydantic_extra__, self.constants)
         return self
 
 
-def _kind_of_potential(value: Any) -> str | None:
-    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-    if kind in _KINDS or not isinstance(kind, str):
-        return kind
-    from mdnum.md.potentials import POTENTIALS
-
-    return "other" if kind in POTENTIALS else kind
+def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
+    if unknown := set(given) - set(known):
+        raise ValueError(f"unknown {', '.join(sorted(unknown))}; it has {', '.join(known)}")
 
 
-def _tagged(table: type[TomlTable]) -> Any:
-    (kind,) = get_args(table.model_fields["kind"].annotation)
-    return Annotated[table, Tag(kind)]
+def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
+    """One of some tables by its kind, or that of a kind which another package adds to a registry."""
+    tags = dict(zip(_kinds(*tables), tables, strict=True))
+
+    def kind_of(value: Any) -> str | None:
+        kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+        if kind in tags or not isinstance(kind, str):
+            return kind
+        return "other" if kind in loaded(registry) else kind
+
+    options = [Annotated[table, Tag(kind)] for kind, table in tags.items()]
+    return Annotated[Union[*options, Annotated[other, Tag("other")]], Discriminator(kind_of)]
 
 
-_KINDS = {get_args(table.model_fields["kind"].annotation)[0] for table in (*_PAIRS, *_MANY_BODY)}
-Potential = Annotated[
-    Union[*(_tagged(table) for table in (*_PAIRS, *_MANY_BODY)), Annotated[OtherTable, Tag("other")]],
-    Discriminator(_kind_of_potential),
-]
+_POTENTIALS = "mdnum.md.potentials:POTENTIALS"
+Potential = _or_other((*_PAIRS, *_MANY_BODY), OtherTable, _POTENTIALS)
 
 
 # --- cutoff -------------------------------------------------------------------------------------------
@@ -390,7 +398,29 @@ class LangevinTable(_Dynamics):
     friction: float = Field(gt=0, description="friction coefficient (1/ps or 1/τ)")
 
 
-Dynamics = Annotated[NVETable | LangevinTable, Discriminator("kind")]
+class OtherDynamics(_Dynamics):
+    """An integrator that another package adds; its keys are the fields of its class."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, bool | int | float | str]
+
+    kind: str = _other_than(NVETable, LangevinTable)
+    temperature: NonNegative = Field(
+        default=0.0, description="of a thermostat, and of drawn velocities (K or ε/k)"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> Any:
+        keys, given = loaded(_INTEGRATORS)[self.kind].keys(), self.__pydantic_extra__
+        _check_names(given, sorted(keys.keys() - type(self).model_fields))
+        needed = [key for key, field in keys.items() if field.default is MISSING and key != "seed"]
+        if missing := [key for key in needed if key not in given.keys() | self.model_fields_set]:
+            raise ValueError(f"{', '.join(missing)} missing")
+        return self
+
+
+_INTEGRATORS = "mdnum.md.integrators:INTEGRATORS"
+Dynamics = _or_other((NVETable, LangevinTable), OtherDynamics, _INTEGRATORS)
 
 
 class PrecisionTable(TomlTable):

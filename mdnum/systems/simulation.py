@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
-from mdnum.md.integrators import Integrator, Langevin
+from mdnum.md.integrators import Integrator
 from mdnum.md.lattice import Lattice, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
@@ -169,7 +169,7 @@ class Simulation:
         """The dynamics as the state needs it: the integrator, or its twin in whole numbers.
 
         Raises:
-            InputError: a friction that a lattice cannot have.
+            InputError: an integrator, or a friction, that a lattice cannot have.
         """
         if self.lattice is None:
             return self.integrator
@@ -180,11 +180,6 @@ class Simulation:
     def smooth(self) -> Simulation:
         """The same system in floats: what is linearized, since a whole number has no derivative."""
         return self if self.lattice is None else replace(self, lattice=None)
-
-    @property
-    def has_bath(self) -> bool:
-        """Whether a state remembers what friction has forgotten."""
-        return self.lattice is not None and isinstance(self.integrator, Langevin)
 
     @property
     def path(self) -> Path | None:

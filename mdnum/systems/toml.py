@@ -196,6 +196,12 @@ _SMALLEST = 1e-150
 _LARGEST_INT = 2**62
 
 
+def loaded(registry: str) -> Any:
+    """The registry at "module:attribute", whose module may be a slow one."""
+    module, _, attribute = registry.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
 class Named:
     """A name of a registry, perhaps with an argument; checked where a file gives one.
 
@@ -207,14 +213,10 @@ class Named:
     def __init__(self, registry: str, *others: str):
         self.registry, self.others = registry, others
 
-    def _loaded(self) -> Any:
-        module, _, attribute = self.registry.partition(":")
-        return getattr(importlib.import_module(module), attribute)
-
     def _check(self, value: Any) -> Any:
         if value in self.others or not isinstance(value, str):
             return value
-        registry = self._loaded()
+        registry = loaded(self.registry)
         if value.partition(registry.separator)[0] not in registry:
             raise PydanticCustomError("unknown_name", "unknown name", {"known": [*self.others, *registry]})
         try:
@@ -227,7 +229,7 @@ class Named:
         return core_schema.no_info_before_validator_function(self._check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        registry = self._loaded()
+        registry = loaded(self.registry)
         # an editor offers those shipped, and lets others pass: packages add theirs
         return {
             "anyOf": [{"enum": [*self.others, *registry.shipped]}, {"type": "string"}],

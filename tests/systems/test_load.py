@@ -56,6 +56,14 @@ def test_the_shipped_json_schema_is_current_and_describes_every_key(file, root):
     assert silent == []
 
 
+@pytest.mark.parametrize("table", ["potential", "dynamics"])
+def test_an_editor_takes_a_shipped_kind_for_one_table_alone(table):
+    made = json_schema("schema.json")
+    options = [made["$defs"][one["$ref"].rpartition("/")[2]] for one in made["properties"][table]["oneOf"]]
+    *own, other = (option["properties"]["kind"] for option in options)
+    assert other["not"]["enum"] == [kind["const"] for kind in own]
+
+
 def test_a_skin_of_its_units_and_a_spec_that_is_frozen():
     argon, crystal = (load(name).spec.model_copy(update={"neighbors": schema.NeighborsTable()})
                       for name in (ARGON, "argon/crystal-108"))  # fmt: skip

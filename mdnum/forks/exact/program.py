@@ -126,7 +126,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
             "precision.state",
         ),
         (
-            not isinstance(simulation.integrator, VelocityVerlet),
+            type(simulation.integrator) is not VelocityVerlet,
             f"the exact program serves NVE dynamics, not {simulation.integrator.name!r}: its noise is "
             "defined by its rounding",
             "Use --set dynamics.kind=nve",

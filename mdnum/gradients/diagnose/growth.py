@@ -27,11 +27,12 @@ from mdnum.gradients.adjoint import AdjointCarry, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import passed, tape_of
-from mdnum.gradients.tape import RunTape, TapeStretch, over_rows, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch
 from mdnum.md.decide import Tables
-from mdnum.md.integrators import Integrator
+from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
+from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
 #: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.
@@ -307,10 +308,11 @@ class Jacobian:
     A state is positions and velocities times `clock`, an internal time, flat.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
     """
 
     def __init__(self, tape: RunTape, clock: float):
+        check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
             raise InputError("the Jacobian of a step is one of pair potentials", where=tape.simulation.name)
         self.tape, self.clock = tape, clock
@@ -364,7 +366,7 @@ def _orthonormal(block):
 @partial(jax.jit, static_argnames=("backward",))
 def _carried(
     force: PairForce,
-    integrator: Integrator,
+    integrator: KickDrift,
     masses: Float[Array, "atoms"],
     tables: Tables,
     rows,
