@@ -53,8 +53,8 @@ class PairPotential(eqx.Module):
         return jax.tree.map(lambda leaf: of_type(leaf, types), self)
 
     @property
-    def leaves(self) -> dict[str, Float[Array, "types"]]:
-        """Its parameters by name, each with one entry per pair type."""
+    def leaves(self) -> dict[str, Any]:
+        """Its parameters by name, each of shape (types,) with one entry per pair type."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:

@@ -121,8 +121,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
                 "overrides change a system while it is loaded", where=system.name, remedy=_CHANGE_OBJECTS
             )
         return system
-    if not isinstance(system, System):
-        system = load(system, overrides, world="md")
+    system = load(system, overrides, world="md")
     spec, units = system.spec, system.units
     dynamics, neighbors, precision = spec.dynamics, spec.neighbors, spec.precision
     policy = PrecisionPolicy(precision.state, precision.force, precision.decision, precision.accumulate)

@@ -12,8 +12,8 @@ from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
 from mdnum.forks.processes import digests, digests_elsewhere
 from mdnum.forks.worlds import program_of
-from mdnum.rollout.program import names
 from mdnum.systems.build import build
+from mdnum.systems.parameters import names
 
 # processes of their own, and hundreds of runs
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from mdnum.errors import InputError
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import run_epoch
-from mdnum.rollout.program import dial, names, unit
 from mdnum.systems.build import build
+from mdnum.systems.parameters import dial, names, unit
 
 
 def leaves(simulation) -> list[np.ndarray]:

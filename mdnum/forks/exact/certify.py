@@ -14,6 +14,7 @@ from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.program import Decision, Program
 from mdnum.systems import BallSystem
+from mdnum.systems.load import opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
@@ -117,6 +118,7 @@ def certify(
     Raises:
         InputError: the system cannot be certified, or steps below 1.
     """
+    system = opened(system)
     is_ball = isinstance(system, BallSystem)
     own = system.spec.integrator.steps if isinstance(system, BallSystem) else system.steps
     last = own if steps is None else steps
