@@ -108,7 +108,8 @@ def test_what_is_not_run_by_default_is_listed_with_how_to_ask(monkeypatch):
     assert isinstance(smoothed, SmoothedDifferences) and smoothed.replicas.count == 5
 
 
-@pytest.mark.slow
+# a golden has such a folder, and test_crossings the closed form
+@pytest.mark.nightly
 def test_the_folder_holds_the_derivative_of_the_closed_form(tmp_path):
     out = tmp_path / "well"
     options = ("--steps", "2000", "--methods", "event-aware,symmetric", "-o", str(out))

@@ -17,7 +17,8 @@ from mdnum import doctor
 from mdnum.doctor import diagnose
 
 
-@pytest.mark.slow
+# CI asks the doctor of the installed wheel
+@pytest.mark.nightly
 def test_this_installation_is_safe_and_that_is_known_in_time():
     """20 s on two cores; counted in processor time, because other programs may be using them."""
     before = os.times()

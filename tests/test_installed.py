@@ -83,20 +83,16 @@ def test_nothing_is_said_before_something_is_compiled_or_where_a_folder_takes_it
     assert list((tmp_path / "cache").rglob("*.nbi"))
 
 
-@pytest.mark.slow
+# everything is compiled again; a ball and a search, above, are what the gate has of it
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("words", "compiles"),
     [
         ("run argon/crystal-108 --steps 20 --save-every 10", True),
-        *(
-            pytest.param(*one, marks=pytest.mark.nightly)
-            for one in (
-                ("grad pair/leaving-well --of msd --wrt epsilon --methods symmetric --steps 20", True),
-                ("fork argon/crystal-108 --vary order --steps 20", True),
-                ("audit ase.calculators.lj:LennardJones(sigma=3.405,epsilon=0.0103) --checks forces", False),
-                ("conform ase --cases 3 --no-large", False),
-            )
-        ),
+        ("grad pair/leaving-well --of msd --wrt epsilon --methods symmetric --steps 20", True),
+        ("fork argon/crystal-108 --vary order --steps 20", True),
+        ("audit ase.calculators.lj:LennardJones(sigma=3.405,epsilon=0.0103) --checks forces", False),
+        ("conform ase --cases 3 --no-large", False),
     ],
 )
 def test_every_verb_works_where_nothing_can_be_kept(read_only, tmp_path, words, compiles):
@@ -222,7 +218,11 @@ def test_an_encoding_that_lacks_a_sign_is_given_its_number(monkeypatch, encoding
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("JAX_PLATFORMS", "cuda"), ("JAX_PLATFORMS", "nonsense"), ("NUMBA_DISABLE_JIT", "1")],
+    [
+        pytest.param("JAX_PLATFORMS", "cuda", marks=pytest.mark.nightly),
+        ("JAX_PLATFORMS", "nonsense"),
+        ("NUMBA_DISABLE_JIT", "1"),
+    ],
 )
 def test_a_setting_that_leaves_nothing_to_compute_with_is_one_line(tmp_path, name, value):
     done = started("ball", "ball/drop", "--steps", "5", "--no-report", cwd=tmp_path, **{name: value})
@@ -253,7 +253,15 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-@pytest.mark.parametrize("name", ["typer", "mdnum.cli.verbs", "jax", "jax._src.numpy", "mdnum.doctor"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "typer",
+        "jax._src.numpy",
+        "mdnum.doctor",
+        *(pytest.param(name, marks=pytest.mark.nightly) for name in ("mdnum.cli.verbs", "jax")),
+    ],
+)
 def test_control_c_during_an_import_ends_without_a_traceback(tmp_path, name):
     (tmp_path / "sitecustomize.py").write_text(AT.format(name=name))
     path = os.pathsep.join([str(tmp_path), environment().get("PYTHONPATH", "")])

@@ -133,6 +133,7 @@ def test_flips_of_a_new_run_and_of_its_folder_are_the_same(here, tmp_path: Path)
     assert here("topology_flip_report", "run", *words) == made
 
 
+@pytest.mark.nightly
 def test_ase_agrees_and_searches_are_listed_with_where_they_stop(here, tmp_path: Path) -> None:
     words = ["argon/crystal-108", "--every-kind", "none", "--pairs", "argon/crystal-108"]
     table = here("ase_comparison", *words, "-o", "a.png")
@@ -163,7 +164,7 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
 
 
 def test_no_table_and_no_row_of_positions_leaves_an_accelerator(tmp_path: Path) -> None:
-    words = ["--sizes", "500", "1372", "--steps", "60", "--json"]
+    words = ["--sizes", "256", "500", "--steps", "60", "--json"]
     made = json.loads(study("accelerator", *words, cwd=tmp_path))["sizes"]
     for one in made:
         # the numbers of a stretch's steps come with it: seven of 128 steps, read once
@@ -330,6 +331,7 @@ def test_calculators_side_by_side(tmp_path: Path) -> None:
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
+@pytest.mark.nightly
 def test_runs_that_locate_crossings_have_the_derivative_of_the_motion(monkeypatch) -> None:
     """A pair that leaves its well through a hard cutoff: its last speed follows from its energy."""
     monkeypatch.syspath_prepend(str(SCRIPTS))

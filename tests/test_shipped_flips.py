@@ -16,6 +16,14 @@ STEPS = {"pair/at-cutoff": 3000, "pair/leaving-well": 900, "argon/crystal-108": 
 WITHOUT_FLIPS = {"silicon/tersoff-512"}
 # one of each kind always; compiling all of them takes minutes
 QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
+# other sizes and shapes of the same kinds, and other many-body potentials
+LIKE_OTHERS = {
+    "argon/crystal-500",
+    "argon/liquid-864",
+    "pair/leaving-well",
+    "silicon/tersoff-512",
+    "copper/eam-500",
+}
 SHORT = {"neighbors.skin": 0.15}
 JAX_MD = {"neighbors.builder": "jax-md", **SHORT}
 SLOW, NIGHTLY = pytest.mark.slow, pytest.mark.nightly
@@ -26,11 +34,17 @@ SLOW, NIGHTLY = pytest.mark.slow, pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "steps", "overrides"),
     [
-        *(pytest.param(name, 12, {}, marks=[SLOW] * (name not in QUICK)) for name in names("md")),
+        *(
+            pytest.param(name, 12, {}, marks=NIGHTLY if name in LIKE_OTHERS else [SLOW] * (name not in QUICK))
+            for name in names("md")
+        ),
         # over several lists
         *(pytest.param(name, 100, SHORT, marks=NIGHTLY) for name in names("md")),
-        *(pytest.param(name, 40, JAX_MD, marks=SLOW) for name in sorted(QUICK)),
-        pytest.param("binary/kob-andersen-1000", 40, JAX_MD, marks=NIGHTLY),
+        pytest.param("argon/crystal-108", 40, JAX_MD, marks=SLOW),
+        *(
+            pytest.param(name, 40, JAX_MD, marks=NIGHTLY)
+            for name in ("argon/tilted-500", "pair/at-cutoff", "binary/kob-andersen-1000")
+        ),
     ],
 )
 def test_flips_are_those_of_the_trajectory(tmp_path, name, steps, overrides):

@@ -609,7 +609,6 @@ def test_odd_values_in_tables_with_right_digests_are_no_traceback(small, tmp_pat
     ("kinds", "damages"),
     [
         (("killed",), 5),
-        pytest.param(("ball",), 5, marks=pytest.mark.slow),
         pytest.param(("killed", "ball"), 30, marks=pytest.mark.nightly),
     ],
 )

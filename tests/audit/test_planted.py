@@ -441,9 +441,12 @@ def test_every_way_is_the_same_structure():
 # -- memory ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("make", "atoms"), [(EMT, bulk("Cu", cubic=True)), (LJ, bulk("Ar", "fcc", a=5.26, cubic=True))]
+    ("make", "atoms"),
+    [
+        pytest.param(EMT, bulk("Cu", cubic=True), marks=pytest.mark.nightly),
+        pytest.param(LJ, bulk("Ar", "fcc", a=5.26, cubic=True), marks=pytest.mark.slow),
+    ],
 )
 def test_ases_own_remember_nothing(make, atoms: Atoms):
     assert not asked("state", make, atoms).findings

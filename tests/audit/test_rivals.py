@@ -21,7 +21,7 @@ from mdnum.verbs.audit import _ask
 #: Without the nightly ones: one of each kind of mistake.
 QUICK = (
     "Embedded in a crystal", "Potential as a slab", "cap by order of 9", "cap of 24, single keys",
-    "last force", "every eighth force", "last atom lost", "left-handed cells", "padded shares", "single sum",
+    "last force", "last atom lost", "left-handed cells", "padded shares", "single sum",
     "pairs at random", "last force and a hard cutoff",
 )  # fmt: skip
 

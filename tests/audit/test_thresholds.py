@@ -193,12 +193,13 @@ ASES_OWN = {
     "eam": (f"eam:EAM(potential={str(COPPER)!r})", "Cu", [(5.50679, 1)]),
     "tersoff": ("tersoff:Tersoff.from_lammps('silicon.tersoff')", "Si", [(2.7, 2), (3.0, 2)]),
 }  # fmt: skip
-LONG = ("tip4p", "eam", "tersoff")
+#: Every night: long ones, and those of which another in the gate has the kind.
+AT_NIGHT = ("tip4p", "eam", "tersoff", "lj", "morse")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in LONG)) for name in ASES_OWN]
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in AT_NIGHT)) for name in ASES_OWN]
 )
 def test_ases_own(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "silicon.tersoff").write_text(SILICON)

@@ -48,7 +48,7 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
     }),
     "fork": ("slow", 1e-6, {"first_contact": [45, 46], "separation_after": 0.12548952}),
     # chaos: the bits of another processor's energy are not the same for long
-    "stiffness": ("slow", 0.05, {
+    "stiffness": ("nightly", 0.05, {
         "energy_semi_implicit": {"1.97": 8.403, "2.02": 12.888}, "limit": 2.0, "limit_measured": 2.0,
         "energy_explicit": {"0.03": 1.6994, "0.32": 22.717, "1.0": 272.09},
     }),
@@ -58,21 +58,21 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         # the derivatives do not add up to the change of the loss
         "mean_gradient": -0.001704695763630632, "secant": -0.00019456988920803247,
     }),
-    "hysteresis": ("slow", 0.0, {
+    "hysteresis": ("nightly", 0.0, {
         "contact_flips_without": 529, "contact_flips_with": 12, "stop_flips_without": 190,
         "stop_flips_with": 0, "orders_disagree_without": 5, "orders_disagree_with": 0,
     }),
-    "per-instance": ("slow", 1e-12, {
+    "per-instance": ("nightly", 1e-12, {
         "iterations_before": {"global sum": [7] * 5, "maximum": [4] * 5, "per instance": [4, 2, 0, 0, 3]},
         "iterations_after": {"global sum": [8] * 5, "maximum": [4] * 5, "per instance": [4, 2, 0, 0, 3]},
         "grad_k": {"global sum": [-0.00084717773437500, -0.00072615234375]},
     }),
-    "implicit": ("slow", 1e-9, {
+    "implicit": ("nightly", 1e-9, {
         "grad_k_unrolled": [-0.45 * n * 0.75 ** (n - 1) / 2 for n in range(14, 95, 16)],
         "iterations": [14, 30, 46, 62, 78, 94], "grad_k_implicit": [0.0] * 6, "depends_on_k": False,
     }),
     # sums of 50 products in another order: counts wander, orders of magnitude do not
-    "tf32-in-solver": ("slow", 0.15, {
+    "tf32-in-solver": ("nightly", 0.15, {
         "iterations_float32": 242, "iterations_tf32": 347, "iterations_bfloat16": 400,
         "iterations_at_condition_100": {"float32": 47, "tf32": 52, "bfloat16": 55},
         "column_inner_iterations": {"float32": 8344, "tf32": 9648, "bfloat16": 15726},
@@ -89,7 +89,7 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         "apart_without_impact": 0.0,
         "saltation_error": {"0.01": 0.39, "0.001": 9.9e-3, "0.0001": 1.4e-3},
     }),
-    "euler-choice": ("slow", 1e-5, {
+    "euler-choice": ("nightly", 1e-5, {
         "dy_dy0_explicit": 3.7304193, "dy_dy0_semi_implicit": -2.96736885, "dy_dy0_exact": -2.69467177,
         "dy_dk_explicit": -0.00869065082, "dy_dk_semi_implicit": 0.0174131148,
         "first_contact_explicit": 47, "first_contact_semi_implicit": 46,
@@ -110,11 +110,11 @@ KNOWN: dict[str, tuple[str, float, dict[str, Any]]] = {
         # the speed with which a ball chatters: v = e (h g - v)
         "speed_left_in_fixed_steps": {h: E / (1 + E) * float(h) * G for h in ("0.01", "0.001")},
     }),
-    "smoothing-width": ("slow", 0.1, {
+    "smoothing-width": ("nightly", 0.1, {
         "minima_hard": 64, "one_minimum_from": 0.02, "gradient_error_hard": 78.6, "order_of_bias": 2.0,
         "minimizer_shift_at_0.1": 0.0318,
     }),
-    "determinism": ("slow", 0.0, {"fingerprints": 1, "processes": 3, "first_contact": 48}),
+    "determinism": ("nightly", 0.0, {"fingerprints": 1, "processes": 3, "first_contact": 48}),
     # a drift of 10 for 0.4 time units over rows of atoms that are 1.11 apart turns the phase 3.6 times
     "complex-order": ("nightly", 2e-3, {
         "crossings": 4, "steps": [14, 42, 70, 98],

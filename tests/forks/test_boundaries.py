@@ -83,7 +83,7 @@ def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):
 
 @pytest.mark.parametrize(
     ("key", "at", "width"),
-    [("sigma", 1.0, 1e-3), ("position.17.y", None, 1e-2)],
+    [("sigma", 1.0, 1e-3), pytest.param("position.17.y", None, 1e-2, marks=pytest.mark.nightly)],
 )
 def test_brute_force_over_all_floats_finds_the_same(key, at, width):
     system, steps = solid(), 30
@@ -103,6 +103,8 @@ def test_brute_force_over_all_floats_finds_the_same(key, at, width):
     assert set(met) <= set(truth) and (len(truth) > 1 or met == truth)
 
 
+# in the gate those of the first test are confirmed in a fresh process
+@pytest.mark.nightly
 @pytest.mark.usefixtures("strangers_folder")
 @pytest.mark.parametrize(
     ("make", "key", "low", "high", "steps"),

@@ -391,11 +391,19 @@ def test_what_has_no_exact_image_is_counted():
     [
         "translate=lattice",
         *(
-            pytest.param(word, marks=pytest.mark.slow)
-            for word in (
-                "order@exact", "skin@exact", "unwrapped", "energy-shift", "order@fixed-point",
-                "relabel@exact", "format=ordered-sparse@exact", "rebuild=every:1@exact", "builder@exact",
+            # of each kind one: a sum, lists, labels; others of the same kinds at night
+            pytest.param(word, marks=mark)
+            for mark, words in (
+                (pytest.mark.slow, ("order@exact", "energy-shift", "order@fixed-point", "relabel@exact")),
+                (
+                    pytest.mark.nightly,
+                    (
+                        "skin@exact", "unwrapped", "format=ordered-sparse@exact", "rebuild=every:1@exact",
+                        "builder@exact",
+                    ),
+                ),
             )
+            for word in words
         ),
     ],
 )  # fmt: skip
@@ -429,7 +437,7 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
 
 
 @pytest.mark.parametrize(
-    ("word", "first_bit"), [("order", 1), pytest.param("order@exact", None, marks=pytest.mark.slow)]
+    ("word", "first_bit"), [("order", 1), pytest.param("order@exact", None, marks=pytest.mark.nightly)]
 )
 def test_lists_of_another_order_are_not_those_of_the_leader(crystal: System, word: str, first_bit):
     """B under A's decisions has B's order of pairs: with A's lists it would be A."""
@@ -544,7 +552,9 @@ def test_the_forces_of_each_format_of_jax_md_are_sums_in_one_order(simulation, r
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize(
+    "format", [pytest.param(one, marks=[pytest.mark.nightly] * (one == "dense")) for one in FORMATS]
+)
 def test_the_choice_adds_in_the_order_of_the_format(simulation, rows, format):
     made = ReorderedSimulation.of(simulation, format)
     assert made.reduction == {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}[format]

@@ -89,7 +89,7 @@ SYSTEMS = {
     "name",
     [
         "cold",
-        pytest.param("continuous", marks=pytest.mark.slow),
+        pytest.param("continuous", marks=pytest.mark.nightly),
         pytest.param("hot", marks=pytest.mark.nightly),
     ],
 )

@@ -114,8 +114,17 @@ class Intensity(StructureFactor):
         return jnp.square(jnp.abs(total / frames))
 
 
-@pytest.mark.parametrize("loss", [StructureFactor(every=3), Intensity(every=3)])
-@pytest.mark.parametrize("name", ["event-aware", "forward", "unrolled"])
+@pytest.mark.parametrize(
+    ("name", "loss"),
+    [
+        ("event-aware", StructureFactor(every=3)),
+        ("forward", StructureFactor(every=3)),
+        ("event-aware", Intensity(every=3)),
+        pytest.param("forward", Intensity(every=3), marks=pytest.mark.nightly),
+        pytest.param("unrolled", StructureFactor(every=3), marks=pytest.mark.nightly),
+        pytest.param("unrolled", Intensity(every=3), marks=pytest.mark.nightly),
+    ],
+)
 def test_a_complex_loss_has_the_derivatives_of_both_parts(smooth, name, loss):
     problem = Problem(smooth, loss, STEPS)
     function = value_and_grad(problem, ("sigma", "timestep"), name)
@@ -143,6 +152,7 @@ def test_a_complex_loss_has_what_the_flips_add_to_both_parts(well):
         np.testing.assert_allclose(gradient[name], 1j * value * slopes[name], rtol=1e-10, atol=1e-14)
 
 
+@pytest.mark.nightly
 def test_an_average_of_a_complex_loss_has_both_parts():
     wide = make(crystal(), LENNARD_JONES, {"kind": "hard", "radius": 2.0})
     simulation, names = build(wide), ("sigma", "r_cut")

@@ -102,7 +102,7 @@ def energy(frame, *_):
     return frame.potential
 
 
-@pytest.mark.parametrize(("w", "every"), [("u", 1), pytest.param("w", 4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("w", "every"), [("u", 1), pytest.param("w", 4, marks=pytest.mark.nightly)])
 def test_what_a_loss_sees_jump_moves_with_the_crossing(well, w, every):
     """Energy and virial jump with the flip: by the radius their averages have no other derivative."""
     simulation, axis = well[0].simulation, well[1]
@@ -215,7 +215,7 @@ def test_bad_input_says_what_would_do(hot):
         next(tangents(RunTape(hot.simulation, hot.loss, STEPS), ("potential.sigma",), saltation=True))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_pair_that_leaves_its_well_agrees_by_every_number():
     """Each coordinate of a free pair is a column; stretched, it starts at another distance."""
     simulation = build("pair/leaving-well")

@@ -78,7 +78,13 @@ BOXES = {
 }
 
 
-@pytest.mark.parametrize("name", BOXES)
+#: The others are parts of these.
+TELLING = ("tilted slab", "cluster", "one bin", "dilute")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name not in TELLING)) for name in BOXES]
+)
 def test_a_search_on_a_device_makes_the_same_table(name, monkeypatch):
     matrix, pbc, r_list, atoms = BOXES[name]
     rng, cell = np.random.default_rng(atoms), Cell.create(matrix, pbc)
@@ -131,7 +137,9 @@ def test_a_thread_that_fails_is_heard_of(monkeypatch):
         neighbor_table(np.random.default_rng(1).uniform(0, 20, (400, 3)), Cell.create([20.0] * 3), 3.0, 64)
 
 
-@pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
+@pytest.mark.parametrize(
+    "bins", [5, 8, 12, *(pytest.param(bins, marks=pytest.mark.nightly) for bins in (6, 7, 10))]
+)
 def test_a_pair_at_the_radius_is_not_lost_between_bins(bins):
     """Bins of exactly half a radius put some pairs at the radius three bins apart by rounding."""
     rng = np.random.default_rng(bins)

@@ -111,10 +111,9 @@ ALWAYS, SLAB, NEVER = (True, True, True), (True, False, True), (False, False, Fa
 #: Formulas are in test_cutoffs: here a program is compiled for each kind and box.
 CASES = [
     ("quintic", ALWAYS, "host", ()),
-    *((kind, ALWAYS, "host", pytest.mark.slow) for kind in ("hard", "switched")),
-    *((kind, ALWAYS, "host", pytest.mark.nightly) for kind in ("shifted", "force-shifted", "cosine")),
-    ("quintic", SLAB, "host", pytest.mark.slow),
-    ("quintic", NEVER, "host", pytest.mark.slow),
+    ("hard", NEVER, "host", pytest.mark.slow),
+    *((kind, ALWAYS, "host", pytest.mark.nightly) for kind in CUTOFFS if kind != "quintic"),
+    *(("quintic", pbc, "host", pytest.mark.nightly) for pbc in (SLAB, NEVER)),
     ("switched", SLAB, "jax-md", (pytest.mark.slow, pytest.mark.jax_md)),
 ]
 
@@ -174,7 +173,11 @@ def shell(shift=0.0):
 
 
 @pytest.mark.parametrize(
-    "compare", [pytest.param(c, marks=pytest.mark.slow if c.startswith("r ") else ()) for c in COMPARISONS]
+    "compare",
+    [
+        pytest.param(c, marks={"r <": pytest.mark.nightly, "r <=": pytest.mark.slow}.get(c, ()))
+        for c in COMPARISONS
+    ],
 )
 def test_at_the_cutoff_the_convention_decides_and_the_energy_follows(tmp_path, compare):
     path = write_system(

@@ -133,7 +133,8 @@ def test_compare_counts_missing_extra_and_borderline():
         assert compare_pairs(np.array(i, int), np.array(j, int), truth, 1.5, 1e-12) == counts
 
 
-@pytest.mark.slow  # most of its time is for the programs of jax-md
+# most of its time is for the programs of jax-md; the golden of `mdnum check pairs` has them all in the gate
+@pytest.mark.nightly
 @pytest.mark.jax_md
 def test_all_agree_on_a_rattled_crystal():
     system = make(crystal(), LENNARD_JONES, HARD)

@@ -91,7 +91,7 @@ def test_a_blind_list_with_too_small_a_skin_loses_pairs_and_the_run_says_so(path
 
 
 @pytest.mark.parametrize(
-    "every, delay, skin", [(1, 0, 0.05), (5, 0, 0.1), pytest.param(2, 6, 0.1, marks=pytest.mark.slow)]
+    "every, delay, skin", [(1, 0, 0.05), (5, 0, 0.1), pytest.param(2, 6, 0.1, marks=pytest.mark.nightly)]
 )
 def test_lists_are_rebuilt_and_dangerous_builds_counted_as_lammps_does(path, tmp_path, every, delay, skin):
     overrides = {"neighbors.skin": skin, "neighbors.rebuild.every": every, "neighbors.rebuild.delay": delay}

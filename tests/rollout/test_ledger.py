@@ -197,7 +197,7 @@ def test_a_free_cloud_that_collapses_makes_its_list_grow_on_the_way(tmp_path):
         (True, (True, True, False)),
         pytest.param(True, (True, True, True), marks=pytest.mark.nightly),
         pytest.param(False, (True, False, False), marks=pytest.mark.nightly),
-        pytest.param(True, (False, False, True), marks=pytest.mark.slow),
+        pytest.param(True, (False, False, True), marks=pytest.mark.nightly),
         pytest.param(False, (False, False, False), marks=pytest.mark.nightly),
     ],
 )
@@ -212,7 +212,7 @@ def test_boxes_of_every_kind(tmp_path, tilt, pbc):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(1, 6))])
 def test_random_mixtures(tmp_path, seed):
     """Two species with cutoffs of their own, any box, any kind of cutoff, any convention."""
     rng = np.random.default_rng(seed)
@@ -345,10 +345,21 @@ def recorded(simulation, rows, steps=60, most=None):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["fluid", pytest.param("binary/kob-andersen-1000", marks=pytest.mark.nightly), "argon/langevin-500"],
+    ("name", "on"),
+    [
+        ("fluid", "device"),
+        ("argon/langevin-500", "host"),
+        *(
+            pytest.param(*one, marks=pytest.mark.nightly)
+            for one in (
+                ("fluid", "host"),
+                ("argon/langevin-500", "device"),
+                ("binary/kob-andersen-1000", "host"),
+                ("binary/kob-andersen-1000", "device"),
+            )
+        ),
+    ],
 )
-@pytest.mark.parametrize("on", ["host", "device"])
 def test_changes_noted_in_the_loop_are_those_of_its_rows(fluid, monkeypatch, name, on):
     system = shaken(fluid, 3, 2.5) if name == "fluid" else load(name)
     if on == "device":

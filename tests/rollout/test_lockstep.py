@@ -45,8 +45,8 @@ def alone(crystal) -> list[tuple[np.ndarray, list[set[int]]]]:
     [
         (CRYSTAL, {}),
         (CRYSTAL, {"neighbors.skin": 0.1}),
-        # all at once, and every night one by one
-        pytest.param("binary/kob-andersen-1000", FLOAT32 | LANGEVIN, marks=pytest.mark.slow),
+        # every night other systems and precisions, all at once and one by one
+        pytest.param("binary/kob-andersen-1000", FLOAT32 | LANGEVIN, marks=pytest.mark.nightly),
         pytest.param("binary/kob-andersen-1000", {}, marks=pytest.mark.nightly),
         pytest.param(CRYSTAL, FLOAT32, marks=pytest.mark.nightly),
         pytest.param("argon/langevin-500", {}, marks=pytest.mark.nightly),

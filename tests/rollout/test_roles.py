@@ -72,11 +72,15 @@ def test_a_wide_decision_on_a_narrow_state_is_the_exact_one(path, tmp_path):
     assert result.summary["energy_budget_closes"]
 
 
+@pytest.fixture(scope="module")
+def wide(path, tmp_path_factory):
+    return go(tmp_path_factory.mktemp("wide"), path, 70, save_every=1)[1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
-def test_one_narrow_role_at_a_time(path, tmp_path, role):
-    result, folder = go(tmp_path / "n", path, 70, {f"precision.{role}": "float32"}, save_every=1)
-    _, wide = go(tmp_path / "w", path, 70, save_every=1)
+def test_one_narrow_role_at_a_time(path, tmp_path, wide, role):
+    result, folder = go(tmp_path, path, 70, {f"precision.{role}": "float32"}, save_every=1)
     assert result.summary["status"] == "complete" and algebra_holds(folder)
     assert result.summary["lost_pairs"] == result.summary["count_mismatches"] == 0
     energies = folder.read("series")["potential"], wide.read("series")["potential"]

@@ -89,16 +89,10 @@ def test_all_checks_together_have_a_limit_of_calls():
     assert all(needed_to(question) & basic for question in ("run", "differentiate"))
 
 
-@pytest.mark.slow
+# of a clean one the gate counts the calls in `test_audit`
+@pytest.mark.nightly
 @pytest.mark.parametrize(
-    "kind",
-    [
-        planted.Good,
-        *(
-            pytest.param(one, marks=pytest.mark.nightly)
-            for one in (planted.ByAppearance, planted.HardEdge, planted.FirstSix, planted.drops(0.02, 0))
-        ),
-    ],
+    "kind", [planted.Good, planted.ByAppearance, planted.HardEdge, planted.FirstSix, planted.drops(0.02, 0)]
 )
 def test_a_whole_audit_of_two_elements_stays_within_its_calls(kind, monkeypatch, tmp_path):
     """Counted by the calculator itself, whatever is wrong with it, its structure included."""

@@ -19,9 +19,9 @@ from mdnum.verbs.flips_shared import TEXTS
 from mdnum.verbs.frame import Outcome
 
 
-def slow(*values: Any) -> Any:
-    """A case that the fast suite leaves out."""
-    return pytest.param(*values, marks=pytest.mark.slow)
+def nightly(*values: Any) -> Any:
+    """A case that the gate leaves out."""
+    return pytest.param(*values, marks=pytest.mark.nightly)
 
 
 def vibrating(
@@ -87,7 +87,7 @@ CASES = [
 
 @pytest.mark.parametrize(("change", "factor", "unit"), CASES)
 @pytest.mark.parametrize(
-    ("pbc", "element", "atoms"), [(True, "Ar", 40), (False, "H", 3), slow((True, True, False), "Au", 200)]
+    ("pbc", "element", "atoms"), [(True, "Ar", 40), (False, "H", 3), nightly((True, True, False), "Au", 200)]
 )
 def test_another_unit_is_found_in_both_directions(
     tmp_path: Path, change: dict[str, float], factor: float, unit: str, pbc: Any, element: str, atoms: int
@@ -101,8 +101,8 @@ def test_another_unit_is_found_in_both_directions(
     assert all(one["flux"] is None for one in found.summary["rules"])
 
 
-@pytest.mark.parametrize("dt", [slow(0.002), 0.02, slow(0.1), 0.5, slow(3.0), 40.0])
-@pytest.mark.parametrize("drift", [slow(0.0), 0.3, slow(3.0)])
+@pytest.mark.parametrize("dt", [nightly(0.002), 0.02, nightly(0.1), 0.5, nightly(3.0), 40.0])
+@pytest.mark.parametrize("drift", [nightly(0.0), 0.3, nightly(3.0)])
 @pytest.mark.parametrize("omega", [2.0, 30.0])
 def test_a_right_file_is_not_accused_at_any_stride(
     tmp_path: Path, dt: float, drift: float, omega: float
@@ -179,7 +179,7 @@ def test_times_that_no_simulation_has(tmp_path: Path, times: float, odd: bool) -
 
 @pytest.mark.parametrize(
     "name",
-    ["velo", *map(slow, ["vel", "velocities", "velocity"]), "v", "Velocities", slow("momentum"), "mom"],
+    ["velo", *map(nightly, ["vel", "velocities", "velocity"]), "v", "Velocities", nightly("momentum"), "mom"],
 )
 def test_a_velocity_column_of_another_name_is_said_to_be_ignored(tmp_path: Path, name: str) -> None:
     frames = vibrating()

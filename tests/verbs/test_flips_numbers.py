@@ -72,9 +72,9 @@ def rows(found: Outcome) -> dict[str, str]:
 PACES = [(0.02, 60, 40), (0.3, 40, 40), (3.0, 30, 24), (50.0, 25, 60)]
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
 @pytest.mark.parametrize(("speed", "frames", "atoms"), PACES)
-@pytest.mark.parametrize("digits", [12, pytest.param(2, marks=pytest.mark.slow), 1])
+@pytest.mark.parametrize("digits", [12, pytest.param(2, marks=pytest.mark.nightly), 1])
 def test_numbers_agree(tmp_path: Path, seed: int, speed: float, frames: int, atoms: int, digits: int) -> None:
     found = examined(
         tmp_path, gas(seed, frames, atoms, speed, digits=digits), cutoffs=[3.1, 2.0], nearest=[4]

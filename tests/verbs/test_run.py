@@ -428,7 +428,7 @@ def test_another_process_compiles_what_the_first_run_calls_and_keeps_it(tmp_path
     assert {"kernel._over_blocks", "kernel._help", "decide._note"} <= kept
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_energy_is_set_beside_that_of_float64(tmp_path):
     smooth = {"cutoff.kind": "quintic"}
     whole, floats = (

@@ -60,7 +60,8 @@ def test_the_pair_whose_second_derivative_overflows_is_named(meeting):
     ("loss", "expected"),
     [
         pytest.param(VelocityAutocorrelation(), (False, True, "", ""), marks=pytest.mark.slow),
-        pytest.param(Custom(see=gone), (True, True, "loss", "div"), marks=pytest.mark.slow),
+        # as in the refusal below
+        pytest.param(Custom(see=gone), (True, True, "loss", "div"), marks=pytest.mark.nightly),
         # a loss that is not finite itself is no fault of the reverse pass
         (Custom(see=lambda frame, *_: jnp.log(jnp.sum(frame.v))), (True, False, "loss", "log")),
     ],

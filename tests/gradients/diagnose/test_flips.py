@@ -111,6 +111,7 @@ def test_boundaries_lie_where_free_flight_puts_them(flying):
         assert abs(beyond - within) > 1e-6 * abs(within) and edge.value_beyond != edge.value_inside
 
 
+@pytest.mark.nightly
 def test_along_the_radius_a_boundary_is_where_the_distance_is(flying):
     found = edges(flying, "r_cut", reach=0.02)
     timestep = float(flying.simulation.integrator.timestep)
