@@ -1,5 +1,26 @@
 """mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
 
+A simulation is made of objects, or of a system file:
+
+    >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
+    >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
+    >>> sim = mdnum.build("argon/liquid-864")
+
+Verbs take either, or the name or path of a system file, and leave a folder:
+
+    run                 simulate, record every flip, compare with ASE
+    fork, fork_...      follow two runs that differ in one choice; maps, certificates, forecasts
+    grad                differentiate a loss of a run in several ways, and judge the derivatives
+    check               compare energies, pairs or a trajectory with other codes, on the spot
+    flips               contacts and flips of anybody's trajectory
+    audit_calculator    is an ASE calculator smooth, invariant and conservative?
+    conform             does a neighbor list find every pair?
+    bounce, demonstrate the same questions about a ball
+
+Nouns: `Simulation`, pair potentials (`LennardJones`, `Morse`, `SoftSphere`, `PairFunction` for one of your
+own), `Cut`, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and `Integrator` to write one),
+`PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and `MdnumCalculator` for ASE.
+
 The names below are imported on first use (PEP 562), because jax takes half a second to import and
 jax_md takes six, and `mdnum --help` needs neither.
 """
@@ -13,6 +34,7 @@ from mdnum.lazy import on_first_use
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from mdnum import gradients as gradients
     from mdnum import systems as systems
     from mdnum.doctor import diagnose as diagnose
     from mdnum.errors import CapacityError as CapacityError
@@ -20,11 +42,29 @@ if TYPE_CHECKING:
     from mdnum.errors import InputError as InputError
     from mdnum.errors import MdnumError as MdnumError
     from mdnum.errors import NumericalError as NumericalError
+    from mdnum.gradients import Problem as Problem
+    from mdnum.gradients import method as method
+    from mdnum.gradients import value_and_grad as value_and_grad
+    from mdnum.md.integrators import Integrator as Integrator
+    from mdnum.md.integrators import KickDrift as KickDrift
+    from mdnum.md.integrators import Langevin as Langevin
+    from mdnum.md.integrators import VelocityVerlet as VelocityVerlet
+    from mdnum.md.potentials import LennardJones as LennardJones
+    from mdnum.md.potentials import Morse as Morse
+    from mdnum.md.potentials import PairFunction as PairFunction
+    from mdnum.md.potentials import PairPotential as PairPotential
+    from mdnum.md.potentials import SoftSphere as SoftSphere
+    from mdnum.numerics.roles import PrecisionPolicy as PrecisionPolicy
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
+    from mdnum.systems.code import allow_code as allow_code
+    from mdnum.systems.construct import Cut as Cut
+    from mdnum.systems.construct import simulation as simulation
+    from mdnum.systems.simulation import Simulation as Simulation
     from mdnum.verbs import audit as _audit
     from mdnum.verbs.ball import bounce as bounce
+    from mdnum.verbs.check import check as check
     from mdnum.verbs.conform import conform as conform
     from mdnum.verbs.demos import demonstrate as demonstrate
     from mdnum.verbs.flips import flips as flips
@@ -46,10 +86,18 @@ __getattr__, __dir__, __all__ = on_first_use(
     {
         "doctor": "diagnose",
         "errors": "CapacityError FolderError InputError MdnumError NumericalError",
+        "gradients": "Problem gradients method value_and_grad",
+        "md.integrators": "Integrator KickDrift Langevin VelocityVerlet",
+        "md.potentials": "LennardJones Morse PairFunction PairPotential SoftSphere",
+        "numerics.roles": "PrecisionPolicy",
         "references": "MdnumCalculator",
         "systems": "build load systems",
+        "systems.code": "allow_code",
+        "systems.construct": "Cut simulation",
+        "systems.simulation": "Simulation",
         "verbs.audit": "audit_calculator=audit",
         "verbs.ball": "bounce",
+        "verbs.check": "check",
         "verbs.conform": "conform",
         "verbs.demos": "demonstrate",
         "verbs.flips": "flips",

@@ -445,8 +445,9 @@ def worst_errors() -> tuple[float, float]:
 
     simulation = build("argon/tilted-500")
     ours, constants = simulation.evaluate(), simulation.potential.constants(0)
+    cell = simulation.structure.cell.array
     energy, forces = _lennard_jones(
-        simulation.positions, simulation.structure.cell.array, r_cut=simulation.r_cut, **constants
+        simulation.positions, cell, constants["sigma"], constants["epsilon"], simulation.r_cut
     )
     force = float(np.max(np.abs(ours.forces - forces)) / np.max(np.abs(forces)))
     return abs(ours.energy - energy) / abs(energy), force

@@ -326,7 +326,7 @@ def test_check_prints_every_record_and_exits_by_agreement(
         assert all(word in out for word in ("first", "last", "1.25", "2.5", "(ε, ε/σ)"))
         assert call("check", "energy", crystal, "--json") == expected
         assert json.loads(capsys.readouterr().out)["ok"] is ok
-    assert asked[0].spec.cutoff.kind == "shifted"
+    assert asked[0].cutoff.name == "shifted"
 
 
 def test_few_records_with_many_parts_stand_side_by_side(capsys: pytest.CaptureFixture[str]):

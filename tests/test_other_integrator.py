@@ -149,9 +149,9 @@ def test_from_a_file_it_is_that_from_objects(site):
     [
         ({"dynamics.relaxation": None}, "relaxation missing"),
         ({"dynamics.temperature": None}, "temperature missing"),
-        ({"dynamics.friction": 1.0}, "unknown friction; it has relaxation"),
+        ({"dynamics.friction": 1.0}, "unknown friction"),
         ({"dynamics.kind": "nose-hover"}, "unknown dynamics kind 'nose-hover'"),
-        ({"dynamics.kind": "broken"}, "integrator 'broken' of package strange-steps cannot be used"),
+        ({"dynamics.kind": "broken"}, "package strange-steps"),
     ],
 )
 def test_a_file_that_does_not_fit_it_is_refused(site, tmp_path, changes, message):
@@ -265,14 +265,12 @@ def test_every_other_method_refuses_it_by_name():
     for other in (problem, replace(problem, simulation=squeezed)):
         name = other.simulation.integrator.name
         for word in ("symmetric", "event-aware", "forward", "surrogate", "boundary", "reweighting"):
-            with pytest.raises(
-                InputError, match=f"{name} is another; the method unrolled differentiates any"
-            ):
+            with pytest.raises(InputError, match=rf"{name} .*unrolled"):
                 method(word)(other, names)
         with pytest.raises(InputError, match=f"{name} is another"):
             spectrum(other)
     whole: Any = {"precision": {"state": "lattice"}}
-    with pytest.raises(InputError, match="steps of nve and langevin, and none of nose"):
+    with pytest.raises(InputError, match=r"nve .*langevin, .*nose"):
         method("reversible")(Problem(held(**whole), everything(108), 10), names)
     with pytest.raises(InputError, match="none of nose-hoover"):
         first_state(held(**whole))

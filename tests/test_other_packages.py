@@ -61,9 +61,10 @@ class Slower(Choice):
         return f"slower={self.share}"
 
     def make(self, system):
-        key = "dynamics.timestep" if hasattr(system.spec, "dynamics") else "integrator.timestep"
-        table = system.spec.dynamics if hasattr(system.spec, "dynamics") else system.spec.integrator
-        return twin(system, {key: table.timestep * (1 + float(self.share))}, self.name, self.name)
+        is_ball = hasattr(system, "balls")
+        key = "integrator.timestep" if is_ball else "dynamics.timestep"
+        own = system.spec.integrator if is_ball else system
+        return twin(system, {key: own.timestep * (1 + float(self.share))}, self.name, self.name)
 '''
 METHOD = """
 import numpy as np
@@ -148,6 +149,15 @@ def test_a_choice_of_both_worlds(site, name):
     ((before, after),) = made.changes.values()
     assert after == pytest.approx(1.001 * before, rel=1e-12)
     assert "slower=1e-6" in shipped("md") and "slower=1e-6" in shipped("ball")
+
+
+def test_a_choice_that_reads_a_system_file_says_what_it_is_given(site, monkeypatch):
+    from mdnum.forks.choices.base import parse, twin_of
+
+    choice = parse("slower=1e-3")
+    monkeypatch.setattr(type(choice), "make", lambda self, system: system.spec.dynamics)
+    with pytest.raises(InputError, match=r"strange_choice.* Simulation.*extending\.md"):
+        twin_of(choice, mdnum.load("pair/at-cutoff"))
 
 
 def test_a_gradient_method(site):

@@ -108,7 +108,8 @@ def changed(
         file, colon, name = potential.rpartition(":")
         function = f"{Path(file).resolve()}{colon}{name}"
         overrides = {"potential.kind": "python", "potential.function": json.dumps(function), **overrides}
-    return {"overrides": overrides, "allow_code": allow_code or potential is not None}
+    allowed = {"allow_code": True} if allow_code or potential is not None else {}
+    return {"overrides": overrides, **allowed}
 
 
 def of_a_folder(

@@ -6,7 +6,7 @@ import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,6 +18,13 @@ import mdnum.numerics  # noqa: F401 (float64 must be on before the first array e
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import AtCutoff, Cutoff
 from mdnum.registry import Registry
+
+if TYPE_CHECKING:
+    PerType = Any
+else:
+    #: A constant of a pair potential: as a person gives it one number, or one for each pair of species; in a
+    #: simulation an array with one entry per pair type.
+    PerType = Float[Array, "types"] | float | int | Mapping[str, float]
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
@@ -67,11 +74,16 @@ class PairPotential(eqx.Module):
 
 
 class LennardJones(PairPotential):
-    """4 epsilon ((sigma/r)^12 - (sigma/r)^6)."""
+    """4 epsilon ((sigma/r)^12 - (sigma/r)^6); sigma: length, epsilon: energy.
+
+    Example:
+        >>> LennardJones(sigma=3.405, epsilon=0.0103235)
+        >>> LennardJones(sigma={"Ar-Ar": 3.405, "Ar-Kr": 3.5, "Kr-Kr": 3.6}, epsilon=0.0103235)
+    """
 
     name = "lennard-jones"
-    sigma: Float[Array, "types"]  # length, shape (types,)
-    epsilon: Float[Array, "types"]  # energy, shape (types,)
+    sigma: PerType  # length, shape (types,)
+    epsilon: PerType  # energy, shape (types,)
 
     def evaluate(self, r2):
         inverse = 1 / r2
@@ -81,13 +93,17 @@ class LennardJones(PairPotential):
 
 
 class Morse(PairPotential):
-    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0)))."""
+    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0))); energy, one over length, length.
+
+    Example:
+        >>> Morse(depth=0.3429, alpha=1.3588, r0=2.866)
+    """
 
     name = "morse"
     # depth: energy; alpha: 1/length; r0: length; each of shape (types,)
-    depth: Float[Array, "types"]
-    alpha: Float[Array, "types"]
-    r0: Float[Array, "types"]
+    depth: PerType
+    alpha: PerType
+    r0: PerType
 
     def evaluate(self, r2):
         r = jnp.sqrt(r2)
@@ -96,13 +112,17 @@ class Morse(PairPotential):
 
 
 class SoftSphere(PairPotential):
-    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside."""
+    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside; length, energy, exponent above 1.
+
+    Example:
+        >>> SoftSphere(sigma=1.0, epsilon=1.0, alpha=2.0)
+    """
 
     name = "soft-sphere"
     # sigma: length; epsilon: energy; alpha: exponent above 1; each of shape (types,)
-    sigma: Float[Array, "types"]
-    epsilon: Float[Array, "types"]
-    alpha: Float[Array, "types"]
+    sigma: PerType
+    epsilon: PerType
+    alpha: PerType
 
     def evaluate(self, r2):
         r = jnp.sqrt(r2)

@@ -60,11 +60,12 @@ def simulation(
     potential: PairPotential | ManyBody,
     cutoff: Cut | None = None,
     *,
-    timestep: float,
+    timestep: float | None = None,
     units: str = "metal",
     temperature: float = 0.0,
     friction: float | None = None,
-    integrator: Integrator | None = None,
+    integrator: Integrator | type[Integrator] | None = None,
+    dynamics: Mapping[str, Any] | None = None,
     seed: int = 0,
     remove_drift: bool = True,
     drawn: bool | None = None,
@@ -91,11 +92,13 @@ def simulation(
         potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; or one of
             `mdnum.md.manybody`.
         cutoff: of a pair potential; one of many bodies has its own.
-        timestep: in ps, or in reduced time.
+        timestep: in ps, or in reduced time; not beside an integrator that has one.
         units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
         temperature: of velocities that are drawn, and of a thermostat.
         friction: of Langevin dynamics, one over time; default constant energy.
-        integrator: another one; its numbers are in internal time, length * sqrt(mass / energy).
+        integrator: another class of integrators, or one of them, whose numbers are internal (time is length *
+            sqrt(mass / energy)).
+        dynamics: further numbers of such a class, by the keys and in the units of a system file.
         seed: of drawn velocities and of a thermostat's noise.
         remove_drift: whether the velocity of the center of mass is taken out at the start.
         drawn: whether velocities are drawn; default where the atoms have no momenta.
@@ -129,10 +132,12 @@ def simulation(
     skin = DEFAULT_SKIN[units] if skin is None else float(skin)
     sigmas = np.asarray(model.potential.leaves.get("sigma", ())).tolist() if pairwise else ()
     check(atoms, r_cut, skin, smallest_distance(potential.name, units, sigmas), system.length)
-    if integrator is None:
-        kind = VelocityVerlet if friction is None else Langevin
+    if not isinstance(integrator, Integrator):
+        if timestep is None:
+            raise InputError("no time step", where=name, remedy="Add timestep=...")
+        kind = integrator or (VelocityVerlet if friction is None else Langevin)
         numbers = {"timestep": timestep, "friction": friction, "temperature": temperature, "seed": seed}
-        integrator = kind.of_file(numbers, system)
+        integrator = kind.of_file({**numbers, **(dynamics or {})}, system)
     drawn = not atoms.has("momenta") if drawn is None else drawn
     return assembled(
         Origin(name, about), atoms, system, model, "r <" if cutoff is None else cutoff.compare,

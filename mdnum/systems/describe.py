@@ -6,6 +6,7 @@ The tables and keys are those of a system file, whether there was one or not.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,11 @@ def described(simulation: Simulation) -> dict[str, Any]:
         "about": simulation.origin.about,
         "units": simulation.units.name,
         "structure": {"formula": simulation.structure.get_chemical_formula(), "digest": _start(simulation)},
-        "potential": {"kind": simulation.potential.name, **_constants(simulation)},
+        "potential": {
+            "kind": simulation.potential.name,
+            **_constants(simulation),
+            **_code(getattr(simulation.potential, "function", None)),
+        },
         "cutoff": _cutoff(simulation),
         "neighbors": {
             "skin": rule.skin,
@@ -167,6 +172,19 @@ def _constants(simulation: Simulation) -> dict[str, Any]:
         for path, leaf in leaves
         if eqx.is_array_like(leaf)
     }
+
+
+def _code(function: Any) -> dict[str, Any]:
+    """The text of a function that a person wrote, and its digest; where there is no text, its code's."""
+    if function is None:
+        return {}
+    try:
+        source = inspect.cleandoc(inspect.getsource(function))
+    except (OSError, TypeError):
+        source = ""
+    compiled = getattr(function, "__code__", None)
+    hashed = source.encode() or repr(compiled and (compiled.co_code, compiled.co_consts)).encode()
+    return {"code": {"source": source, "sha256": hashlib.sha256(hashed).hexdigest()}}
 
 
 def _cutoff(simulation: Simulation) -> dict[str, Any] | None:
