@@ -77,7 +77,7 @@ def run() -> Demo:
     high, low = (np.array([p.value({EPSILON: 1 + h}) for p in problems]) for h in (1e-5, -1e-5))
     g = np.array([jax.grad(jnp.abs)(one) for one in jnp.asarray(z)])
     real = (np.abs(high) - np.abs(low)) / 2e-5
-    off, wrong = (float(np.max(np.abs((one * dz).real / real - 1))) for one in (g, np.conj(g)))
+    off, wrong = (float(np.max(np.abs(np.real(one * dz) / real - 1))) for one in (g, np.conj(g)))
     rows = [row for part in Engine(simulation, STEPS).segments() for row in np.array(part.rows_of("x"))]
     peak = np.array([losses[0].z(row)[1] for row in np.array(rows)])
     ledger = cuts(peak, float(gamma(1000, np.dtype(float))))
@@ -85,7 +85,7 @@ def run() -> Demo:
     turned, turns = float(phase[-1] - phase[0]) / (2 * np.pi), SPEED * DT * STEPS / A
     slopes = [jax.grad(f) for f in (jnp.abs, jnp.angle, lambda z: z.real / jnp.abs(z))]
     near = [(abs(r), *(f"{abs(complex(f(r))):.3g}" for f in slopes)) for r in (1j, 1e-8j, 1e-200j, 0j)]
-    rows = list(zip(NAMES, *np.abs([z, g]).tolist(), (g * dz).real.tolist(), real.tolist(), strict=True))
+    rows = list(zip(NAMES, *np.abs([z, g]).tolist(), np.real(g * dz).tolist(), real.tolist(), strict=True))
     return Demo(
         title="Order parameters are complex numbers",
         question="How do |psi6|, |S(k)| and the phase of S(k) of a crystal depend on epsilon through a run?",

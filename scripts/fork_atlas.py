@@ -44,7 +44,7 @@ from mdnum.forks.choices import Choice, parse, shipped, twin_or_reason
 from mdnum.forks.worlds import varied
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.numerics.verdicts import REPEATS
-from mdnum.systems import System, load
+from mdnum.systems import Simulation, System, load
 
 KINDS = ("hard", "shifted", "force-shifted", "switched")
 SYSTEMS = ("argon/crystal-108", "liquid:256", "argon/tilted-500")
@@ -143,7 +143,7 @@ def system_of(word: str) -> System:
     return system
 
 
-def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, repeats: int) -> Cell:
+def cell_of(system: Simulation, word: str, kind: str, choice: Choice, steps: int, repeats: int) -> Cell:
     """Follow one choice; an error is a cell, too."""
     begun = time.perf_counter()
 

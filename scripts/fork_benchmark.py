@@ -90,9 +90,9 @@ def single(system: System) -> Callable[[int], None]:
 
 def triple(system: System) -> Callable[[int], None]:
     """Two runs and the counterfactual, compared step by step."""
-    from mdnum.forks.choices import parse
+    from mdnum.forks.choices import parse, twin_of
 
-    twin = parse("start").make(system)
+    twin = twin_of(parse("start"), system)
 
     def run(steps: int) -> None:
         for _ in twin.a.lockstep(twin.b, steps, forward=True, back=False, guard=None):

@@ -30,7 +30,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.forks import Fork, fork
-from mdnum.forks.choices import parse, twin_or_reason
+from mdnum.forks.choices import parse, twin_of, twin_or_reason
 from mdnum.numerics import reductions
 from mdnum.systems import Simulation, System, load
 
@@ -53,8 +53,8 @@ def force_error(simulation: Simulation, exact: np.ndarray) -> float:
 
 def study(system: System, word: str, steps: int) -> Row:
     """Compare one reduction with the system's own, and with itself in another order."""
-    exact = parse("order@exact").make(system).a.simulation.evaluate().forces
-    shuffled = fork(parse(f"order@{word}").make(system), min(steps, 100), counterfactual=False)
+    exact = twin_of(parse("order@exact"), system).a.simulation.evaluate().forces
+    shuffled = fork(twin_of(parse(f"order@{word}"), system), min(steps, 100), counterfactual=False)
     own = shuffled.twin.a.simulation
     twin = twin_or_reason(parse(f"reduction={word}"), system)
     found = None if isinstance(twin, str) else fork(twin, steps, counterfactual=False)

@@ -40,7 +40,7 @@ from ase.build import bulk
 from scipy.stats import beta
 
 from mdnum.forks import fork
-from mdnum.forks.choices import parse
+from mdnum.forks.choices import parse, twin_of
 from mdnum.forks.pair import SPLIT, displacements
 from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, count, growth, judge
 from mdnum.rollout.engine import Engine
@@ -119,7 +119,7 @@ def gather(made: System, share: float, unseen: int) -> dict[str, np.ndarray]:
         share: the split tolerance over the cutoff.
         unseen: repeats for the truth, at either displacement, where the runs split either way.
     """
-    twin = parse("precision").make(made)
+    twin = twin_of(parse("precision"), made)
     found = fork(twin, STEPS, split=share * twin.a.scale, back=False)
     sizes = displacements(found)
     truth: list[list[Delay]] = [[], []]
@@ -144,7 +144,7 @@ def _rows(delays: Sequence[Delay]) -> np.ndarray:
 
 def scan(made: System) -> list[tuple[object, ...]]:
     """Displacement of the starts, delayed repeats, repeats, and the median of their free splits."""
-    twin = parse("precision").make(made)
+    twin = twin_of(parse("precision"), made)
     found = fork(twin, STEPS, back=False, repeats=0)
     fit = found.growth["B"]
     rows: list[tuple[object, ...]] = [("the pair", "–", 1, found.dates.split or -1)]

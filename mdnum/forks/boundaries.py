@@ -20,6 +20,7 @@ from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program
 from mdnum.systems import BallSystem
+from mdnum.systems.load import opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
@@ -230,6 +231,7 @@ def boundaries(
     most = (MOST_BALL if isinstance(system, BallSystem) else MOST) if most is None else most
     if cells < 1 or most < 1:
         raise InputError(f"cells = {cells} and most = {most}; expected at least 1")
+    system = opened(system)
     program = program_of(system, steps)
     last = program.steps if steps is None else steps
     if last < 1:

@@ -13,7 +13,7 @@ from mdnum.forks.worlds import changes, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry, nearest
-from mdnum.systems import BallSystem
+from mdnum.systems import BallSystem, System
 from mdnum.systems.load import opened, world_of
 
 if TYPE_CHECKING:
@@ -126,13 +126,13 @@ def shipped(world: str) -> dict[str, Choice]:
     return {choice.name: choice for kind in kinds for choice in of_family(kind)}
 
 
-def unavailable(choice: Choice, system: Simulation | BallSystem) -> str | None:
+def unavailable(choice: Choice, system: Simulation | System | BallSystem) -> str | None:
     """Why a choice does not apply to a system; None where it does."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 
 
-def twin_or_reason(choice: Choice, system: Simulation | BallSystem) -> Twin | str:
+def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> Twin | str:
     """The two programs of a choice, or why it does not apply to the system."""
     if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
@@ -150,7 +150,7 @@ def twin_or_reason(choice: Choice, system: Simulation | BallSystem) -> Twin | st
         return error.message.removeprefix(f"variant {choice.name!r}: ")
 
 
-def twin_of(choice: Choice, system: Simulation | BallSystem) -> Twin:
+def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
     """The two programs of a choice.
 
     Raises:
