@@ -27,7 +27,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.forks import Fork, fork
-from mdnum.forks.choices import Choice, parse
+from mdnum.forks.choices import Choice, parse, twin_of
 from mdnum.systems import System, load
 
 ROLES = ("accumulate", "decision", "force", "state", "all but state")
@@ -76,7 +76,7 @@ def main() -> None:
     found = {}
     for role in chosen.roles:
         say(f"{system.name}: {role} in float32")
-        found[role] = fork(choice_of(role).make(system), chosen.steps, repeats=chosen.repeats, back=False)
+        found[role] = fork(twin_of(choice_of(role), system), chosen.steps, repeats=chosen.repeats, back=False)
     tolerance = next(iter(found.values())).tolerance
     table(
         f"{system.name}, {len(system.atoms)} atoms, {chosen.steps} steps, split at {tolerance:.3g} "
