@@ -60,8 +60,8 @@ _CHECKED = [
     "mdnum.trajectories",
     "mdnum.doctor",
 ]
-# The checks take a fifth of the time of a test that does not compile, and a user's run has none: CI makes its
-# first call with them and its second without.
+# The checks take a quarter of the time, and a user's run has none: a plain pytest has them, and the nightly;
+# the gate has not.
 if os.environ.get("MDNUM_TEST_TYPES") != "off":
     typing_rules.keep_numba_whole()
     typing_rules.check_lazily()

@@ -12,7 +12,17 @@ from mdnum.safe_path import environment, python
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+#: Its path through the package is that of tests/systems/test_objects.py.
+_LONG = ("morse",)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.nightly] * (path.stem in _LONG))
+        for path in EXAMPLES
+    ],
+)
 def test_an_example_runs_and_says_something(path, tmp_path):
     assert len(path.read_text().splitlines()) < 50
     done = subprocess.run(

@@ -220,7 +220,7 @@ def test_it_is_forked_with_a_counterfactual(site, tmp_path):
 NAMES = ("potential.sigma", "dynamics.timestep", "dynamics.temperature", "dynamics.relaxation", "box.scale")
 
 
-@pytest.mark.parametrize("kind", [NoseHoover, PerAtom])
+@pytest.mark.parametrize("kind", [NoseHoover, pytest.param(PerAtom, marks=pytest.mark.nightly)])
 def test_unrolled_differentiates_through_its_state(kind):
     """Against central differences of the run; what the state is begun with counts too."""
     problem = Problem(held(kind, timestep=0.01), everything(108), 40)

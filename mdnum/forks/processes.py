@@ -32,7 +32,7 @@ from jaxtyping import Float
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks.worlds import program_of, varied
 from mdnum.safe_path import environment, python
-from mdnum.systems import BallSystem
+from mdnum.systems import BallSystem, System
 from mdnum.systems.code import allow_code, is_allowed
 from mdnum.systems.load import opened
 
@@ -154,7 +154,11 @@ def variants(
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {"path": _written(system, folder), "steps": steps, "code": is_allowed()}
+        question = {
+            "path": str(in_a_file(system).write(folder / "system")),
+            "steps": steps,
+            "code": is_allowed(),
+        }
         done, count = 0, Lock()
 
         def ran(k: int) -> tuple[Ran, np.ndarray | None]:
@@ -382,7 +386,12 @@ def digests_elsewhere(
         progress(0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {"path": _written(system, folder), "key": key, "steps": steps, "code": is_allowed()}
+        question = {
+            "path": str(in_a_file(system).write(folder / "system")),
+            "key": key,
+            "steps": steps,
+            "code": is_allowed(),
+        }
         asked = [value.hex() for value in values]
         failed = _ask({**question, "values": asked}, folder / "question.json", heard)
     if failed or len(found) != len(asked):
@@ -393,16 +402,20 @@ def digests_elsewhere(
     return found
 
 
-def _written(system: Simulation | BallSystem, scratch: Path) -> str:
-    """The file from which another process makes a system again, bit for bit.
+def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
+    """What another process can read and make again, bit for bit.
 
     Raises:
         InputError: it was made of objects, which are in this process only.
     """
     own = system if isinstance(system, BallSystem) else system.file
     if own is None:
-        raise InputError("objects of this process cannot be made again by another", where=system.name)
-    return str(own.write(scratch / "system"))
+        raise InputError(
+            "objects of this process cannot be made again by another",
+            where=system.name,
+            remedy="Ask it of a system file",
+        )
+    return own
 
 
 # --- asking and answering -----------------------------------------------------------------------------

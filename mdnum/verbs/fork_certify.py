@@ -290,9 +290,10 @@ def fork_processes(
         FolderError: the folder cannot be used.
         MdnumError: not one of the variants ran.
     """
-    from mdnum.forks.processes import VARIANTS, variants
+    from mdnum.forks.processes import VARIANTS, in_a_file, variants
 
     loaded = of_md(system, keep.get("overrides"), "processes", pairwise=True)
+    in_a_file(loaded)
     last, asked = last_step(loaded, steps, PROGRAM_STEPS), VARIANTS if which is None else tuple(which)
     with frame.answering("processes", f"fork-{loaded.name}", loaded, **keep) as answer:
 

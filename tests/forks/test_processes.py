@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from rollout.harness import furthest, history
 
+import mdnum
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks import processes
 from mdnum.forks.processes import (
@@ -20,7 +21,7 @@ from mdnum.forks.processes import (
     variants,
 )
 from mdnum.systems.build import build
-from mdnum.systems.load import System, load
+from mdnum.systems.simulation import Simulation
 from mdnum.verbs.fork_certify import _cause
 
 # processes of their own
@@ -28,8 +29,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def crystal() -> System:
-    return load("argon/crystal-108", world="md")
+def crystal() -> Simulation:
+    return build("argon/crystal-108")
 
 
 def ran(name: str, hashes: str, first_bit: int | None = None) -> Ran:
@@ -73,19 +74,17 @@ def test_the_pattern_of_agreement_tells_the_cause(rows, causes):
     assert all(_cause(**cause) for cause in found)
 
 
-def test_a_program_is_the_trajectory_of_the_rollout_up_to_rounding(crystal: System):
-    simulation = build(crystal)
-    ours, _ = history(simulation, 30)
+def test_a_program_is_the_trajectory_of_the_rollout_up_to_rounding(crystal: Simulation):
+    ours, _ = history(crystal, 30)
     for program in ("scan", "rollout", "vmap"):
         x = positions_of(crystal, 30, program)
         assert x.shape == (30, 3, 108)
-        assert furthest(simulation, x.transpose(0, 2, 1), ours[1:]).max() < 1e-13
+        assert furthest(crystal, x.transpose(0, 2, 1), ours[1:]).max() < 1e-13
 
 
 def test_a_program_ends_before_its_list_is_used_up():
-    liquid = load("argon/liquid-864", {"neighbors.skin": 0.1}, world="md")
-    x = positions_of(liquid, 120, "rollout")
-    simulation = build(liquid)
+    simulation = build("argon/liquid-864", {"neighbors.skin": 0.1})
+    x = positions_of(simulation, 120, "rollout")
     moved = furthest(simulation, x.transpose(0, 2, 1), simulation.positions)
     assert 0 < len(x) < 120
     # twice the skin that was asked for, half of it used
@@ -93,7 +92,7 @@ def test_a_program_ends_before_its_list_is_used_up():
 
 
 @pytest.mark.usefixtures("strangers_folder")
-def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: System):
+def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: Simulation):
     told: list[tuple[int, int]] = []
     known = {variant.name: variant for variant in VARIANTS}
     which = (
@@ -120,13 +119,17 @@ def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: System):
     assert not any("bogus" in names for names in found.clusters)
 
 
-def test_what_cannot_be_run_is_refused(crystal: System, monkeypatch: pytest.MonkeyPatch):
+def test_what_cannot_be_run_is_refused(crystal: Simulation, tmp_path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(InputError, match="many-body"):
-        variants(load("silicon/tersoff-512", world="md"))
+        variants(build("silicon/tersoff-512"))
     with pytest.raises(InputError, match=r"steps = 0: .*one step"):
         variants(crystal, 0)
     with pytest.raises(InputError, match=r"steps = 10: .*one variant"):
         variants(crystal, 10, [])
+    # another process has none of the objects of this one
+    with pytest.raises(InputError, match="objects"):
+        mdnum.fork_processes(crystal.with_cutoff("quintic"), steps=2, out=tmp_path / "of-objects")
+    assert not (tmp_path / "of-objects").exists()
     monkeypatch.setattr(processes, "_ask", lambda *_, **options: "no such flag")
     with pytest.raises(MdnumError, match=r"'bogus'.*: no such flag"):
         variants(crystal, 2, [Variant("bogus")])
