@@ -425,7 +425,7 @@ class KeptRounds(Kept):
         # it says so; nothing is rounded; half precision is no single one
         ("declared", "", None),
         ("rounds_nothing", "", None),
-        pytest.param("rounds_too_much", "", "error", marks=pytest.mark.slow),
+        pytest.param("rounds_too_much", "", "error", marks=pytest.mark.nightly),
     ],
 )
 def test_a_list_that_rounds_positions_to_float32_is_a_warning(

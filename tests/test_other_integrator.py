@@ -279,6 +279,7 @@ def test_every_other_method_refuses_it_by_name():
         first_state(replace(nve, integrator=Slower(jnp.float64(0.004))))
 
 
+@pytest.mark.nightly
 def test_a_linear_drift_of_its_own_is_differentiated_by_all():
     simulation = replace(held(), integrator=Slower(jnp.float64(0.004)))
     problem = Problem(simulation, everything(108), 30)

@@ -163,6 +163,7 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     assert is_png(tmp_path / "b.png")
 
 
+@pytest.mark.nightly
 def test_no_table_and_no_row_of_positions_leaves_an_accelerator(tmp_path: Path) -> None:
     words = ["--sizes", "256", "500", "--steps", "60", "--json"]
     made = json.loads(study("accelerator", *words, cwd=tmp_path))["sizes"]

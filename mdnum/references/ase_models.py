@@ -49,6 +49,9 @@ from mdnum.systems import System
 from mdnum.systems.build import model_of
 from mdnum.systems.simulation import Simulation
 
+#: Label of the judge of a pair function that a person wrote.
+ITSELF = "the function itself on ASE's neighbor list"
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -117,7 +120,7 @@ def independent(subject: Simulation | System) -> Reference:
     own = pairwise and isinstance(model.potential, PairFunction)
     make_model = (lambda: PairModel(pair_forms(model, species, compare))) if pairwise else models[model.name]
     return Reference(
-        f"{'the function itself' if own else 'plain numpy'} on ASE's neighbor list",
+        ITSELF if own else "plain numpy on ASE's neighbor list",
         False,
         "none: the function, called pair by pair outside of the loop" if own
         else "none: the formulas of the system file, written a second time",

@@ -27,7 +27,7 @@ from mdnum.systems.structures import species_of
 if TYPE_CHECKING:
     from ase import Atoms
 
-_CHANGE_OBJECTS = "Change the objects: mdnum.parameters.changed(simulation, {...})"
+_CHANGE_OBJECTS = "Change the objects: mdnum.systems.parameters.changed(simulation, {...})"
 
 
 def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, "types"]:

@@ -131,6 +131,8 @@ def test_an_own_morse_has_the_ledger_and_the_verdicts_of_the_one_here(tmp_path):
     assert all(np.array_equal(ledgers[0][key], ledgers[1][key]) for key in ledgers[0])
     codes = [[one.code for one in run.verdict.findings if one.code != "NOT_ASE"] for run in runs]
     assert codes[0] == codes[1]
+    (judged,) = [one for one in runs[0].verdict.findings if one.code == "NOT_ASE"]
+    assert "itself" in judged.text
     assert runs[0].summary["ase"]["ok"] and runs[0].summary["ase"]["energy_rel"] < 1e-14
     assert runs[0].summary["energy_budget_closes"]
     assert forks[0].summary["effect"] == forks[1].summary["effect"]

@@ -118,7 +118,7 @@ def test_a_split_between_two_frames_loses_nothing(water, parts):
     np.testing.assert_array_equal(whole.times, split.times)
 
 
-@pytest.mark.parametrize("backend", ["multiprocessing", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["multiprocessing", pytest.param("dask", marks=pytest.mark.nightly)])
 def test_other_processes_find_the_same_to_the_last_bit(backend):
     def group():
         made = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD)

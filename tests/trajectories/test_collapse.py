@@ -249,6 +249,7 @@ def test_a_box_that_shrinks_takes_its_atoms_along():
     assert len(list(checked(frames))) == 4
 
 
+@pytest.mark.nightly
 def test_what_was_good_before_a_coordinate_overflowed_is_kept(tmp_path):
     path = DATA / "overflowed_coordinate.extxyz"
     found = mdnum.flips(path, cutoffs=[5.0], out=tmp_path / "a", report=False)
