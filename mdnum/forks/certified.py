@@ -30,7 +30,7 @@ from mdnum.numerics.rounding import unit_roundoff
 from mdnum.program import Twin
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
-from mdnum.systems.describe import described
+from mdnum.systems.describe import program
 from mdnum.systems.simulation import Simulation
 
 #: Ambiguous decisions that are listed; the count covers all of them.
@@ -131,7 +131,7 @@ def wider(twin: Twin) -> str | None:
 
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
     """What must be the same in a program and its shadow."""
-    tables = described(run)
+    tables = program(run)
     tables["precision"] = {key: value for key, value in tables["precision"].items() if key not in ROLES["md"]}
     return tables, repr(run.reduction)
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.integrators import Integrator, converted
+from mdnum.md.manybody import leaves_by_path
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.registry import nearest
 from mdnum.systems.simulation import Simulation
@@ -85,13 +86,8 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
     return replace(force, potential=_with_quantities(force.potential, values))
 
 
-def _leaves_by_path(potential: Any) -> dict[str, Any]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-
-
 def _quantities_of(potential: Any) -> dict[str, Any]:
-    found = {name: leaf for name, leaf in _leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
+    found = {name: leaf for name, leaf in leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
     for field in fields(potential):
         value = getattr(potential, field.name)
         # constants that a formula holds; the radius of a table is where it ends, and not one of them
@@ -101,7 +97,7 @@ def _quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def _with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    names, tree = list(_leaves_by_path(potential)), jax.tree.structure(potential)
+    names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)
     # constants are static fields, so that a module would warn of an array; here they only live for a trace
@@ -204,7 +200,7 @@ class _Constant(Parameter):
         return np.array(_quantities_of(self.simulation.model)[self.key], np.float64)
 
     def changed(self, new):
-        constant = self.key not in _leaves_by_path(self.simulation.model)
+        constant = self.key not in leaves_by_path(self.simulation.model)
         value = float(new) if constant else jnp.asarray(new)
         model: Any = _with_quantities(self.simulation.model, {self.key: value})
         # its radius may follow

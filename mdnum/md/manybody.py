@@ -103,6 +103,12 @@ class ManyBody(eqx.Module):
 _UNIT = 2.0**24
 
 
+def leaves_by_path(potential: Any) -> dict[str, Any]:
+    """The arrays of a potential by where they are in it, such as "pair.values"."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
 class StillingerWeber(ManyBody):
     """Two- and three-body potential for tetrahedral semiconductors.
 

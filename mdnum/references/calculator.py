@@ -19,7 +19,7 @@ from mdnum.references.independent import ClassicalCalculator
 from mdnum.systems import System
 from mdnum.systems.build import interaction, model_of
 from mdnum.systems.construct import Cut, cut, of_atoms, with_atoms
-from mdnum.systems.describe import described
+from mdnum.systems.describe import program
 from mdnum.systems.evaluate import Evaluator
 from mdnum.systems.schema import DEFAULT_SKIN
 from mdnum.systems.simulation import Simulation
@@ -41,7 +41,7 @@ class _Recipe(NamedTuple):
 
 def _recipe(system: Any, overrides: Any, potential: Any, cutoff: Any, unit: str) -> _Recipe:
     if isinstance(system, Simulation):
-        tables = {key: table for key, table in described(system).items() if key in _SAID}
+        tables = {key: table for key, table in program(system).items() if key in _SAID}
         return _Recipe(
             lambda atoms: with_atoms(system, atoms, 0.0), system.rule.skin, tables, system.pairwise
         )
@@ -72,7 +72,7 @@ def _recipe(system: Any, overrides: Any, potential: Any, cutoff: Any, unit: str)
         raise InputError(message, where="MdnumCalculator")
     if not pairwise:
         return _Recipe(
-            lambda atoms: of_atoms(atoms, replace(potential, pbc=tuple(map(bool, atoms.pbc))), units=unit),
+            lambda atoms: of_atoms(atoms, potential, units=unit),
             skin,
             tables,
             False,

@@ -12,14 +12,13 @@ from jaxtyping import Float
 from pydantic import TypeAdapter, ValidationError
 
 from mdnum.errors import InputError
-from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.integrators import INTEGRATORS
 from mdnum.md.neighbors import RebuildRule
-from mdnum.md.potentials import POTENTIALS, CutPotential, PairFunction
+from mdnum.md.potentials import POTENTIALS, PairFunction
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.systems import code, pairs, schema
-from mdnum.systems.construct import DOUBLE_ONLY, assembled, cut
+from mdnum.systems.construct import assembled, cut
 from mdnum.systems.load import System, load
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import species_of
@@ -69,21 +68,13 @@ def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder:
         return _many_body_model(spec.potential, atoms, folder, name)
     species, _ = species_of(atoms)
     if isinstance(spec.potential, schema.PythonTable):
-        own = PairFunction(code.function(spec.potential.function, folder), **spec.potential.parameters)
-        radius, onset = pairs.cutoff_radii(spec, species)
-        return cut(
-            own, spec.cutoff.kind, species, _per_type(radius), onset if onset is None else _per_type(onset)
-        )
-    tables = pairs.pair_constants(spec, species)
-    constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
-    radius, onset = pairs.cutoff_radii(spec, species)
-    r_cut = jax.device_put(_per_type(radius))
-    return CutPotential(
-        POTENTIALS[spec.potential.kind](**constants),
-        CUTOFFS.parse(spec.cutoff.kind),
-        r_cut,
-        r_cut if onset is None else jax.device_put(_per_type(onset)),
-    )
+        potential = PairFunction(code.function(spec.potential.function, folder), **spec.potential.parameters)
+    else:
+        tables = pairs.pair_constants(spec, species)
+        constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
+        potential = POTENTIALS[spec.potential.kind](**constants)
+    ends = (table if table is None else _per_type(table) for table in pairs.cutoff_radii(spec, species))
+    return cut(potential, spec.cutoff.kind, species, *ends)
 
 
 def _many_body_model(potential: Any, atoms: Atoms, folder: Path, name: str):
@@ -125,8 +116,6 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
     spec, units = system.spec, system.units
     dynamics, neighbors, precision = spec.dynamics, spec.neighbors, spec.precision
     policy = PrecisionPolicy(precision.state, precision.force, precision.decision, precision.accumulate)
-    if spec.cutoff is None and policy != PrecisionPolicy():
-        raise InputError(DOUBLE_ONLY, where="precision", remedy="Remove the [precision] table")
     rebuild, fork = neighbors.rebuild, spec.fork
     return assembled(
         Origin(system.name, spec.about, system, {} if fork is None else fork.model_dump()),

@@ -23,7 +23,7 @@ from mdnum.md.potentials import CutPotential, PairPotential, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
-from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, pair_key
+from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, pair_key, pair_names
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import Draw, check, smallest_distance, species_of
 from mdnum.units import Units
@@ -177,7 +177,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
     Raises:
         InputError: a pair has none, or it is no finite number.
     """
-    names = [f"{a}-{b}" for k, a in enumerate(symbols) for b in symbols[k:]]
+    names = pair_names(symbols)
     if isinstance(value, Mapping):
         given = {pair_key(*key.split("-")): number for key, number in value.items()}
         missing = [one for one in names if pair_key(*one.split("-")) not in given]
@@ -222,6 +222,11 @@ def assembled(
     masses = np.asarray(atoms.get_masses(), np.float64)
     symbols, species = species_of(atoms)
     pairwise = isinstance(model, CutPotential)
+    if not pairwise:
+        if policy != PrecisionPolicy():
+            raise InputError(DOUBLE_ONLY, where="precision", remedy="Remove the [precision] table")
+        # its energy function takes lattice vectors off along these axes
+        model = replace(model, pbc=cell.pbc)
     radii = tuple(float(r) for r in np.asarray(model.r_cut)) if pairwise else (float(model.r_cut),)
     decider = PairDecider(radii, compare, policy.decision, cell.reach(positions), policy.state)
     check_radius(cell, max(radii), rule.skin)
@@ -263,8 +268,6 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         first, second = np.triu_indices(len(places))
         kinds = pair_type(places[first], places[second], len(old))
         model = jax.tree.map(lambda leaf: leaf[kinds], model)
-    else:
-        model = replace(model, pbc=tuple(bool(flag) for flag in atoms.pbc))
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,
         simulation.decider.compare, replace(simulation.rule, skin=skin), simulation.builder,

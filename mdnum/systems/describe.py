@@ -12,32 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.md.manybody import leaves_by_path
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, write_text
 from mdnum.store.folder import system_tables
 from mdnum.systems.build import build
 from mdnum.systems.load import GIVE_OBJECTS, STRUCTURE_FILE, load
+from mdnum.systems.schema import pair_names
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import to_extxyz
 from mdnum.systems.toml import flat
 
 #: Of a description, what says nothing about what is computed.
-_WORDS = ("name", "about")
-_ASKED = (*_WORDS, "dynamics.steps", "record.save_every")
+_ASKED = ("name", "about", "dynamics.steps", "record.save_every")
 
 
-def described(simulation: Simulation) -> dict[str, Any]:
-    """Tables of plain values, ready for JSON: what the objects of a simulation are."""
+def program(simulation: Simulation) -> dict[str, Any]:
+    """Tables of plain values, ready for JSON: every number and choice of a simulation but its structure."""
     rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
     tables: dict[str, Any] = {
-        "name": simulation.name,
-        "about": simulation.origin.about,
         "units": simulation.units.name,
-        "structure": {"formula": simulation.structure.get_chemical_formula(), "digest": _start(simulation)},
         "potential": {
             "kind": simulation.potential.name,
             **_constants(simulation),
@@ -65,6 +62,17 @@ def described(simulation: Simulation) -> dict[str, Any]:
         "record": {"save_every": simulation.save_every},
     }
     return {key: table for key, table in tables.items() if table is not None}
+
+
+def described(simulation: Simulation) -> dict[str, Any]:
+    """What the objects of a simulation are, with its name and the digest of what step 0 is made of."""
+    formula = simulation.structure.get_chemical_formula()
+    return {
+        "name": simulation.name,
+        "about": simulation.origin.about,
+        "structure": {"formula": formula, "digest": _start(simulation)},
+        **program(simulation),
+    }
 
 
 def write(simulation: Simulation, folder: Path) -> None:
@@ -109,19 +117,13 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
     return given
 
 
-def program(simulation: Simulation) -> dict[str, Any]:
-    """Every number and choice of a simulation but its structure."""
-    return {key: table for key, table in described(simulation).items() if key not in (*_WORDS, "structure")}
-
-
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
     """The tables of two simulations that are to be compared: of their files where both have one."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
         return first, second
-    first, second = ({**described(one), "structure": None} for one in (a, b))
-    return first, second
+    return program(a), program(b)
 
 
 def reduction_word(reduction: Any) -> str:
@@ -144,10 +146,7 @@ def by_pair(simulation: Simulation, leaf: Any) -> Any:
     values = np.asarray(leaf, np.float64)
     if len(set(values.tolist())) == 1:
         return float(values[0])
-    rows, columns = np.triu_indices(len(simulation.symbols))
-    names = simulation.symbols
-    pairs = zip(rows, columns, strict=True)
-    return {f"{names[a]}-{names[b]}": float(x) for (a, b), x in zip(pairs, values, strict=True)}
+    return dict(zip(pair_names(simulation.symbols), values.tolist(), strict=True))
 
 
 def _start(simulation: Simulation) -> str:
@@ -166,12 +165,8 @@ def _start(simulation: Simulation) -> str:
 def _constants(simulation: Simulation) -> dict[str, Any]:
     if simulation.pairwise:
         return {name: by_pair(simulation, leaf) for name, leaf in simulation.potential.leaves.items()}
-    leaves, _ = jax.tree_util.tree_flatten_with_path(simulation.model)
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): plain_leaf(leaf)
-        for path, leaf in leaves
-        if eqx.is_array_like(leaf)
-    }
+    leaves = leaves_by_path(simulation.model)
+    return {name: plain_leaf(leaf) for name, leaf in leaves.items() if eqx.is_array_like(leaf)}
 
 
 def _code(function: Any) -> dict[str, Any]:

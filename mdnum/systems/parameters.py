@@ -225,15 +225,14 @@ def _scaled(simulation: Simulation, value: float) -> Simulation:
 
 def _constants(simulation: Simulation) -> list[Dial]:
     """Constants of the potential: one for each, or one for each and pair of species."""
-    species = simulation.symbols
     dials = []
     for name, values in simulation.potential.leaves.items():
         if name == "sigma" and simulation.in_sigma:
             # the radius would move along
             continue
         leaf = np.asarray(values)
-        for kind, (i, j) in enumerate(zip(*np.triu_indices(len(species)), strict=True)):
-            pair = "" if len(leaf) == 1 else f"pairs.{species[i]}-{species[j]}."
+        for kind, name_of_pair in enumerate(schema.pair_names(simulation.symbols)):
+            pair = "" if len(leaf) == 1 else f"pairs.{name_of_pair}."
             value = float(leaf[kind])
             dials.append(Dial(f"potential.{pair}{name}", value, _constant(name, kind), value > 0))
     return dials

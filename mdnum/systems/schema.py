@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
+from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, create_model, model_validator
@@ -30,6 +31,11 @@ ONSET_FRACTION = 0.9
 def pair_key(a: str, b: str) -> str:
     """The one spelling under which a pair of species is looked up: "Ni-P" for either order."""
     return "-".join(sorted((a, b)))
+
+
+def pair_names(symbols: Sequence[str]) -> list[str]:
+    """The pairs of some species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
+    return [f"{a}-{b}" for a, b in combinations_with_replacement(symbols, 2)]
 
 
 def _check_pairs(pairs: Mapping[str, Any] | None) -> None:

@@ -307,17 +307,12 @@ def _not_run(
 def _entries(simulation: Simulation, name: str) -> list[str] | None:
     """Which pair each entry of a parameter belongs to; None where it has one entry, or one for each atom."""
     from mdnum.gradients import parameters
-    from mdnum.md.potentials import pair_type
+    from mdnum.systems.schema import pair_names
 
     several = np.ndim(parameters.value(simulation, name)) and not name.startswith("initial.")
     if not simulation.pairwise or not several:
         return None
-    species = simulation.symbols
-    found = [""] * simulation.pair_types
-    for i, first in enumerate(species):
-        for j, second in enumerate(species[i:], i):
-            found[int(pair_type(np.array(i), np.array(j), len(species)))] = f"{first}-{second}"
-    return found
+    return pair_names(simulation.symbols)
 
 
 def _keep_arrays(answer: Answer) -> None:

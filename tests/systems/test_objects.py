@@ -219,6 +219,18 @@ def test_what_does_not_fit_together_is_one_line(change, message):
         mdnum.simulation(atoms, given["potential"](), given["cutoff"], timestep=given["timestep"])
 
 
+def test_a_potential_of_many_bodies_follows_the_periodicity_of_the_atoms_and_has_one_precision():
+    slab = bulk("Si", "diamond", a=5.43, cubic=True).repeat(3)
+    slab.center(vacuum=6.0, axis=2)
+    slab.pbc = (True, True, False)
+    potential = mdnum.build("silicon/stillinger-weber-512").model
+    made = mdnum.simulation(slab, potential, timestep=0.001)
+    assert potential.pbc == (True, True, True) and made.model.pbc == made.pbc == (True, True, False)
+    narrow = mdnum.PrecisionPolicy(force="float32")
+    with pytest.raises(InputError, match=r"precision: .*float64"):
+        mdnum.simulation(slab, potential, timestep=0.001, precision=narrow)
+
+
 def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_else(tmp_path):
     (tmp_path / "mine.py").write_text(CODE)
     path, ran = tmp_path / "my.toml", tmp_path / "mine.py.ran"
