@@ -112,7 +112,7 @@ def test_brute_force_over_all_floats_finds_the_same(key, at, width):
     [(solid, "velocity.scale", 1.0, 1.01, 30), (meeting, "cutoff.radius", 2.2, 2.3, 12)],
 )
 def test_both_sides_differ_in_a_fresh_process(make, key, low, high, steps):
-    system = make()
+    system = build(make())
     found = boundaries(system, key, low, high, steps, cells=4, most=2)
     assert found.boundaries
     values = [side.at for b in found.boundaries for side in (b.below, b.above)]

@@ -164,9 +164,12 @@ class _Interpreter:
 
     def _scan(self, params: Any, inputs: list[Any]) -> list[Any]:
         body, length = params["jaxpr"], params["length"]
-        constants, carries = params["num_consts"], params["num_carry"]
-        fixed, carry = inputs[:constants], list(inputs[constants : constants + carries])
-        rows = inputs[constants + carries :]
+        if "ft_in" in params:  # jax 0.11.2
+            fixed, carry, rows = map(list, params["ft_in"].update(inputs).unpack())
+        else:
+            ends = np.cumsum([params["num_consts"], params["num_carry"]])
+            fixed, carry, rows = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
+        carries = len(carry)
         out: dict[int, list[Any]] = {}
         for k in reversed(range(length)) if params["reverse"] else range(length):
             self.rounds.append(k)
