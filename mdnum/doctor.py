@@ -212,7 +212,11 @@ def float64() -> DoctorRow:
 
 
 def elementwise() -> DoctorRow:
-    """Basic operations under jit and eagerly against numpy, bit for bit, in both precisions."""
+    """Basic operations under jit and eagerly against numpy, bit for bit, in both precisions.
+
+    On an accelerator quotients and square roots in float32 may be approximate. No decision rests on them
+    (`numerics.exact.root`).
+    """
     operations: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
         "add": (jnp.add, np.add),
         "subtract": (jnp.subtract, np.subtract),
@@ -232,7 +236,10 @@ def elementwise() -> DoctorRow:
                 count = _differing(function(jnp.asarray(a), jnp.asarray(b)), expected)
                 if count:
                     wrong.append(f"{name} {np.dtype(dtype).name} {mode}: {count} of {_COUNT}")
-    return _row("elementwise", not wrong, operations=", ".join(operations), wrong="; ".join(wrong))
+    known = all(one.startswith(("divide float32", "sqrt float32")) for one in wrong)
+    gpu = bool(wrong) and known and jax.default_backend() != "cpu"
+    status: Status | bool = "info" if gpu else not wrong
+    return _row("elementwise", status, operations=", ".join(operations), wrong="; ".join(wrong))
 
 
 def functions() -> DoctorRow:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from devices import on_cpu
 
 from mdnum import doctor
 from mdnum.doctor import diagnose
@@ -72,6 +73,7 @@ def _asked(expression: str, **environment: str) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
+@on_cpu
 def test_fast_math_is_unsafe_and_what_flags_do_is_computed(monkeypatch: pytest.MonkeyPatch):
     """The flag is read, and what it does is seen without reading it; nothing contracts without FMA."""
     flags = "--xla_cpu_enable_fast_math=true --xla_cpu_max_isa=AVX"
@@ -87,6 +89,7 @@ __attribute__((constructor)) static void flush(void) { _mm_setcsr(_mm_getcsr() |
 """
 
 
+@on_cpu
 def test_subnormal_numbers_are_computed_with_and_not_compared(tmp_path: Path):
     """Beside a library that sets the processor to flush, where comparing them with anything is no use."""
     compiler = shutil.which("cc") or shutil.which("gcc")
@@ -119,6 +122,19 @@ def test_elementwise_sees_a_single_wrong_bit(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(np, "sqrt", lambda a: np.power(a, 0.5) * (1 + np.finfo(a.dtype).eps))
     row = doctor.elementwise()
     assert row.status == "unsafe" and "sqrt" in row.seen and "add" not in row.seen
+
+
+@pytest.mark.parametrize(("device", "status"), [("cpu", "unsafe"), ("gpu", "info")])
+def test_approximate_quotients_in_float32_are_those_of_a_device(
+    monkeypatch: pytest.MonkeyPatch, device: str, status: str
+):
+    exact = np.divide
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    monkeypatch.setattr(
+        np, "divide", lambda a, b: exact(a, b) * (1 + (a.dtype == np.float32) * np.finfo(a.dtype).eps)
+    )
+    row = doctor.elementwise()
+    assert row.status == status and "divide float32" in row.seen
 
 
 @pytest.mark.usefixtures("strangers_folder")

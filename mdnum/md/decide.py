@@ -26,7 +26,7 @@ from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, regist
 from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
-from mdnum.numerics.exact import squared_norm
+from mdnum.numerics.exact import root, squared_norm
 from mdnum.numerics.rounding import unit_roundoff
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
@@ -134,7 +134,7 @@ class PairDecider:
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
         """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
         r2 = squared_norm(dx, dy, dz, zero)
-        return jnp.sqrt(r2) if self.space == "r" else r2
+        return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
         """The compared quantity on the host, from displacement components of the decision's dtype."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from devices import on_cpu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import all_pairs, cut_energy, margins
@@ -17,6 +18,8 @@ from mdnum.md import foreign, kernel
 from mdnum.md.cell import wrap_positions
 from mdnum.md.decide import Tables
 from mdnum.systems import build
+
+pytestmark = on_cpu
 
 CUTOFFS = ("hard", "force-shifted", "switched", "quintic")
 

@@ -9,6 +9,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 import small_systems
+from devices import on_cpu
 from rollout.harness import listed
 
 from mdnum.md.cell import HostCell
@@ -115,6 +116,7 @@ def test_forces_and_energies_are_those_of_numpy(dtype, kind, decision):
     assert np.allclose(virial, wide_virial, rtol=0, atol=50 * unit * np.abs(np.asarray(wide_virial)).max())
 
 
+@on_cpu
 def test_without_fences_the_roundings_would_be_left_out():
     """The planted defect: the same expression in one fusion, which numpy does not reproduce."""
     x = jnp.asarray(np.random.default_rng(0).random(4000), jnp.bfloat16)

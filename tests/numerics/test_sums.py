@@ -461,7 +461,8 @@ def test_segments_are_summed_in_storage_order(dtype):
     seen = np.asarray(jax.jit(lambda v: segment_sum(v, index, 9))(jnp.asarray(values)))
     assert seen.dtype == dtype
     assert np.array_equal(seen, expected)
-    if dtype == np.float64:
+    # on another device in any order
+    if dtype == np.float64 and jax.default_backend() == "cpu":
         assert np.array_equal(np.asarray(jax.jit(scatter_add, static_argnums=2)(values, index, 9)), expected)
 
 

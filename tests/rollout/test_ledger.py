@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
+from devices import on_cpu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import COMPARISONS, all_pairs, broken_alternations, margins
@@ -386,7 +387,7 @@ def test_changes_noted_in_the_loop_are_those_of_its_rows(fluid, monkeypatch, nam
 
 
 @pytest.mark.parametrize("words, atoms", [(1, 5), (3, 13), (16, 64), (40, 103)])
-@pytest.mark.parametrize("on", ["host", "device"])
+@pytest.mark.parametrize("on", [pytest.param("host", marks=on_cpu), "device"])
 def test_changes_are_noted_to_the_last_byte(monkeypatch, on, words, atoms):
     monkeypatch.setattr(foreign, "known", lambda: on == "host")
     rng = np.random.default_rng(words)
