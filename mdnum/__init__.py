@@ -34,8 +34,20 @@ from mdnum.lazy import on_first_use
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from mdnum import ball as ball
+    from mdnum import cli as cli
+    from mdnum import errors as errors
+    from mdnum import forks as forks
     from mdnum import gradients as gradients
+    from mdnum import md as md
+    from mdnum import numerics as numerics
+    from mdnum import references as references
+    from mdnum import report as report
+    from mdnum import rollout as rollout
+    from mdnum import store as store
     from mdnum import systems as systems
+    from mdnum import trajectories as trajectories
+    from mdnum import units as units
     from mdnum.doctor import diagnose as diagnose
     from mdnum.errors import CapacityError as CapacityError
     from mdnum.errors import FolderError as FolderError
@@ -84,13 +96,16 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = on_first_use(
     __name__,
     {
+        # submodules that docs/python.md names
+        **{name: name for name in ("ball", "cli", "forks", "md", "numerics", "report", "rollout", "store")},
+        **{name: name for name in ("trajectories", "units")},
         "doctor": "diagnose",
-        "errors": "CapacityError FolderError InputError MdnumError NumericalError",
+        "errors": "CapacityError FolderError InputError MdnumError NumericalError errors",
         "gradients": "Problem gradients method value_and_grad",
         "md.integrators": "Integrator KickDrift Langevin VelocityVerlet",
         "md.potentials": "LennardJones Morse PairFunction PairPotential SoftSphere",
         "numerics.roles": "PrecisionPolicy",
-        "references": "MdnumCalculator",
+        "references": "MdnumCalculator references",
         "systems": "build load systems",
         "systems.code": "allow_code",
         "systems.construct": "Cut simulation",

@@ -87,6 +87,10 @@ class Diagnosis:
 def diagnose(budget: float = 18.0) -> Diagnosis:
     """Test this installation.
 
+    Example:
+        >>> mdnum.diagnose().ok
+        True
+
     Args:
         budget: seconds after which the tests in other processes are given up; those in this process
             take about six.

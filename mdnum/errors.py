@@ -55,6 +55,12 @@ class MdnumError(Exception):
 
     Control characters in what it quotes are escaped, and long quotes are shortened.
 
+    Example:
+        >>> try:
+        ...     mdnum.run("mine.toml")
+        ... except mdnum.MdnumError as error:
+        ...     print(error)
+
     Args:
         message: what was seen and what was expected.
         remedy: what to do about it, an imperative sentence.

@@ -8,7 +8,7 @@ import numpy as np
 from ase import Atoms
 from ase.build import bulk
 
-from mdnum.rollout.engine import Engine
+from mdnum.rollout import Engine
 from mdnum.systems import System, SystemSpec, build
 
 DENSITY, R_CUT, SKIN, TIMESTEP, TEMPERATURE = 0.8442, 2.5, 0.3, 0.005, 0.72

@@ -62,7 +62,7 @@ def memory(atoms: int, steps: int) -> list[dict[str, float]]:
 
 def _memory_of(atoms: int, steps: int) -> None:
     """The process that memory() looks at."""
-    from mdnum.rollout.run import run
+    import mdnum
 
     seen: list[dict[str, float]] = []
 
@@ -71,7 +71,7 @@ def _memory_of(atoms: int, steps: int) -> None:
             seen.append({"step": step, "flips": info["flips"], "peak_mb": peak_mb()})
 
     with tempfile.TemporaryDirectory() as scratch:
-        run(liquid(atoms), out=f"{scratch}/run", steps=steps, progress=look)
+        mdnum.run(liquid(atoms), out=f"{scratch}/run", steps=steps, progress=look)
     print(json.dumps(seen))
 
 

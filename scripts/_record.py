@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import PairRecorder, flip_columns
-from mdnum.rollout.summary import ListHealth
+from mdnum.rollout import Engine, ListHealth, PairRecorder, flip_columns
 from mdnum.systems import Simulation
 
 Columns = dict[str, np.ndarray]

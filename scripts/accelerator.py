@@ -30,8 +30,7 @@ from _output import say, start, table
 from _processes import machine
 
 from mdnum.md import foreign
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import PairRecorder
+from mdnum.rollout import Engine, PairRecorder
 from mdnum.systems import build
 
 

@@ -92,8 +92,7 @@ class Stopwatch:
 
 def mdnum_loop(simulation: Simulation, record: bool) -> Callable[[int], Turn]:
     """mdnum's rollout; a recorded one is decoded to counts and ledger rows, all a run does but write them."""
-    from mdnum.rollout.engine import Engine
-    from mdnum.rollout.flips import PairRecorder
+    from mdnum.rollout import Engine, PairRecorder
 
     def run(steps: int) -> Turn:
         recorder = PairRecorder(simulation)

@@ -15,11 +15,7 @@ from pathlib import Path
 import numpy as np
 from _output import figure, parser, save, say, start, table
 
-from mdnum.references.conformance.case import AREAS
-from mdnum.references.conformance.judge import Report
-from mdnum.references.conformance.peers import installed, load
-from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.suite import examine
+from mdnum.references.conformance import AREAS, Report, examine, installed, load, script
 
 # compiles for every number of atoms
 _SLOW = ("jax-md", "jax-md-kept")

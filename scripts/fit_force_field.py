@@ -38,10 +38,9 @@ from ase import Atoms
 from ase.build import bulk
 from jaxtyping import Array, Float
 
-from mdnum.gradients import Problem, method
+from mdnum.gradients import Method, Problem, method
 from mdnum.gradients.differences import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
-from mdnum.gradients.problem import Method
 from mdnum.gradients.tape import RunTape
 from mdnum.systems import Simulation, System, SystemSpec, build
 

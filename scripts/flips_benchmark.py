@@ -84,7 +84,7 @@ class Motion:
 
 def motion(atoms: int, whole: int, strides: int) -> Motion:
     """A liquid of about so many atoms: some steps kept one by one, then every 100th."""
-    from mdnum.rollout.engine import Engine, unwrapped
+    from mdnum.rollout import Engine, unwrapped
     from mdnum.systems import build
 
     simulation = build(liquid(atoms))
@@ -102,9 +102,7 @@ def motion(atoms: int, whole: int, strides: int) -> Motion:
 
 def mdnum_flips(length: float) -> Callable[[np.ndarray], int]:
     """Flips as mdnum finds them."""
-    from mdnum.trajectories.frame import Box, Frame
-    from mdnum.trajectories.rules import CutoffRule
-    from mdnum.trajectories.tracker import Tracker
+    from mdnum.trajectories import Box, CutoffRule, Frame, Tracker
 
     tracker, box = Tracker(CutoffRule(R_CUT)), Box(np.eye(3) * length, np.ones(3, bool))
     return lambda x: len(tracker.step(Frame(tracker.frames, 0.0, x, box)))
@@ -233,8 +231,7 @@ def file_costs(
     """What reading a file, the command on it, and `NeighborFlips` in one process and two take."""
     import MDAnalysis
 
-    from mdnum.trajectories.analysis import NeighborFlips
-    from mdnum.trajectories.trajectory import open_trajectory
+    from mdnum.trajectories import NeighborFlips, open_trajectory
 
     radius, made = R_CUT * ANGSTROM, []
 
@@ -280,9 +277,7 @@ def file_costs(
 
 def many(moved: Motion, name: str, chosen: list[np.ndarray], copies: tuple[int, int, int]) -> dict[str, Any]:
     """Seconds a frame of copies side by side, in a scattered order; none of the frames is left out."""
-    from mdnum.trajectories.frame import Box, Frame
-    from mdnum.trajectories.rules import CutoffRule
-    from mdnum.trajectories.tracker import Tracker
+    from mdnum.trajectories import Box, CutoffRule, Frame, Tracker
 
     edges = moved.length * np.array(copies)
     places = np.stack(np.meshgrid(*[np.arange(n) for n in copies], indexing="ij"), -1).reshape(-1, 1, 3)

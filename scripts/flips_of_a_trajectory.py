@@ -30,10 +30,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 import mdnum
-from mdnum.trajectories.ledger import FlipTable
-from mdnum.trajectories.rules import CutoffRule
-from mdnum.trajectories.tracker import Tracker
-from mdnum.trajectories.trajectory import open_trajectory
+from mdnum.trajectories import CutoffRule, FlipTable, Tracker, open_trajectory
 
 
 def made(folder: Path, steps: int) -> Path:

@@ -73,8 +73,7 @@ def system_of(word: str) -> System:
 
 def single(system: System) -> Callable[[int], None]:
     """A run alone, recorded."""
-    from mdnum.rollout.engine import Engine
-    from mdnum.rollout.flips import PairRecorder
+    from mdnum.rollout import Engine, PairRecorder
     from mdnum.systems import build
 
     simulation = build(system)

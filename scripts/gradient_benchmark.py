@@ -77,7 +77,7 @@ def on_the_lattice(system: System) -> System:
 
 def forward(system: System) -> Callable[[int], None]:
     """The run alone."""
-    from mdnum.rollout.engine import Engine
+    from mdnum.rollout import Engine
     from mdnum.systems import build
 
     simulation = build(system)

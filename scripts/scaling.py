@@ -69,8 +69,7 @@ def measure(atoms: int, seconds: float) -> dict[str, float]:
 
 def _steps(simulation: Any, last: int, *, record: bool) -> tuple[float, float, float]:
     """CPU and clock seconds of a step, and its flips, after the lives of two lists."""
-    from mdnum.rollout.engine import Engine
-    from mdnum.rollout.flips import PairRecorder
+    from mdnum.rollout import Engine, PairRecorder
 
     recorder, flips, rows, begun = PairRecorder(simulation), 0, 0, None
     for segment in Engine(simulation, last, record=record, rows=not record).segments():

@@ -30,7 +30,7 @@ from _output import COLORS, figure, parser, save, say, start, table
 from _record import record
 
 from mdnum.errors import InputError
-from mdnum.rollout.engine import Engine
+from mdnum.rollout import Engine
 from mdnum.systems import Simulation, System, build, load
 
 

@@ -31,7 +31,7 @@ from _output import parser, say, start, table
 import mdnum
 from mdnum.errors import NumericalError
 from mdnum.store import RunFolder
-from mdnum.systems.load import names as shipped
+from mdnum.systems import names as shipped
 
 FACTORS = (0.5, 1, 2, 4, 8, 16)
 _BLOCKS = 8

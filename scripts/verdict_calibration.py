@@ -39,11 +39,10 @@ from ase import Atoms
 from ase.build import bulk
 from scipy.stats import beta
 
-from mdnum.forks import fork
+from mdnum.forks import SPLIT, displacements, fork
 from mdnum.forks.choices import parse, twin_of
-from mdnum.forks.pair import SPLIT, displacements
 from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, count, growth, judge
-from mdnum.rollout.engine import Engine
+from mdnum.rollout import Engine
 from mdnum.systems import System, SystemSpec, build, load
 
 STEPS = 4000

@@ -8,7 +8,7 @@ molecular dynamics alone are `forks.replays` (overridden decisions, minimal caus
 
 from __future__ import annotations
 
-from mdnum.forks.pair import Fork, fork
+from mdnum.forks.pair import SPLIT, Fork, displacements, fork
 from mdnum.program import Decision, Twin
 
-__all__ = ["Decision", "Fork", "Twin", "fork"]
+__all__ = ["SPLIT", "Decision", "Fork", "Twin", "displacements", "fork"]

@@ -36,6 +36,10 @@ Values = Mapping[str, Any]
 class Problem:
     """A loss of a rollout.
 
+    Example:
+        >>> loss = mdnum.gradients.losses.MeanPotential()
+        >>> mdnum.Problem(mdnum.build("argon/crystal-108"), loss, steps=100)
+
     Attributes:
         simulation: the system as objects, its start included.
         loss: what is made of the trajectory.
@@ -196,6 +200,9 @@ _SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
 def method(name: str) -> Method:
     """The method of that name, with its defaults.
 
+    Example:
+        >>> mdnum.method("symmetric")
+
     Raises:
         InputError: there is none.
     """
@@ -257,6 +264,10 @@ def value_and_grad(
     problem: Problem, names: Sequence[str], method: Method | str = "event-aware", *, has_aux: bool = False
 ) -> Callable[[Values], tuple[Any, dict[str, np.ndarray]]]:
     """A function that gives the loss and its gradient, as `jax.value_and_grad` does.
+
+    Example:
+        >>> f = mdnum.value_and_grad(problem, ["sigma"])
+        >>> value, slopes = f({"sigma": 1.01})
 
     Args:
         names: parameters to differentiate by, full or short names. method: a method, or its name.

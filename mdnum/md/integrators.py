@@ -81,6 +81,9 @@ class Integrator(eqx.Module):
     A system file has its fields as keys; `quantity` says which are no pure numbers. A static field takes the
     value in the file as it is.
 
+    Example:
+        >>> class NoseHoover(mdnum.Integrator): ...  # examples/thermostat.py is a whole one
+
     Attributes:
         timestep: internal time.
     """
@@ -227,6 +230,10 @@ def one_step(
 class KickDrift(Integrator):
     """A kick by the forces, then what does not know them: what most derivatives are written out for.
 
+    Example:
+        >>> isinstance(mdnum.build("argon/langevin-500").integrator, mdnum.KickDrift)
+        True
+
     Raises:
         TypeError: a subclass has another kick, half step or extra state, which those would not see.
     """
@@ -287,7 +294,11 @@ def _is_linear(integrator: KickDrift) -> bool:
 
 
 class VelocityVerlet(KickDrift):
-    """NVE. Symplectic and time-reversible in exact arithmetic; local error O(dt³)."""
+    """NVE. Symplectic and time-reversible in exact arithmetic; local error O(dt³).
+
+    Example:
+        >>> mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
+    """
 
     name = "nve"
 
@@ -300,6 +311,10 @@ class Langevin(KickDrift):
 
     Noise comes from a counter-based key folded with the step, so two runs can share it and a resumed run
     continues it.
+
+    Example:
+        >>> cut = mdnum.Cut("switched", 8.5)
+        >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, friction=1.0)
     """
 
     name = "langevin"

@@ -33,7 +33,16 @@ def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> N
 
 
 class PairPotential(eqx.Module):
-    """A bare pair potential; every array leaf is a parameter with one entry per pair type."""
+    """A bare pair potential; every array leaf is a parameter with one entry per pair type.
+
+    Example:
+        >>> class Inverse(mdnum.PairPotential):
+        ...     name = "inverse"
+        ...     strength: Any
+        ...
+        ...     def evaluate(self, r2):
+        ...         return self.strength / r2, -self.strength / (r2 * r2)
+    """
 
     name: ClassVar[str]
 

@@ -57,7 +57,11 @@ def check_role(role: str, dtype: str) -> None:
 
 @dataclass(frozen=True)
 class PrecisionPolicy:
-    """The dtype of each role of a number in a rollout of molecular dynamics."""
+    """The dtype of each role of a number in a rollout of molecular dynamics.
+
+    Example:
+        >>> mdnum.PrecisionPolicy(force="float32")
+    """
 
     # positions and velocities as they are carried from step to step; "lattice" for whole numbers
     state: str = "float64"

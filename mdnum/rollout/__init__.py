@@ -1,1 +1,20 @@
 """Running: epochs of a Verlet list, what they record, and the folder it goes into."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mdnum.lazy import on_first_use
+
+if TYPE_CHECKING:
+    from mdnum.rollout.engine import Engine as Engine
+    from mdnum.rollout.engine import unwrapped as unwrapped
+    from mdnum.rollout.flips import PairRecorder as PairRecorder
+    from mdnum.rollout.flips import flip_columns as flip_columns
+    from mdnum.rollout.summary import ListHealth as ListHealth
+
+__getattr__, __dir__, __all__ = on_first_use(__name__, {
+    "engine": "Engine unwrapped",
+    "flips": "PairRecorder flip_columns",
+    "summary": "ListHealth",
+})  # fmt: skip

@@ -99,6 +99,9 @@ def _many_body_model(potential: Any, atoms: Atoms, folder: Path, name: str):
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:
     """The objects of a system.
 
+    Example:
+        >>> mdnum.build("argon/liquid-864", {"cutoff.kind": "switched"})
+
     Args:
         system: a loaded system, a name or path to load, or a simulation, which is returned as it is.
         overrides: as for `load`, where a name or path is given.

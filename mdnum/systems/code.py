@@ -19,6 +19,10 @@ _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 def allow_code(allow: bool = True) -> Iterator[None]:
     """In here the Python that a system file names is executed.
 
+    Example:
+        >>> mdnum.allow_code()
+        >>> mdnum.run("mine.toml")  # its [potential] names mine.py:morse
+
     Args:
         allow: False leaves it as it was.
     """

@@ -394,6 +394,10 @@ def load(
 ) -> System | BallSystem:
     """A system by name or path, checked: a System, or a BallSystem where the file says `world = "ball"`.
 
+    Example:
+        >>> mdnum.load("argon/liquid-864").spec.cutoff.kind
+        'hard'
+
     Args:
         name: a shipped name, a path to a TOML file, a folder that holds system.toml, or a loaded system,
             which is returned as it is.

@@ -50,6 +50,10 @@ class Simulation:
 
     `mdnum.simulation` makes one from a structure and a potential, `mdnum.build` from a system file.
 
+    Example:
+        >>> sim = mdnum.build("argon/liquid-864")
+        >>> sim.evaluate().energy
+
     Attributes:
         origin: where it came from.
         structure: atoms as they were given; positions and velocities of step 0 are those below.

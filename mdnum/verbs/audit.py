@@ -71,6 +71,9 @@ def audit(
     6,000 calls for one element, and 12,000 at most. What leads to a verdict is asked first. Whatever ends an
     audit, the checks that were done are in its folder.
 
+    Example:
+        >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
+
     Args:
         calculator: as the command line names one, or a function that makes a new ASE calculator; may be left
             out where an audit of one that was named in words is resumed. The Python that it names is run.

@@ -41,6 +41,9 @@ def bounce(
 ) -> Outcome:
     """Run a ball's system and its variants, record every contact and stop decision, and write a report.
 
+    Example:
+        >>> mdnum.bounce("ball/drop", against=["precision.state=float32"])
+
     Args:
         system: a loaded system, a shipped name or the path of a system file.
         steps: instead of the system's.

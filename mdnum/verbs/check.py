@@ -43,6 +43,10 @@ class Checked:
 def check(question: str, system: Simulation | System | str | Path) -> Checked:
     """Compare a system with other codes.
 
+    Example:
+        >>> mdnum.check("energy", "argon/liquid-864").report.ok
+        True
+
     Args:
         question: "energy", "pairs" or "dynamics".
         system: a simulation, a system, a shipped name or the path of a system file.

@@ -104,6 +104,9 @@ def conform(
 
     The folder is filled as answers come: one that was stopped, however, is resumed by `resume`.
 
+    Example:
+        >>> mdnum.conform("vesin", time=60)
+
     Args:
         pairs: a name (`references.conformance.known`), `package.module:function`, `file.py:function`, or a
             function of (positions, cell, pbc, r_cut) that returns (i, j), (i, j, shift), (i, j, shift,

@@ -75,6 +75,9 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
 def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     """Run a demonstration, or all of them.
 
+    Example:
+        >>> mdnum.demonstrate("fork")
+
     Args:
         name: of one, or "all".
         keep: see `frame.Keep`; without overrides.

@@ -66,6 +66,9 @@ def flips(
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
 
+    Example:
+        >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
+
     Args:
         trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
             may stand behind an @ ("run.xtc@100:", "run.xtc@::10").

@@ -54,6 +54,9 @@ def fork(
 ) -> Outcome:
     """Run a system and its twin that differs in one choice, and say where and why they diverge.
 
+    Example:
+        >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
+
     Args:
         system: a simulation, a system, a shipped name or the path of a system file, of either world.
         vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. Default what
@@ -133,6 +136,9 @@ def fork_screen(
 
     Counterfactuals are left to the choices that turn out to matter.
 
+    Example:
+        >>> mdnum.fork_screen("argon/crystal-108", steps=200)
+
     Args:
         system: as for `fork`.
         steps: last step; default that of the [fork] table, or the system's own.
@@ -165,6 +171,9 @@ def fork_screen(
 @partial(frame.keywords_checked, more=PairQuestion.__annotations__)
 def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked: Any) -> Outcome:
     """Compare two finished runs of one world: what was different, and where they diverge.
+
+    Example:
+        >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
 
     Args:
         a, b: run folders.
@@ -220,6 +229,9 @@ def fork_benign(
     system: Simulation | System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Whether a choice changes anything that would be measured: an ensemble-consistency test.
+
+    Example:
+        >>> mdnum.fork_benign("argon/liquid-864", "order")
 
     Args:
         system: of molecular dynamics, as for `fork`.

@@ -44,6 +44,9 @@ def fork_certify(
 ) -> Outcome:
     """When runs in each precision leave the history in exact arithmetic.
 
+    Example:
+        >>> mdnum.fork_certify("argon/crystal-108", steps=100)
+
     Args:
         system: a simulation, a system, a shipped name or the path of a system file: Lennard-Jones, NVE, at
             most 108 atoms; or a ball whose steps are sums and products.
@@ -275,6 +278,9 @@ def fork_processes(
     **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a system jitted, eagerly, in a batch, in a gradient and under flags of XLA, and find which agree.
+
+    Example:
+        >>> mdnum.fork_processes("argon/crystal-108", steps=100)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.

@@ -50,6 +50,9 @@ def fork_map(
 ) -> Outcome:
     """Where the history of a run's decisions changes along a number, to adjacent floats.
 
+    Example:
+        >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
+
     Args:
         system: a simulation, a system, a shipped name or the path of a system file, of either world.
         key: the number, such as "potential.sigma", "timestep" or "position.17.x"; of a ball "k", "tol", "y0".
@@ -305,6 +308,9 @@ def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Which decisions a random displacement of the start would flip first, from one tangent run.
+
+    Example:
+        >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.

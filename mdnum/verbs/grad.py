@@ -65,6 +65,9 @@ def grad(
 ) -> Outcome:
     """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
 
+    Example:
+        >>> mdnum.grad("argon/crystal-108", "mean-potential", ["sigma", "cutoff.radius"], steps=200)
+
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; of molecular dynamics or
             a ball.

@@ -54,7 +54,7 @@ _BESIDE = 2000
 
 @keywords_checked
 def run(
-    system: System | str | Path | None,
+    system: Simulation | System | str | Path | None,
     *,
     out: str | Path | None = None,
     steps: int | None = None,
@@ -67,6 +67,9 @@ def run(
     allow_code: bool = False,
 ) -> Outcome:
     """Simulate a system, record every flip, compare the first and last frame with ASE, and write a report.
+
+    Example:
+        >>> mdnum.run("argon/liquid-864", steps=500).folder
 
     Args:
         system: a loaded system, a shipped name or the path of a system file; None when resuming.

@@ -12,6 +12,7 @@ from mdnum.lazy import on_first_use
 
 if TYPE_CHECKING:
     from mdnum.references.conformance.adoption import NeighborListConformance as NeighborListConformance
+    from mdnum.references.conformance.case import AREAS as AREAS
     from mdnum.references.conformance.case import Case as Case
     from mdnum.references.conformance.case import Still as Still
     from mdnum.references.conformance.judge import Report as Report
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 # no module here has the name of what is exported: importing it would put the module in its place
 __getattr__, __dir__, __all__ = on_first_use(__name__, {
     "adoption": "NeighborListConformance",
-    "case": "Case Still",
+    "case": "AREAS Case Still",
     "judge": "Report",
     "lists": "LISTS KeptList ListLimits PairList from_object",
     "peers": "installed known load",
