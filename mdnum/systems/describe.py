@@ -9,6 +9,7 @@ import hashlib
 import inspect
 import json
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import equinox as eqx
@@ -174,7 +175,7 @@ def _code(function: Any) -> dict[str, Any]:
     if function is None:
         return {}
     try:
-        source = inspect.cleandoc(inspect.getsource(function))
+        source = dedent(inspect.getsource(function)).strip()
     except (OSError, TypeError):
         source = ""
     compiled = getattr(function, "__code__", None)

@@ -228,6 +228,8 @@ def _what(run: RunView) -> Iterator[tuple[str, str]]:
     lengths = {"radius": units.length, "onset": units.length, "skin": units.length}
     for key, title in (("potential", "Potential"), ("cutoff", "Cutoff"), ("neighbors", "Neighbor lists")):
         if table := system.get(key):
+            if code := table.get("code"):
+                table = table | {"code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
             yield title, in_words(table, lengths)
     if run.cutoff.get("energy_jump") is not None:
         energy, force = (number(run.cutoff.get(key)) for key in ("energy_jump", "force_jump"))

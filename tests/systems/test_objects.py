@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -138,7 +139,10 @@ def test_an_own_morse_has_the_ledger_and_the_verdicts_of_the_one_here(tmp_path):
     assert forks[0].summary["effect"] == forks[1].summary["effect"]
     assert forks[0].summary["fork"] == forks[1].summary["fork"]
     text = json.loads((runs[0].folder / "simulation.json").read_text())
-    assert "depth * (e * e - 2 * e)" in text["potential"]["code"]["source"]
+    # as it was written: it can be executed again
+    again: dict[str, Any] = {"jnp": jnp}
+    exec(text["potential"]["code"]["source"], again)
+    assert again["morse"](2.0, 0.3, 1.4, 2.5) == morse(2.0, 0.3, 1.4, 2.5)
 
 
 def test_an_own_function_is_differentiated_by_its_parameters_and_the_cutoff():
