@@ -34,6 +34,7 @@ from mdnum.lazy import on_first_use
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    # submodules that docs/python.md names, first
     from mdnum import ball as ball
     from mdnum import cli as cli
     from mdnum import errors as errors
@@ -74,7 +75,7 @@ if TYPE_CHECKING:
     from mdnum.systems.construct import Cut as Cut
     from mdnum.systems.construct import simulation as simulation
     from mdnum.systems.simulation import Simulation as Simulation
-    from mdnum.verbs import audit as _audit
+    from mdnum.verbs.audit import audit as _audit
     from mdnum.verbs.ball import bounce as bounce
     from mdnum.verbs.check import check as check
     from mdnum.verbs.conform import conform as conform
@@ -91,36 +92,7 @@ if TYPE_CHECKING:
     from mdnum.verbs.grad import grad as grad
     from mdnum.verbs.run import run as run
 
-    audit_calculator = _audit.audit
+    audit_calculator = _audit
 
-__getattr__, __dir__, __all__ = on_first_use(
-    __name__,
-    {
-        # submodules that docs/python.md names
-        **{name: name for name in ("ball", "cli", "forks", "md", "numerics", "report", "rollout", "store")},
-        **{name: name for name in ("trajectories", "units")},
-        "doctor": "diagnose",
-        "errors": "CapacityError FolderError InputError MdnumError NumericalError errors",
-        "gradients": "Problem gradients method value_and_grad",
-        "md.integrators": "Integrator KickDrift Langevin VelocityVerlet",
-        "md.potentials": "LennardJones Morse PairFunction PairPotential SoftSphere",
-        "numerics.roles": "PrecisionPolicy",
-        "references": "MdnumCalculator references",
-        "systems": "build load systems",
-        "systems.code": "allow_code",
-        "systems.construct": "Cut simulation",
-        "systems.simulation": "Simulation",
-        "verbs.audit": "audit_calculator=audit",
-        "verbs.ball": "bounce",
-        "verbs.check": "check",
-        "verbs.conform": "conform",
-        "verbs.demos": "demonstrate",
-        "verbs.flips": "flips",
-        "verbs.fork": "fork fork_benign fork_folders fork_screen",
-        "verbs.fork_certify": "fork_certify fork_processes",
-        "verbs.fork_map": "fork_forecast fork_map",
-        "verbs.grad": "grad",
-        "verbs.run": "run",
-    },
-)
+__getattr__, __dir__, __all__ = on_first_use(__name__, audit_calculator="mdnum.verbs.audit:audit")
 __all__ += ["__version__"]

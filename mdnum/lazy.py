@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
 def on_first_use(
-    package: str, modules: Mapping[str, str]
+    package: str, **others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package that imports nothing of its own.
 
+    Its names are those that its source imports under `if TYPE_CHECKING`, from modules by their full names:
+    they are said once, for type checkers and for Python.
+
     Args:
         package: its `__name__`.
-        modules: names, with spaces between them, by the module in the package that has them; "new=old" where
-            it calls them otherwise, and the module's own name for the module itself.
+        others: "module:name" by name, of what a module calls otherwise.
     """
-    homes = {
-        word.partition("=")[0]: (module, word.rpartition("=")[2])
-        for module, words in modules.items()
-        for word in words.split()
-    }
+    homes = {name: place.split(":") for name, place in others.items()}
+    for node in ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            found = [one for one in node.body if isinstance(one, ast.ImportFrom)]
+            said = [(str(one.module), alias) for one in found for alias in one.names]
+            # what has another name here than in its module is there for type checkers alone
+            homes |= {one.name: [home, one.name] for home, one in said if one.asname in (None, one.name)}
 
     def get(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, attribute = homes[name]
-        found = importlib.import_module(f"{package}.{module}")
-        value = found if attribute == module else getattr(found, attribute)
+        own = module == package  # a module of it
+        found = importlib.import_module(f"{package}.{name}" if own else module)
+        value = found if own else getattr(found, attribute)
         setattr(sys.modules[package], name, value)
         return value
 

@@ -39,12 +39,4 @@ if TYPE_CHECKING:
     )
     from mdnum.ball.world import World
 
-__getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "exact": "ExactImpact ExactPenalty",
-    "problem": "FinalHeight MeanHeight BallProblem ResidualPenetration arrive loss_of",
-    "rollout": "BallDifference BallRun first_difference simulate",
-    "step": "BallDecisions BallState BallVerlet EventLocated ExplicitEuler Impact ImplicitMidpoint Penalty "
-    "Projection SemiImplicitEuler",
-    "stopping": "FixedCount GlobalSum HysteresisStop Maximum PerInstance Reason Relative",
-    "world": "World",
-})  # fmt: skip
+__getattr__, __dir__, __all__ = on_first_use(__name__)

@@ -19,9 +19,4 @@ if TYPE_CHECKING:
     from mdnum.references.pair_check import check_pairs as check_pairs
     from mdnum.references.pair_check import effective_cutoff as effective_cutoff
 
-__getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "calculator": "MdnumCalculator",
-    "energy_check": "check_dynamics check_energy",
-    "oracle": "all_pairs",
-    "pair_check": "Search all_searches check_pairs effective_cutoff",
-})  # fmt: skip
+__getattr__, __dir__, __all__ = on_first_use(__name__)

@@ -13,8 +13,4 @@ if TYPE_CHECKING:
     from mdnum.rollout.flips import flip_columns as flip_columns
     from mdnum.rollout.summary import ListHealth as ListHealth
 
-__getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "engine": "Engine unwrapped",
-    "flips": "PairRecorder flip_columns",
-    "summary": "ListHealth",
-})  # fmt: skip
+__getattr__, __dir__, __all__ = on_first_use(__name__)

@@ -19,11 +19,4 @@ if TYPE_CHECKING:
     from mdnum.trajectories.trajectory import open_trajectory as open_trajectory
 
 # MDAnalysis takes seconds to import
-__getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "analysis": "NeighborFlips",
-    "frame": "Box Frame",
-    "ledger": "FlipTable",
-    "rules": "CutoffRule",
-    "tracker": "Tracker",
-    "trajectory": "open_trajectory",
-})  # fmt: skip
+__getattr__, __dir__, __all__ = on_first_use(__name__)

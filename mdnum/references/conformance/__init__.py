@@ -30,13 +30,4 @@ if TYPE_CHECKING:
     from mdnum.references.conformance.suite import examine as examine
 
 # no module here has the name of what is exported: importing it would put the module in its place
-__getattr__, __dir__, __all__ = on_first_use(__name__, {
-    "adoption": "NeighborListConformance",
-    "case": "AREAS Case Still",
-    "judge": "Report",
-    "lists": "LISTS KeptList ListLimits PairList from_object",
-    "peers": "installed known load",
-    "questions": "boxes cases",
-    "reproduction": "script",
-    "suite": "examine",
-})  # fmt: skip
+__getattr__, __dir__, __all__ = on_first_use(__name__)
