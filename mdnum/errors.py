@@ -113,6 +113,12 @@ class NumericalError(MdnumError):
         self.folder = folder
 
 
+def in_a_line(error: BaseException) -> str:
+    """An exception that is not mdnum's, in one line."""
+    words = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {words}" if words else type(error).__name__
+
+
 def expect_path(given: object, remedy: str) -> None:
     """Rejects an array or another object where a path is expected, without quoting what it holds.
 

@@ -16,8 +16,8 @@ from pydantic import Field
 from mdnum.audit.base import CheckResult
 from mdnum.audit.subject import LoadedCalculator
 from mdnum.audit.thresholds import PairThreshold
-from mdnum.errors import FolderError, InputError
-from mdnum.references.load import described, place
+from mdnum.errors import FolderError, InputError, in_a_line
+from mdnum.references.load import place
 from mdnum.store import RunFolder, expect, restoring
 from mdnum.store.answers import NAME, restored
 from mdnum.units import METAL, Units
@@ -60,7 +60,7 @@ def load_calculator(words: str) -> LoadedCalculator:
             except Exception as error:  # whatever a constructor raises
                 remedy = "Give the arguments it needs: Class(argument=value)"
                 raise InputError(
-                    f"making it failed: {described(error)}", where=text, remedy=remedy
+                    f"making it failed: {in_a_line(error)}", where=text, remedy=remedy
                 ) from error
         return value
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, in_a_line
 from mdnum.registry import nearest
 from mdnum.safe_path import search_last
 
@@ -75,7 +75,7 @@ class NamedObject:
         try:
             return target(*arguments, **keywords)
         except Exception as error:
-            raise self._wrong(f"making it failed: {described(error)}", "Correct the arguments") from error
+            raise self._wrong(f"making it failed: {in_a_line(error)}", "Correct the arguments") from error
 
     def source(self) -> tuple[str, str]:
         """(lines that import the name, an expression that is the object), for a script without mdnum."""
@@ -126,7 +126,7 @@ class NamedObject:
             remedy = f"Install {missing}, or correct the name" if missing else "Install what it needs"
         elif isinstance(error, SyntaxError):
             remedy = "Correct that line"
-        return InputError(f"cannot be imported: {described(error)}", where=self.home, remedy=remedy)
+        return InputError(f"cannot be imported: {in_a_line(error)}", where=self.home, remedy=remedy)
 
     def _default(self, module: ModuleType, defaults: Sequence[str]) -> Any:
         for name in defaults:
@@ -190,9 +190,3 @@ def public(scope: Any) -> list[str]:
     """Names of what can be called in a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]
-
-
-def described(error: BaseException) -> str:
-    """An exception in one line."""
-    words = " ".join(str(error).split())[:300]
-    return f"{type(error).__name__}: {words}" if words else type(error).__name__

@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, in_a_line
 
 _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 
@@ -76,8 +76,7 @@ def function(place: str, folder: Path) -> Callable[..., Any]:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        message = " ".join(str(error).split())
-        raise InputError(f"cannot be executed: {type(error).__name__}: {message}", where=str(file)) from error
+        raise InputError(f"cannot be executed: {in_a_line(error)}", where=str(file)) from error
     found = getattr(module, name, None)
     if not callable(found):
         raise InputError(f"has no function {name!r}", where=str(file), remedy="Correct potential.function")
