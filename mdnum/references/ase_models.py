@@ -34,7 +34,7 @@ from ase.stress import voigt_6_to_full_3x3_stress
 from numpy import ndarray
 
 from mdnum.errors import InputError
-from mdnum.md.potentials import CutPotential, PairFunction
+from mdnum.md.potentials import PairFunction
 from mdnum.references.independent import (
     ClassicalCalculator,
     OnNeighborList,
@@ -45,8 +45,7 @@ from mdnum.references.independent import (
     edges_of,
     pair_forms,
 )
-from mdnum.systems import System
-from mdnum.systems.build import model_of
+from mdnum.systems import System, build
 from mdnum.systems.simulation import Simulation
 
 #: Label of the judge of a pair function that a person wrote.
@@ -67,30 +66,22 @@ def reference(subject: Simulation | System) -> Reference:
     """The best judge there is for a simulation: ASE where it has the class, else plain numpy.
 
     Args:
-        subject: a `Simulation`, or a `System`, which need not fit its box.
+        subject: a `Simulation`, or a `System`, whose box need not have room for its skin.
     """
-    model, species, compare = _interaction(subject)
-    pairwise = isinstance(model, CutPotential)
-    kind = model.potential.name if pairwise else model.name
+    simulation = _objects(subject)
+    kind, species, model = simulation.potential.name, simulation.symbols, simulation.model
     if kind == "eam":
         return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(Path(model.file)))
     if kind == "tersoff":
-        constants = TersoffParameters(**asdict(TersoffModel()))
-        return Reference(
-            "ASE Tersoff", True, "none", lambda: Tersoff({("Si", "Si", "Si"): constants}, skin=0.0)
-        )
-    if kind == "stillinger-weber":
-        return independent(subject)
-    if not pairwise:
-        raise InputError("nothing here evaluates an energy function a second time", where=kind)
-    forms = pair_forms(model, species, compare)
-    cutoff = forms[species[0], species[0]].cutoff
-    if (kind, cutoff) not in _ASE_PAIR or isinstance(model.potential, PairFunction):
-        return independent(subject)
-    label, conversion, made = _ASE_PAIR[kind, cutoff]
+        constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(TersoffModel()))}
+        return Reference("ASE Tersoff", True, "none", lambda: Tersoff(constants, skin=0.0))
+    known = _ASE_PAIR.get((kind, model.cutoff.name)) if simulation.pairwise else None
+    if known is None or isinstance(simulation.potential, PairFunction):
+        return independent(simulation)
+    label, conversion, made = known
+    forms = _forms(simulation)
     if len(species) == 1:
-        form = forms[species[0], species[0]]
-        return Reference(label, True, conversion, lambda: made(form))
+        return Reference(label, True, conversion, lambda: made(forms[species[0], species[0]]))
     return Reference(
         f"{label}, a sum over species",
         True,
@@ -99,26 +90,22 @@ def reference(subject: Simulation | System) -> Reference:
     )
 
 
-def _interaction(subject: Simulation | System) -> tuple[Any, tuple[str, ...], str]:
-    """A potential with its end, the species, and what inside means."""
-    if isinstance(subject, Simulation):
-        return subject.model, subject.symbols, subject.decider.compare
-    spec = subject.spec
-    model = model_of(spec, subject.atoms, subject.folder, subject.name)
-    return model, subject.species, "r <" if spec.cutoff is None else spec.cutoff.compare
-
-
 def independent(subject: Simulation | System) -> Reference:
     """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second.
 
     Args:
-        subject: a `Simulation`, or a `System`, which need not fit its box.
+        subject: as for `reference`.
+
+    Raises:
+        InputError: of an energy function, which nothing here evaluates a second time.
     """
-    model, species, compare = _interaction(subject)
-    pairwise = isinstance(model, CutPotential)
+    simulation = _objects(subject)
+    kind = simulation.potential.name
     models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
-    own = pairwise and isinstance(model.potential, PairFunction)
-    make_model = (lambda: PairModel(pair_forms(model, species, compare))) if pairwise else models[model.name]
+    if not simulation.pairwise and kind not in models:
+        raise InputError("nothing here evaluates an energy function a second time", where=kind)
+    own = isinstance(simulation.potential, PairFunction)
+    make_model = (lambda: PairModel(_forms(simulation))) if simulation.pairwise else models[kind]
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
         False,
@@ -126,6 +113,14 @@ def independent(subject: Simulation | System) -> Reference:
         else "none: the formulas of the system file, written a second time",
         lambda: OnNeighborList(make_model()),
     )  # fmt: skip
+
+
+def _objects(subject: Simulation | System) -> Simulation:
+    return subject if isinstance(subject, Simulation) else build(subject.without_skin)
+
+
+def _forms(simulation: Simulation) -> dict[tuple[str, str], PairForm]:
+    return pair_forms(simulation.model, simulation.symbols, simulation.decider.compare)
 
 
 class StepAtCutoff(ClassicalCalculator):

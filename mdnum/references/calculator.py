@@ -35,59 +35,41 @@ class _Recipe(NamedTuple):
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
-    tables: Mapping[str, Any]  # what it says of itself
-    pairwise: bool  # whether energies belong to atoms
+    tables: Mapping[str, Any]  # what it says of itself; a cutoff where energies belong to atoms
 
 
-def _recipe(system: Any, overrides: Any, potential: Any, cutoff: Any, unit: str) -> _Recipe:
+def _of_system(system: Simulation | System) -> _Recipe:
     if isinstance(system, Simulation):
-        tables = {key: table for key, table in program(system).items() if key in _SAID}
-        return _Recipe(
-            lambda atoms: with_atoms(system, atoms, 0.0), system.rule.skin, tables, system.pairwise
-        )
-    if system is not None:
-        loaded = system if isinstance(system, System) else systems.load(str(system), overrides, world="md")
-        return _Recipe(
-            lambda atoms: systems.build(replace(loaded.without_skin, atoms=atoms)),
-            loaded.spec.skin,
-            loaded.spec.model_dump(exclude_none=True, include=_SAID),
-            loaded.spec.cutoff is not None,
-        )
-    skin = DEFAULT_SKIN[units.get(unit).name]
+        tables = {key: table for key, table in program(system).items() if key in _SAID and table is not None}
+        return _Recipe(lambda atoms: with_atoms(system, atoms, 0.0), system.rule.skin, tables)
+    tables = system.spec.model_dump(exclude_none=True, include=_SAID)
+    bare = system.without_skin
+    return _Recipe(lambda atoms: systems.build(replace(bare, atoms=atoms)), system.spec.skin, tables)
+
+
+def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
+    """From objects, or from the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
-        compare = "r <" if made.cutoff is None else made.cutoff.compare
-        tables = {
-            name: table.model_dump(exclude_none=True) for name, table in made._asdict().items() if table
-        }
-        return _Recipe(
-            lambda atoms: of_atoms(atoms, model_of(made, atoms, Path(), "MdnumCalculator"), compare, unit),
-            skin,
-            {**tables, "units": unit},
-            made.cutoff is not None,
-        )
-    pairwise, tables = isinstance(potential, PairPotential), {"potential": potential, "units": unit}
-    if pairwise != isinstance(cutoff, Cut):
-        message = "a pair potential needs cutoff=mdnum.Cut(kind, radius), and no other takes one"
-        raise InputError(message, where="MdnumCalculator")
-    if not pairwise:
-        return _Recipe(
-            lambda atoms: of_atoms(atoms, potential, units=unit),
-            skin,
-            tables,
-            False,
-        )
-    at = cutoff.radius, cutoff.onset
+        end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path(), "MdnumCalculator")
+        said = {name: table and table.model_dump(exclude_none=True) for name, table in made._asdict().items()}
+    else:
+        if isinstance(potential, PairPotential) != isinstance(cutoff, Cut):
+            message = "a pair potential needs cutoff=mdnum.Cut(kind, radius), and no other takes one"
+            raise InputError(message, where="MdnumCalculator")
+        end, said = cutoff, {"potential": potential, "cutoff": cutoff}
 
-    def make(atoms: Atoms) -> Simulation:
-        model = cut(potential, cutoff.kind, species_of(atoms)[0], *at)
-        return of_atoms(atoms, model, cutoff.compare, unit)
+        def model(atoms: Atoms) -> Any:
+            if end is None:
+                return potential
+            return cut(potential, end.kind, species_of(atoms)[0], end.radius, end.onset)
 
+    compare = "r <" if end is None else end.compare
+    tables = {name: table for name, table in said.items() if table is not None}
     return _Recipe(
-        make,
-        skin,
-        {**tables, "cutoff": cutoff},
-        True,
+        lambda atoms: of_atoms(atoms, model(atoms), compare, unit),
+        DEFAULT_SKIN[units.get(unit).name],
+        {**tables, "units": unit},
     )
 
 
@@ -136,10 +118,12 @@ class MdnumCalculator(ClassicalCalculator):
         if isinstance(system, System | Simulation) and overrides:
             remedy = "Pass the name of the system, or load it with the overrides"
             raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
-        self._recipe = _recipe(system, overrides, potential, cutoff, units)
+        if system is not None and not isinstance(system, System | Simulation):
+            system = systems.load(str(system), overrides, world="md")
+        self._recipe = _of_potential(potential, cutoff, units) if system is None else _of_system(system)
         self._given = system if isinstance(system, Simulation) else None
         self.parameters = Parameters(self._recipe.tables)
-        if not self._recipe.pairwise:
+        if "cutoff" not in self._recipe.tables:
             # a potential of many bodies need not split its energy by atom
             self.implemented_properties = [one for one in self.implemented_properties if one != "energies"]
 
