@@ -12,15 +12,20 @@ and back and forth.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
 from mdnum.references.conformance.case import Case, gas, grid, matrix, sequence
 
+#: (name, path, cell, and what follows of `sequence`'s arguments where it is not as usual).
+Script = Iterator[tuple[Any, ...]]
+
 _R, _SKIN, _L = 1.0, 0.3, 6.0
+_MIDDLE = np.array([3.0, 3.0, 3.0])
 #: What a pair starts beyond the padding and ends inside the cutoff by, in paddings.
 HAIR = 2e-3
 #: Of a ladder, in paddings: which of them a list has that shows no pairs of its skin is not known.
@@ -35,8 +40,15 @@ _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 def movers() -> Iterator[Case]:
     """Scripts for a list that is kept, the short ones first."""
-    for area in (_pairs, _many, _wrapping, _strain, _narrow, _reuse):
-        yield from area()
+    for area, scripts in (
+        ("motion", _pairs),
+        ("motion", _many),
+        ("wrapping", _wrapping),
+        ("strain", _strain),
+    ):
+        yield from (sequence(name, area, path, *rest) for name, path, *rest in scripts())
+    yield from _narrow()
+    yield from _reuse()
 
 
 def sequences() -> Iterator[Case]:
@@ -45,119 +57,113 @@ def sequences() -> Iterator[Case]:
         yield replace(case, skin=0.0)
 
 
-def _pairs() -> Iterator[Case]:
-    middle = np.array([3.0, 3.0, 3.0])
-    apart = _R + 1.01 * _SKIN
-    for share, steps in ((0.9, 1), (0.6, 1), (0.51, 1), (0.9, 9), (0.6, 20)):
-        path = [_two(middle, apart - 2 * share * _SKIN * k / steps) for k in range(steps + 1)]
-        how = "in one step" if steps == 1 else f"in {steps} steps"
-        yield sequence(f"two atoms head-on, each by {share} skins {how}", "motion", path, _L)
-    path = [_two(middle, apart - 0.02 * _SKIN * k) for k in range(120)]
-    yield sequence("two atoms creep together, 120 steps", "motion", path, _L)
-    path = [np.array([middle, middle + np.array([apart - 1.1 * _SKIN * k / 10, 0, 0])]) for k in range(11)]
-    yield sequence("one atom comes to another at rest", "motion", path, _L)
-    others = gas(12, _L, 80)
-    others = others[np.linalg.norm(others - middle, axis=1) > 2.0]
-    path = [np.vstack([_two(middle, apart - 0.09 * _SKIN * k), others]) for k in range(14)]
-    yield sequence("two atoms head-on among others at rest", "motion", path, _L)
-    path = [np.array([middle, middle + np.array([0.9 + 0.01 * k, 0, 0])]) for k in range(40)]
-    yield sequence("two atoms part slowly", "motion", path, _L)
-    at = middle + np.array([apart, 0, 0])
-    out, within = np.array([middle, at]), np.array([middle, middle + np.array([0.5, 0, 0])])
-    yield sequence("an atom jumps in and out", "motion", [out] * 3 + [within] + [out] * 3, _L)
-
-
-def _two(middle: ndarray, apart: float) -> ndarray:
+def _two(apart: float, middle: ndarray = _MIDDLE) -> ndarray:
     half = np.array([apart / 2, 0.0, 0.0])
     return np.array([middle - half, middle + half])
 
 
-def _many() -> Iterator[Case]:
+def _beside(apart: float) -> ndarray:
+    """An atom, and another that moves toward it or away."""
+    return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
+
+
+def _how(steps: int) -> str:
+    return "at once" if steps == 1 else f"in {steps} steps"
+
+
+def _pairs() -> Script:
+    apart = _R + 1.01 * _SKIN
+    for share, steps in ((0.9, 1), (0.6, 1), (0.51, 1), (0.9, 9), (0.6, 20)):
+        how = "in one step" if steps == 1 else _how(steps)
+        path = [_two(apart - 2 * share * _SKIN * k / steps) for k in range(steps + 1)]
+        yield f"two atoms head-on, each by {share} skins {how}", path, _L
+    yield "two atoms creep together, 120 steps", [_two(apart - 0.02 * _SKIN * k) for k in range(120)], _L
+    path = [_beside(apart - 1.1 * _SKIN * k / 10) for k in range(11)]
+    yield "one atom comes to another at rest", path, _L
+    others = gas(12, _L, 80)
+    others = others[np.linalg.norm(others - _MIDDLE, axis=1) > 2.0]
+    path = [np.vstack([_two(apart - 0.09 * _SKIN * k), others]) for k in range(14)]
+    yield "two atoms head-on among others at rest", path, _L
+    yield "two atoms part slowly", [_beside(0.9 + 0.01 * k) for k in range(40)], _L
+    out = [_beside(apart)] * 3
+    yield "an atom jumps in and out", [*out, _beside(0.5), *out], _L
+
+
+def _many() -> Script:
     start = gas(40, _L, 81)
-    yield sequence("nothing moves", "motion", [start] * 5, _L)
+    yield "nothing moves", [start] * 5, _L
     drift = np.array([0.011, 0.007, -0.005])
-    yield sequence("all atoms drift slowly", "motion", [start + k * drift for k in range(120)], _L)
+    yield "all atoms drift slowly", [start + k * drift for k in range(120)], _L
     speeds = np.random.default_rng(82).normal(size=start.shape)
     speeds /= np.linalg.norm(speeds, axis=1)[:, None]
     for step, steps in ((0.01, 110), (0.03, 60), (0.1, 20), (0.4, 8), (2.5, 5)):
-        path = [start + k * step * speeds for k in range(steps)]
-        yield sequence(f"a gas, {step} r_cut at a step", "motion", path, _L)
+        yield f"a gas, {step} r_cut at a step", [start + k * step * speeds for k in range(steps)], _L
     fast = [np.vstack([start[0] + 0.8 * k * np.array([1.0, 0.6, 0.3]), start[1:]]) for k in range(12)]
-    yield sequence("one fast atom among atoms at rest", "motion", fast, _L)
+    yield "one fast atom among atoms at rest", fast, _L
     path = [gas(30, 4.0, 83) * (1 + 0.1 * abs(5 - k)) for k in range(11)]
-    name = "a free cluster flies apart and comes back"
-    yield sequence(name, "motion", path, np.zeros((3, 3)), pbc=False)
+    yield "a free cluster flies apart and comes back", path, np.zeros((3, 3)), _R, _SKIN, False
     order = np.random.default_rng(84).permutation(len(start))
-    yield sequence("atoms change places", "motion", [start, start[order], start], _L)
+    yield "atoms change places", [start, start[order], start], _L
     dense, sparse = 3.0 + 0.25 * gas(40, _L, 85, -1.0, 1.0), gas(40, _L, 86)
-    yield sequence("dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L)
+    yield "dense, sparse, dense, sparse", [sparse, dense, sparse, dense, sparse], _L
     jitter = np.random.default_rng(87).normal(scale=0.12, size=(60, *start.shape))
-    yield sequence("a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L)
+    yield "a jitter of a third of the skin", [start + noise for noise in jitter], _L
 
 
-def _wrapping() -> Iterator[Case]:
+def _wrapping() -> Script:
     start = gas(30, _L, 90)
     speeds = np.random.default_rng(91).normal(scale=0.05, size=start.shape)
     whole = [start + k * speeds for k in range(50)]
-    yield sequence("atoms leave the box", "wrapping", whole, _L)
-    yield sequence("atoms are wrapped as they leave", "wrapping", [np.mod(x, _L) for x in whole], _L)
+    yield "atoms leave the box", whole, _L
+    yield "atoms are wrapped as they leave", [np.mod(x, _L) for x in whole], _L
     twice = [np.mod(x, _L) if k % 2 else x for k, x in enumerate(whole)]
-    yield sequence("atoms are wrapped at every other step", "wrapping", twice, _L)
+    yield "atoms are wrapped at every other step", twice, _L
     rng = np.random.default_rng(92)
     tossed = [start + _L * rng.integers(-2, 3, start.shape) for _ in range(6)]
-    yield sequence("other images of the same atoms", "wrapping", tossed, _L)
+    yield "other images of the same atoms", tossed, _L
     pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + np.array([k * 0.01 - 0.1, 0, 0]) for k in range(20)]
-    yield sequence("a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L)
-    meet = [
-        np.array([[0.02 + 0.01 * k, 3, 3], [_L - 1.4 + 0.01 * k * (1 + k / 10), 3, 3]]) for k in range(30)
-    ]
-    yield sequence("an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L)
+    yield "a pair goes through a face, wrapped", [np.mod(x, _L) for x in pair], _L
+    places = ((0.02 + 0.01 * k, _L - 1.4 + 0.01 * k * (1 + k / 10)) for k in range(30))
+    meet = [np.mod([[one, 3, 3], [other, 3, 3]], _L) for one, other in places]
+    yield "an atom follows another through a face", meet, _L
     skewed = np.array([[5.0, 0, 0], [2.0, 5.0, 0], [-1.5, 1.0, 5.0]])
-    slanted = gas(30, skewed, 93)
-    moved = [slanted + k * speeds[:30] for k in range(40)]
+    moved = [gas(30, skewed, 93) + k * speeds for k in range(40)]
     home = [x - np.floor(np.linalg.solve(skewed.T, x.T).T) @ skewed for x in moved]
-    yield sequence("a skewed box, atoms are wrapped", "wrapping", home, skewed)
+    yield "a skewed box, atoms are wrapped", home, skewed
 
 
-def _strain() -> Iterator[Case]:
+def _strain() -> Script:
     apart = _R + _SKIN + 0.01
     edge = 4.0
     across = np.array([[apart / 2, 2, 2], [edge - apart / 2, 2, 2]])
     for total, steps in ((0.35, 1), (0.6, 1), (1.0, 1), (0.35, 10), (0.35, 100)):
-        path = [(across, np.diag([edge - total * k / steps, edge, edge])) for k in range(steps + 1)]
-        how = "at once" if steps == 1 else f"in {steps} steps"
-        yield sequence(f"the box shrinks by {total} {how}, the atoms rest", "strain", path, edge)
+        path = [(across, [edge - total * k / steps, edge, edge]) for k in range(steps + 1)]
+        yield f"the box shrinks by {total} {_how(steps)}, the atoms rest", path, edge
     close = np.array([[0.5, 2, 2], [edge - 0.5 - 1e-9, 2, 2]])
-    path = [(close, np.diag([edge, edge, edge])), (close, np.diag([edge - 2e-9, edge, edge]))]
-    yield sequence("the box shrinks by 2e-9, no skin", "strain", path, edge, _R, 0.0)
+    path = [(close, edge), (close, [edge - 2e-9, edge, edge])]
+    yield "the box shrinks by 2e-9, no skin", path, edge, _R, 0.0
     start = gas(40, _L, 100)
-    for scale, word in ((0.97, "shrinks"), (1.03, "grows")):
-        factors = scale ** np.arange(9)
-        path = [(start * f, np.eye(3) * _L * f) for f in factors]
-        yield sequence(f"the box {word} and takes the atoms along", "strain", path, _L)
-    factors = 0.995 ** np.arange(40)
-    path = [(start * f, np.eye(3) * _L * f) for f in factors]
-    yield sequence("the box shrinks slowly and takes the atoms along", "strain", path, _L)
+    for factor, steps, words in ((0.97, 9, "shrinks"), (1.03, 9, "grows"), (0.995, 40, "shrinks slowly")):
+        path = [(start * f, _L * f) for f in factor ** np.arange(steps)]
+        yield f"the box {words} and takes the atoms along", path, _L
     for size in (0.02, 0.2):
         shears = [np.array([[1.0, 0, 0], [size * k, 1, 0], [0, 0, 1]]) for k in range(9)]
-        path = [(start @ shear, _L * shear) for shear in shears]
-        yield sequence(f"the box is sheared by {size} at a step", "strain", path, _L)
+        yield f"the box is sheared by {size} at a step", [(start @ shear, _L * shear) for shear in shears], _L
     over = np.array([[1.0, 0.3, 2], [2.4, edge - 0.3, 2], [3.0, 2, 2]])
     for steps in (1, 12):
         tilts = [np.array([[edge, 0, 0], [1.4 * k / steps, edge, 0], [0, 0, edge]]) for k in range(steps + 1)]
-        how = "at once" if steps == 1 else f"in {steps} steps"
-        name = f"the box is sheared {how}, the atoms rest, the volume stays"
-        yield sequence(name, "strain", [(over, tilt) for tilt in tilts], edge)
-    swapped = [(across, np.diag([edge - w, edge * edge / (edge - w), edge])) for w in np.linspace(0, 0.5, 6)]
-    yield sequence("one edge shrinks, one grows, the atoms rest", "strain", swapped, edge)
+        name = f"the box is sheared {_how(steps)}, the atoms rest, the volume stays"
+        yield name, [(over, tilt) for tilt in tilts], edge
+    swapped = [(across, [edge - w, edge * edge / (edge - w), edge]) for w in np.linspace(0, 0.5, 6)]
+    yield "one edge shrinks, one grows, the atoms rest", swapped, edge
     angles = np.linspace(0.0, 1.2, 7)
     turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
-    yield sequence("box and atoms turn", "strain", [(start @ turn, _L * turn) for turn in turns], _L)
-    mixed = [(start * (1 - 0.004 * k) + 0.01 * k, np.eye(3) * _L * (1 - 0.004 * k)) for k in range(12)]
-    yield sequence("the box shrinks while the atoms drift", "strain", mixed, _L)
+    yield "box and atoms turn", [(start @ turn, _L * turn) for turn in turns], _L
+    mixed = [(start * (1 - 0.004 * k) + 0.01 * k, _L * (1 - 0.004 * k)) for k in range(12)]
+    yield "the box shrinks while the atoms drift", mixed, _L
     few = gas(5, 2.3, 101)
-    path = [(few * f, np.eye(3) * 2.3 * f) for f in (1.0, 0.9, 0.75, 0.6, 0.5, 0.8)]
-    yield sequence("the box shrinks below two cutoffs", "strain", path, 2.3)
+    path = [(few * f, 2.3 * f) for f in (1.0, 0.9, 0.75, 0.6, 0.5, 0.8)]
+    yield "the box shrinks below two cutoffs", path, 2.3
 
 
 def _narrow() -> Iterator[Case]:
@@ -190,30 +196,21 @@ def _reuse() -> Iterator[Case]:
     yield sequence("fewer atoms each time", "reuse", [start[:n] for n in (40, 23, 9, 2, 1, 0)], _L)
     yield sequence("more atoms each time", "reuse", [start[:n] for n in (1, 2, 9, 23, 40)], _L)
     yield sequence("an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L)
-    yield _anew(sequence("as many other atoms", "reuse", [start, other, start], _L))
-    yield _anew(sequence("many neighbors, then few, then many", "reuse", [dense, start, dense, start], _L))
-    boxes = [(start, np.eye(3) * _L), (start, np.eye(3) * 9.0), (start * 0.6, np.eye(3) * 3.6)]
-    yield _anew(sequence("other boxes", "reuse", boxes, _L))
-    yield _other_skins()
-    yield _anew(sequence("the same atoms three times", "reuse", [start] * 3, _L))
+    yield _anew("as many other atoms", [start, other, start])
+    yield _anew("many neighbors, then few, then many", [dense, start, dense, start])
+    yield _anew("other boxes", [(start, _L), (start, 9.0), (start * 0.6, 3.6)])
+    # each time two atoms come in, with a thinner skin and with a thicker one
+    path = [_two(_R + (1.01 - closed) * skin) for skin in (0.6, 0.1, 0.6) for closed in (0.0, 0.6, 1.8)]
+    yield _anew("started anew with another skin", path, (0.6, None, None, 0.1, None, None, 0.6, None, None))
+    yield _anew("the same atoms three times", [start] * 3)
 
 
-def _other_skins() -> Case:
-    """A list that starts anew with a thinner skin, and with a thicker one; each time two atoms come in."""
-    middle, path, skins = np.array([3.0, 3.0, 3.0]), [], []
-    for skin in (0.6, 0.1, 0.6):
-        apart = _R + 1.01 * skin
-        path += [_two(middle, apart), _two(middle, apart - 0.6 * skin), _two(middle, apart - 1.8 * skin)]
-        skins += [skin, None, None]
-    case = sequence("started anew with another skin", "reuse", path, _L, _R, max(filter(None, skins)))
-    starts = zip(case.stills, skins, strict=True)
-    stills = tuple(replace(still, fresh=skin is not None, skin=skin) for still, skin in starts)
-    return replace(case, stills=stills)
-
-
-def _anew(case: Case) -> Case:
-    """A script in which every still is another question to the same list."""
-    return replace(case, stills=tuple(replace(still, fresh=True) for still in case.stills))
+def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
+    """Every still is another question to the same list, or those are for which a skin is given."""
+    case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
+    starts = zip(case.stills, skins or [None] * len(path), strict=True)
+    stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
+    return replace(case, stills=tuple(stills))
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
