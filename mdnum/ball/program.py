@@ -16,14 +16,10 @@ from mdnum.ball.limits import spacing
 from mdnum.ball.problem import START, BallProblem
 from mdnum.ball.rollout import BallRun, CrossDecision, cross_decisions, overridden, simulate, undecided
 from mdnum.ball.step import BallDecisions, Projection
+from mdnum.ball.world import PARAMETERS
 from mdnum.errors import InputError
 from mdnum.numerics.events import Ledger
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
-
-#: Words of system files for what the world calls otherwise.
-_SHORT = {"timestep": "h", "dt": "h", "height": "y0", "velocity": "v0", "tolerance": "tol"}
-#: Units of what is not a pure number.
-_UNITS = {"y0": "m", "v0": "m/s", "h": "s", "tol": "m", "gravity": "m/s²", "k": "1/s²", "damping": "1/s"}
 
 
 @dataclass(frozen=True)
@@ -224,7 +220,7 @@ class BallProgram:
             InputError: there is none of that name.
         """
         word = key.rpartition(".")[2]
-        word = _SHORT.get(word, word)
+        word = next((name for name, row in PARAMETERS.items() if word in row.get("words", ())), word)
         problem, world = self.problem, self.problem.world
         if word not in START and not world.has(word):
             known = ", ".join([*world.parameters, *START])
@@ -237,15 +233,14 @@ class BallProgram:
 
         values = np.unique(np.asarray(problem.values([word])[word], np.float64))
         is_gain = word == "k" and isinstance(world.contact, Projection)
-        role = "state" if word in START else "decision" if word in ("tol", "enter") else "arithmetic"
         return Number(
             key=word,
             value=float(values[0]) if len(values) == 1 else None,
-            unit="" if is_gain else _UNITS.get(word, ""),
+            unit="" if is_gain else PARAMETERS[word].get("unit", ""),
             at=at,
             positive=word not in ("y0", "v0", "gravity"),
             zero=True,
-            dtype=world.policy.dtype(role),
+            dtype=world.policy.dtype(PARAMETERS[word].get("role", "arithmetic")),
         )
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:

@@ -191,19 +191,11 @@ def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
 def _chunk(world: World, state: BallState, imposed: Any, length: int, history: bool) -> Any:
     def step(state, given):
         after, record = world.advance(state, imposed=given, history=history)
-        solve = record.solve
-        row = {
-            "y": after.y,
-            "v": after.v,
-            "height": record.height,
-            "contact": record.contact,
-            "iterations": solve.iterations,
-            "reason": solve.reason,
-            "residual": solve.residual,
-            "margin": solve.margin,
-            "before": solve.before,
-        }
-        return after, row | ({"history": solve.history} if history else {})
+        row = {"y": after.y, "v": after.v, "height": record.height, "contact": record.contact}
+        solve = record.solve._asdict()
+        if not history:
+            del solve["history"]
+        return after, row | solve
 
     return lax.scan(step, state, imposed, length=length)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Mapping
+from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -32,29 +35,10 @@ from mdnum.numerics.exact import zero_bits
 from mdnum.numerics.formats import stochastic_round
 from mdnum.numerics.roles import RolePrecision
 
-#: Where each parameter lives; the first place that a world has is meant.
-_PLACES: Mapping[str, tuple[tuple[str, ...], ...]] = {
-    "k": (("contact", "k"),),
-    "damping": (("contact", "damping"),),
-    "eps": (("contact", "eps"),),
-    "alpha": (("contact", "alpha"),),
-    "restitution": (("contact", "restitution"),),
-    "rest_speed": (("contact", "rest_speed"),),
-    "tol": (("contact", "stop", "tol"), ("contact", "stop", "rule", "tol"), ("integrator", "stop", "tol")),
-    "enter": (("contact", "stop", "enter"),),
-    "h": (("integrator", "h"),),
-    "gravity": (("gravity",),),
-    "lift": (("lift",),),
-}
-#: Least and greatest value, and whether the least itself is too small.
-_RANGES: Mapping[str, tuple[float, float, bool]] = {
-    **dict.fromkeys(("k", "eps", "alpha", "tol", "h"), (0.0, math.inf, True)),
-    **dict.fromkeys(("damping", "rest_speed", "enter", "lift"), (0.0, math.inf, False)),
-    "restitution": (0.0, 1.0, False),
-    "gravity": (-math.inf, math.inf, False),
-}
-#: Compared in the dtype of decisions, so not rounded to the dtype of arithmetic before.
-_DECIDING = ("tol", "enter")
+#: What is known of each parameter.
+PARAMETERS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
+    Path(__file__).with_name("parameters.toml").read_text(encoding="utf-8")
+)
 #: Iterations are counted in 32 bits.
 _MOST_ITERATIONS = 2**31 - 1
 
@@ -109,17 +93,17 @@ class World(eqx.Module):
         fence = Rounding(zero_bits(np.float64))
         world = cls(contact, integrator, gravity, control, hysteresis, fence, policy)
         _check(world)
-        values = {name: world.value(name) for name in _PLACES if world.has(name)}
+        values = {name: world.value(name) for name in world.parameters}
         if control is not None:
             world = eqx.tree_at(lambda w: w.control, world, jnp.asarray(control, policy.dtype("arithmetic")))
         return world.with_values(values)
 
     # -- parameters ----------------------------------------------------------------------------------
 
-    def _place(self, name: str) -> tuple[str, ...] | None:
-        for path in _PLACES.get(name, ()):
+    def _place(self, name: str) -> str | None:
+        for path in PARAMETERS.get(name, {}).get("places", ()):
             node: Any = self
-            for part in path:
+            for part in path.split("."):
                 node = getattr(node, part, None)
             if node is not None:
                 return path
@@ -132,9 +116,9 @@ class World(eqx.Module):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that this world has."""
-        return tuple(name for name in _PLACES if self.has(name))
+        return tuple(name for name in PARAMETERS if self.has(name))
 
-    def _known(self, name: str) -> tuple[str, ...]:
+    def _known(self, name: str) -> str:
         path = self._place(name)
         if path is None:
             raise InputError(
@@ -148,7 +132,7 @@ class World(eqx.Module):
         Raises:
             InputError: there is none of that name here.
         """
-        return _get(self, self._known(name))
+        return attrgetter(self._known(name))(self)
 
     def with_values(self, values: Mapping[str, Any]) -> World:
         """The same world with other values; nothing is checked, so values may be traced.
@@ -159,9 +143,9 @@ class World(eqx.Module):
         world = self
         for name, value in values.items():
             path = self._known(name)
-            dtype = np.dtype(np.float64) if name in _DECIDING else self.policy.dtype("arithmetic")
-            cast = jnp.asarray(value).astype(dtype)
-            world = eqx.tree_at(lambda w, path=path: _get(w, path), world, cast)
+            decides = PARAMETERS[name].get("role") == "decision"
+            cast = jnp.asarray(value).astype(np.float64 if decides else self.policy.dtype("arithmetic"))
+            world = eqx.tree_at(attrgetter(path), world, cast)
         return world
 
     # -- decide ----------------------------------------------------------------------------------------
@@ -258,12 +242,6 @@ def _start(world: World, y: Array, v: Array) -> BallState:
     return BallState(step, y, v, a, touching)
 
 
-def _get(node: Any, path: tuple[str, ...]) -> Any:
-    for part in path:
-        node = getattr(node, part)
-    return node
-
-
 def _check(world: World) -> None:
     """Refuse numbers out of range and parts that do not go together, before anything runs."""
     contact: Any = world.contact
@@ -327,8 +305,9 @@ def _count(name: str, value: int) -> None:
 
 
 def _in_range(name: str, value: Any) -> None:
-    least, most, strictly = _RANGES[name]
-    x = float(value)
+    row, x = PARAMETERS[name], float(value)
+    strictly, most = "above" in row, row.get("most", math.inf)
+    least = row.get("above", row.get("least", -math.inf))
     if math.isfinite(x) and least <= x <= most and not (strictly and x == least):
         return
     expected = f"finite number {'above' if strictly else 'of at least'} {least:g}"
