@@ -6,13 +6,13 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from importlib import metadata
 from typing import Any, Protocol
 
 import numpy as np
 from numpy import ndarray
 
 from mdnum.errors import InputError
+from mdnum.provenance import version
 from mdnum.references.conformance.case import Case
 from mdnum.references.oracle import completed, widths
 from mdnum.registry import Registry
@@ -113,13 +113,6 @@ class ListLimits:
 LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(ListLimits) if limit.default is False}
 
 
-def _version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 @dataclass(frozen=True)
 class PairList:
     """A neighbor list under test."""
@@ -146,13 +139,13 @@ class PairList:
     @property
     def version(self) -> str | None:
         """Installed version of its package, or None."""
-        return None if self.package is None else _version(self.package)
+        return self.package and version(self.package)
 
     @property
     def lacks(self) -> list[str]:
         """Distributions that it needs and that are not installed."""
         needed = (*((self.package,) if self.package else ()), *self.needs)
-        return [name for name in needed if _version(name) is None]
+        return [name for name in needed if version(name) is None]
 
     def with_options(self, **options: Any) -> PairList:
         """The same with other declarations; None leaves one as it is."""
@@ -162,48 +155,6 @@ class PairList:
 #: Lists with a name, installed or not; another package adds a `PairList`, a function or a class of lists that
 #: are kept by an entry point "mdnum.neighbor_lists".
 LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
-
-
-def peer(
-    name: str,
-    package: str,
-    *helpers: Any,
-    given: Mapping[str, Any] | None = None,
-    about: str = "",
-    **declared: Any,
-) -> Callable[[Any], Any]:
-    """Decorates a function, or a class of lists that are kept, which `LISTS` then has by this name.
-
-    Args:
-        package: distribution whose version counts.
-        helpers: what its lines need beside themselves, for a script without mdnum.
-        given: arguments by keyword, where one function is several lists.
-        about: one line; the first of the docstring by default.
-        declared: attributes of `PairList`.
-    """
-
-    def register(made: Any) -> Any:
-        kept = inspect.isclass(made)
-        called, call = made, made.__name__
-        if given:
-            called = functools.partial(made, **given)
-            arguments = ", ".join(f"{word}={value!r}" for word, value in given.items())
-            call = f"(lambda *given: {call}(*given, {arguments}))"
-        listed = PairList(
-            name,
-            called if kept else lambda: called,
-            kept,
-            package,
-            source="\n\n".join(source_of(one) for one in (*helpers, made)),
-            call=call,
-            description=about or (inspect.getdoc(made) or "").partition("\n")[0].rstrip("."),
-            word=name,
-            **declared,
-        )
-        LISTS.add(name, listed, description=listed.description)
-        return made
-
-    return register
 
 
 def source_of(made: Any) -> str:

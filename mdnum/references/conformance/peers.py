@@ -9,35 +9,61 @@ nothing: atoms outside the box, odd cells and few atoms go in as they are.
 # (attributes begin as None without a type: a script that prints a class knows no Any)
 from __future__ import annotations
 
+import functools
+import inspect
+import tomllib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mdnum.errors import InputError
-from mdnum.references.conformance.lists import LISTS, ListLimits, PairList, from_object, peer
+from mdnum.references.conformance.lists import LISTS, ListLimits, PairList, from_object, source_of
 from mdnum.references.load import place
 from mdnum.registry import nearest
 
-_SINGLE = 2.0**-24
-#: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
-_OF_MDANALYSIS = ListLimits(
-    minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, least_cutoff=1e-3
-)
-#: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
-#: and without a cell list; in free space, where displacement(a, b) is -displacement(b, a), none.
-_JAX_MD_KNOWN = {
-    "ONE_SIDED": "Its periodic displacement, mod(d + L/2, L) - L/2, rounds otherwise from i to j than from j "
-    "to i, and each direction is decided by itself; in free space no pair is one-sided."
-}
-# its box matrix is upper triangular, with vectors as columns
-_OF_JAX_MD = ListLimits(
-    minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, most_atoms=5_000
-)
-_NUMPY = "Plain numpy, one image of every pair"
-_FEW = ListLimits(minimum_image=True, most_atoms=5_000)
+_DECLARED: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-@peer("numpy", "numpy", full=False, limits=_FEW, about=f"{_NUMPY}: r < r_cut")
-@peer("numpy-r2", "numpy", full=False, limits=_FEW, given={"squared": True}, about=f"{_NUMPY}: r² < r_cut²")
+def _declared(name: str) -> dict[str, Any]:
+    row = dict(_DECLARED[name])
+    if (other := row.pop("like", None)) is None:
+        return row
+    base = _declared(other)
+    return {**base, **row, "limits": {**base.get("limits", {}), **row.get("limits", {})}}
+
+
+def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
+    """Decorates a function, or a class of lists that are kept, which `LISTS` then has by these names.
+
+    Args:
+        names: of peers.toml.
+        helpers: what its lines need beside themselves, for a script without mdnum.
+    """
+
+    def register(made: Any) -> Any:
+        kept, source = inspect.isclass(made), "\n\n".join(source_of(one) for one in (*helpers, made))
+        for name in names:
+            declared = _declared(name)
+            given, call = declared.pop("given", {}), made.__name__
+            about = declared.pop("about", (inspect.getdoc(made) or "").partition("\n")[0].rstrip("."))
+            called = functools.partial(made, **given) if given else made
+            if given:
+                arguments = ", ".join(f"{word}={value!r}" for word, value in given.items())
+                call = f"(lambda *given: {call}(*given, {arguments}))"
+            declared["limits"] = ListLimits(**declared.get("limits", {}))
+            declared["needs"] = tuple(declared.get("needs", ()))
+            listed = PairList(
+                name, called if kept else lambda called=called: called, kept, source=source, call=call,
+                description=about, word=name, **declared,
+            )  # fmt: skip
+            LISTS.add(name, listed, description=about)
+        return made
+
+    return register
+
+
+@peer("numpy-r2", "numpy")
 def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
     """Plain numpy, one image of every pair."""
 
@@ -54,7 +80,7 @@ def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
     return {"i": i[inside], "j": j[inside]}
 
 
-@peer("ase", "ase", affords=0.3, limits=ListLimits(least_cutoff=0.5))
+@peer("ase")
 def ase_neighbor_list(positions, cell, pbc, r_cut):
     """ase.neighborlist.neighbor_list."""
 
@@ -66,7 +92,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("ase-skin", "ase", affords=0.1, limits=ListLimits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
+@peer("ase-skin")
 class AseSkinList:
     """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
 
@@ -101,14 +127,13 @@ class AseSkinList:
         return {"i": i, "j": j, "shift": shift}
 
 
-@peer("ase-primitive", "ase", AseSkinList, affords=0.3, limits=ListLimits(atoms=1, most_atoms=20_000))
+@peer("ase-primitive", helpers=[AseSkinList])
 def ase_primitive_list(positions, cell, pbc, r_cut):
     """the list under ASE's LennardJones, EAM and Tersoff."""
     return AseSkinList("PrimitiveNeighborList").allocate(positions, cell, pbc, r_cut, 0.0)
 
 
-@peer("vesin-half", "vesin", given={"half": True}, about="vesin, every pair once")
-@peer("vesin", "vesin")
+@peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
     """vesin's cell list, every pair from both atoms."""
 
@@ -120,7 +145,7 @@ def vesin_cells(positions, cell, pbc, r_cut, half=False):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("matscipy", "matscipy", limits=ListLimits(whole_cell=True))
+@peer("matscipy")
 def matscipy_list(positions, cell, pbc, r_cut):
     """matscipy.neighbours.neighbour_list."""
 
@@ -132,7 +157,7 @@ def matscipy_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("pymatgen", "pymatgen", limits=ListLimits(least_cutoff=0.01))
+@peer("pymatgen")
 def pymatgen_points(positions, cell, pbc, r_cut):
     """pymatgen's find_points_in_spheres."""
 
@@ -153,17 +178,7 @@ def pymatgen_points(positions, cell, pbc, r_cut):
     return {"i": i[other], "j": j[other], "shift": shift[other].astype(int), "distance": distance[other]}
 
 
-@peer(
-    "mdanalysis-brute",
-    "MDAnalysis",
-    full=False,
-    unit=_SINGLE,
-    affords=0.3,
-    limits=replace(_OF_MDANALYSIS, most_atoms=20_000),
-    given={"method": "bruteforce"},
-    about="MDAnalysis, bruteforce",
-)
-@peer("mdanalysis", "MDAnalysis", full=False, unit=_SINGLE, affords=0.3, limits=_OF_MDANALYSIS)
+@peer("mdanalysis", "mdanalysis-brute")
 def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
     """MDAnalysis, nsgrid."""
 
@@ -176,7 +191,7 @@ def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
-@peer("scipy", "scipy", full=False, limits=ListLimits(minimum_image=True, along_axes=True))
+@peer("scipy")
 def scipy_tree(positions, cell, pbc, r_cut):
     """scipy.spatial.KDTree.query_pairs."""
 
@@ -189,7 +204,7 @@ def scipy_tree(positions, cell, pbc, r_cut):
     return {"i": pairs[:, 0], "j": pairs[:, 1]}
 
 
-@peer("freud", "freud-analysis", unit=_SINGLE, limits=replace(_OF_MDANALYSIS, least_cutoff=0.0, atoms=1))
+@peer("freud")
 def freud_query(positions, cell, pbc, r_cut):
     """freud.locality.AABBQuery."""
 
@@ -208,8 +223,7 @@ def freud_query(positions, cell, pbc, r_cut):
     return {"i": found.query_point_indices, "j": found.point_indices, "distance": found.distances}
 
 
-# its documentation asks for wrapped positions and for periodicity along all axes or none
-@peer("torch-sim", "torch-sim-atomistic", affords=0.3, limits=ListLimits(wrapped=True, all_axes=True))
+@peer("torch-sim")
 def torch_sim_pairs(positions, cell, pbc, r_cut):
     """torch-sim's linked cells."""
 
@@ -228,13 +242,7 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-@peer(
-    "nvalchemi-ops",
-    "nvalchemi-toolkit-ops",
-    needs=("torch",),
-    affords=0.3,
-    limits=ListLimits(whole_cell=True),
-)
+@peer("nvalchemi-ops")
 def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
     """nvalchemi-ops' cell_list."""
 
@@ -250,13 +258,7 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-@peer(
-    "jax-md-kept",
-    "jax-md",
-    affords=0.01,
-    known=_JAX_MD_KNOWN,
-    limits=replace(_OF_JAX_MD, fixed_cell=True, atoms=1),
-)
+@peer("jax-md-kept")
 class JaxMdList:
     """jax-md's partition.neighbor_list, allocated and updated, as its documentation shows."""
 
@@ -321,13 +323,13 @@ class JaxMdList:
         return {"i": i[real], "j": j[real]}
 
 
-@peer("jax-md", "jax-md", JaxMdList, affords=0.01, known=_JAX_MD_KNOWN, limits=_OF_JAX_MD)
+@peer("jax-md", helpers=[JaxMdList])
 def jax_md_pairs(positions, cell, pbc, r_cut):
     """jax-md's partition.neighbor_list, allocated each time."""
     return JaxMdList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
-@peer("mdnum-verlet", "mdnum", limits=ListLimits(minimum_image=True, atoms=1))
+@peer("mdnum-verlet")
 class MdnumVerletList:
     """mdnum's own list with a skin: rebuilt before it is used up, box strain counted."""
 
@@ -355,7 +357,7 @@ class MdnumVerletList:
         return {"i": i, "j": rows[i, slot]}
 
 
-@peer("mdnum", "mdnum", MdnumVerletList, limits=ListLimits(minimum_image=True, atoms=1))
+@peer("mdnum", helpers=[MdnumVerletList])
 def mdnum_host_list(positions, cell, pbc, r_cut):
     """mdnum's own cell list."""
     return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)
