@@ -16,6 +16,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 
 
 def python(*words: str) -> list[str]:
@@ -62,6 +63,25 @@ def guard(parent: int) -> None:
         # a grid of cells over a huge box is a MemoryError, not a machine that swaps
         have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         resource.setrlimit(resource.RLIMIT_DATA, (have // 2, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+
+
+def executed(file: Path, name: str) -> ModuleType:
+    """What a Python file holds once it was run, as a module that has this name unless another has it.
+
+    Raises:
+        BaseException: whatever the file raises.
+    """
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None  # of every file that ends in .py
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault(name, module)  # inspect, dataclasses and pickles look a module up by its name
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        if sys.modules.get(name) is module:
+            del sys.modules[name]
+        raise
+    return module
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:

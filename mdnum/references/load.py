@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from typing import Any
 
 from mdnum.errors import InputError, in_a_line
 from mdnum.registry import nearest
-from mdnum.safe_path import search_last
+from mdnum.safe_path import executed, search_last
 
 _counter = itertools.count()
 
@@ -54,15 +52,14 @@ class NamedObject:
             InputError: there is no such module, file or name, an argument is no literal, or importing or
                 calling it failed; with what to write instead.
         """
-        module = self._run(anew) if self.is_file else self._import()
+        module = self._module(anew)
         if not self.call:
             return self._default(module, defaults)
         try:
             node = ast.parse(self.call, mode="eval").body
         except SyntaxError:
-            raise self._wrong(
-                f"{self.call!r} is not a name with arguments", "Write thing(argument=value)"
-            ) from None
+            message = f"{self.call!r} is not a name with arguments"
+            raise self._wrong(message, "Write thing(argument=value)") from None
         if not isinstance(node, ast.Call):
             return self._attribute(node, module)
         target = self._attribute(node.func, module)
@@ -89,44 +86,28 @@ class NamedObject:
     def _wrong(self, message: str, remedy: str) -> InputError:
         return InputError(message, where=self.text, remedy=remedy)
 
-    def _import(self) -> ModuleType:
+    def _module(self, anew: bool) -> ModuleType:
+        path = Path(self.home).expanduser()
+        if self.is_file and not path.is_file():
+            raise InputError("no such file", where=self.home, remedy="Give the path of a Python file")
         try:
-            search_last(".", self.home)  # a module beside the person is found, too
-            return importlib.import_module(self.home)
+            if not self.is_file:
+                search_last(".", self.home)  # a module beside the person is found, too
+                return importlib.import_module(self.home)
+            # it can import its neighbors; unlike with `python file.py`, none of them hides a package
+            search_last(path.parent)
+            return executed(path, f"_mdnum_{path.stem}_{next(_counter)}" if anew else path.stem)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # whatever a module raises while it is imported, SystemExit too
-            raise self._not_imported(error) from error
-
-    def _run(self, anew: bool) -> ModuleType:
-        path = Path(self.home).expanduser()
-        if not path.is_file():
-            raise InputError("no such file", where=self.home, remedy="Give the path of a Python file")
-        name = f"_mdnum_{path.stem}_{next(_counter)}" if anew else path.stem
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None and spec.loader is not None  # of every file that ends in .py
-        module = importlib.util.module_from_spec(spec)
-        sys.modules.setdefault(name, module)  # dataclasses and pickles look a module up by its name
-        try:
-            # it can import its neighbors; unlike with `python file.py`, none of them hides a package
-            search_last(path.parent)
-            spec.loader.exec_module(module)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            if sys.modules.get(name) is module:
-                del sys.modules[name]
-            raise self._not_imported(error) from error
-        return module
-
-    def _not_imported(self, error: BaseException) -> InputError:
-        remedy = "Correct what it does when it is imported"
-        if isinstance(error, ImportError):
-            missing = getattr(error, "name", None)
-            remedy = f"Install {missing}, or correct the name" if missing else "Install what it needs"
-        elif isinstance(error, SyntaxError):
-            remedy = "Correct that line"
-        return InputError(f"cannot be imported: {in_a_line(error)}", where=self.home, remedy=remedy)
+            remedy = "Correct what it does when it is imported"
+            if isinstance(error, ImportError):
+                missing = getattr(error, "name", None)
+                remedy = f"Install {missing}, or correct the name" if missing else "Install what it needs"
+            elif isinstance(error, SyntaxError):
+                remedy = "Correct that line"
+            message = f"cannot be imported: {in_a_line(error)}"
+            raise InputError(message, where=self.home, remedy=remedy) from error
 
     def _default(self, module: ModuleType, defaults: Sequence[str]) -> Any:
         for name in defaults:
@@ -134,10 +115,8 @@ class NamedObject:
                 return getattr(module, name)
         names = public(module)
         lacks = f", which has no {' or '.join(defaults)}" if defaults else ", and not a thing in it"
-        remedy = (
-            f"Give {self.home}:{names[0]}. It has {', '.join(names[:8])}" if names else "It has no function"
-        )
-        raise InputError(f"{self.home} is a file{lacks}", remedy=remedy)
+        has = f"Give {self.home}:{names[0]}. It has {', '.join(names[:8])}" if names else "It has no function"
+        raise InputError(f"{self.home} is a file{lacks}", remedy=has)
 
     def _attribute(self, node: ast.expr, module: ModuleType) -> Any:
         """The object that a dotted name means."""
@@ -154,13 +133,10 @@ class NamedObject:
         for part in reversed([*parts, node.id]):
             if not hasattr(value, part):
                 names = public(value)
+                has = ", ".join(names[:8]) or "no function: give the name of one"
                 close = nearest(part, names)
-                has = (
-                    f"It has {', '.join(names[:8])}" if names else "It has no function: give the name of one"
-                )
-                raise InputError(
-                    f"{where} has no {part!r}", remedy=f"Did you mean {close}?" if close else has
-                )
+                remedy = f"Did you mean {close}?" if close else f"It has {has}"
+                raise InputError(f"{where} has no {part!r}", remedy=remedy)
             value, where = getattr(value, part), f"{where}.{part}"
         return value
 

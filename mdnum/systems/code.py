@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mdnum.errors import InputError, in_a_line
+from mdnum.safe_path import executed
 
 _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 
@@ -68,13 +68,11 @@ def function(place: str, folder: Path) -> Callable[..., Any]:
         )
     if not file.is_file():
         raise InputError("no such file", where=str(file), remedy="Correct potential.function")
-    spec = importlib.util.spec_from_file_location(f"mdnum_code_{file.stem}", file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # for inspect, which reads the source of what is defined there
-    sys.modules[spec.name] = module
+    own = f"mdnum_code_{file.stem}"
+    # anew each time: inspect reads the source of what is defined there now
+    sys.modules.pop(own, None)
     try:
-        spec.loader.exec_module(module)
+        module = executed(file, own)
     except Exception as error:
         raise InputError(f"cannot be executed: {in_a_line(error)}", where=str(file)) from error
     found = getattr(module, name, None)
