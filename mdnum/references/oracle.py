@@ -12,6 +12,12 @@ from numpy import ndarray
 
 from mdnum.errors import InputError
 
+Positions = Float[ndarray, "atoms 3"]
+#: Lattice vectors as rows.
+Vectors = Float[ndarray, "3 3"]
+Axes = Bool[ndarray, "3"]
+Shift = Int[ndarray, "3"] | tuple[int, int, int]
+
 _BLOCK = 2_000_000  # pairs and images looked at in one go: 48 MB of displacements
 
 
@@ -36,17 +42,13 @@ class PairSet:
         return PairSet(*(column[mask] for column in columns))
 
 
-def widths(cell: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
+def widths(cell: Vectors) -> Float[ndarray, "3"]:
     """Distances between opposite faces of the cell (the perpendicular widths)."""
     return 1.0 / np.linalg.norm(np.linalg.inv(cell), axis=0)
 
 
 def rounding_bound(
-    positions: Float[ndarray, "atoms 3"],
-    cell: Float[ndarray, "3 3"],
-    r_cut: float,
-    *,
-    unit_roundoff: float = 2.0**-53,
+    positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
     """How far a computed distance near r_cut can lie from the real one, in the length unit.
 
@@ -66,11 +68,7 @@ def rounding_bound(
 
 
 def exact_squared_distance(
-    positions: Float[ndarray, "atoms 3"],
-    cell: Float[ndarray, "3 3"],
-    i: int,
-    j: int,
-    shift: Int[ndarray, "3"] | tuple[int, int, int] = (0, 0, 0),
+    positions: Positions, cell: Vectors, i: int, j: int, shift: Shift = (0, 0, 0)
 ) -> Fraction:
     """|x_j - x_i + shift @ cell|² of the numbers as stored, without any rounding."""
     total = Fraction(0)
@@ -83,14 +81,7 @@ def exact_squared_distance(
 
 
 def exactly_inside(
-    positions: Float[ndarray, "atoms 3"],
-    cell: Float[ndarray, "3 3"],
-    i: int,
-    j: int,
-    shift: Int[ndarray, "3"] | tuple[int, int, int],
-    r_cut: float,
-    *,
-    closed: bool = False,
+    positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
     """Whether the pair is inside r_cut by real arithmetic; closed counts r == r_cut as inside.
 
@@ -101,9 +92,9 @@ def exactly_inside(
 
 
 def all_pairs(
-    positions: Float[ndarray, "atoms 3"],
-    cell: Float[ndarray, "3 3"],
-    pbc: Bool[ndarray, "3"],
+    positions: Positions,
+    cell: Vectors,
+    pbc: Axes,
     r_cut: float,
     *,
     closed: bool = False,
@@ -160,7 +151,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
     return completed(cell, pbc)
 
 
-def completed(cell: Float[ndarray, "3 3"], pbc: Bool[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+def completed(cell: Vectors, pbc: Axes) -> Vectors:
     """The cell with unit normals of the other vectors in place of those of axes that do not repeat."""
     if pbc.all():
         return cell
