@@ -17,10 +17,8 @@ import platform
 import re
 import subprocess
 import time
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -29,13 +27,14 @@ import numpy as np
 
 import mdnum.numerics  # noqa: F401 (turns on float64)
 from mdnum.errors import in_a_line
+from mdnum.plain import beside
 from mdnum.provenance import version
 from mdnum.safe_path import environment, python
 
 Status = Literal["ok", "info", "unsafe"]
 
 #: By test: its name, what was seen by status ("seen" where it is always the same) and what to do if unsafe.
-_WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_WORDS: dict[str, Any] = beside(__file__)
 PACKAGES, PEERS = _WORDS["packages"]["needed"], _WORDS["packages"]["peers"]
 DIGEST_CODE, IMPORTS_CODE = (_WORDS[test]["code"] for test in ("second_process", "imports"))
 # beyond 16,384 elements XLA splits work between threads, by other code paths

@@ -1,12 +1,18 @@
-"""Anything mdnum computes as the plain values that JSON, TOML and a terminal can hold."""
+"""Plain values: what JSON, TOML and a terminal can hold of anything mdnum computes, and what texts hold."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+
+
+def beside(module: str) -> dict[str, Any]:
+    """The tables of the TOML file beside a module, which is given by its `__file__`."""
+    return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def plain(value: Any) -> Any:

@@ -20,24 +20,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-# code generation differs between processors that differ in these; the rest of the flags is noise
-_FLAGS_THAT_MATTER = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "amx_tile", "asimd", "sve")
-_PACKAGES = (
-    "mdnum", "jax", "jaxlib", "jax-md", "equinox", "numpy", "numba", "ase", "MDAnalysis", "vesin",
-    "matscipy", "pyarrow",
-)  # fmt: skip
-# those whose code decides a bit of a trajectory
-_ARITHMETIC = ("mdnum", "jax", "jaxlib", "jax-md", "numpy", "numba")
-_JAX_SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_disable_jit",
-    "jax_numpy_dtype_promotion",
-    "jax_threefry_partitionable",
-)
+from mdnum.plain import beside
 
-# set while git runs a hook, for the repository of that
-_GIT_ELSEWHERE = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+#: Names of what is recorded.
+_RECORDED: dict[str, list[str]] = beside(__file__)
 
 
 class _System(Protocol):
@@ -64,7 +50,7 @@ def collect(system: _System) -> dict[str, Any]:
     around = surroundings()
     versions, processor = around["versions"], around["cpu"]
     devices = [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()]
-    settings = {name: getattr(jax.config, name, None) for name in _JAX_SETTINGS}
+    settings = {name: getattr(jax.config, name, None) for name in _RECORDED["jax_settings"]}
     environment = {
         name: value for name, value in sorted(os.environ.items()) if name.startswith(("XLA_", "JAX_"))
     }
@@ -81,7 +67,7 @@ def collect(system: _System) -> dict[str, Any]:
         "commit": around["commit"],
         "fingerprint": fingerprint(
             {
-                "versions": {name: versions.get(name) for name in _ARITHMETIC},
+                "versions": {name: versions.get(name) for name in _RECORDED["arithmetic"]},
                 "machine": platform.machine(),
                 "flags": processor["flags"],
                 "devices": devices,
@@ -119,7 +105,7 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 def package_versions() -> dict[str, str | None]:
     """The versions of the packages that a result can depend on, None where one is not installed."""
-    return {package: version(package) for package in _PACKAGES}
+    return {package: version(package) for package in _RECORDED["packages"]}
 
 
 def version(package: str) -> str | None:
@@ -154,7 +140,7 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
     return {
         "model": fields.get("model name") or platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
-        "flags": [flag for flag in _FLAGS_THAT_MATTER if flag in words] if words else None,
+        "flags": [flag for flag in _RECORDED["processor_flags"] if flag in words] if words else None,
     }
 
 
@@ -203,7 +189,7 @@ def commit(package: Path) -> str | None:
     """
 
     settings = ["core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never"]
-    environment = {key: value for key, value in os.environ.items() if key not in _GIT_ELSEWHERE}
+    environment = {key: value for key, value in os.environ.items() if key not in _RECORDED["git_elsewhere"]}
     environment |= {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"}
 
     def git(*words: str) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from mdnum.audit.base import CheckResult
 from mdnum.audit.subject import LoadedCalculator
 from mdnum.audit.thresholds import PairThreshold
 from mdnum.errors import FolderError, InputError, in_a_line
+from mdnum.plain import beside
 from mdnum.references.load import place
 from mdnum.store import RunFolder, expect, restoring
 from mdnum.store.answers import NAME, restored
@@ -26,7 +26,7 @@ _WAYS = (
     "Give package.module:Class(argument=value), the path of a Python file that makes a calculator, "
     "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
 )
-_SCRIPT: str = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["script"]
+_SCRIPT: str = beside(__file__)["script"]
 #: Where structures are kept that show a finding.
 STRUCTURES = "structures"
 

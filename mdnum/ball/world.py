@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -34,11 +32,10 @@ from mdnum.numerics.events import Hysteresis, Threshold
 from mdnum.numerics.exact import zero_bits
 from mdnum.numerics.formats import stochastic_round
 from mdnum.numerics.roles import RolePrecision
+from mdnum.plain import beside
 
 #: What is known of each parameter.
-PARAMETERS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
-    Path(__file__).with_name("parameters.toml").read_text(encoding="utf-8")
-)
+PARAMETERS: Mapping[str, Mapping[str, Any]] = beside(__file__)
 #: Iterations are counted in 32 bits.
 _MOST_ITERATIONS = 2**31 - 1
 

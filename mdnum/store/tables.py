@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.pool import ThreadPool
@@ -21,10 +20,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
+from mdnum.plain import beside
 from mdnum.store import files as manifest
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
-_DECLARED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_DECLARED = beside(__file__)
 _TYPES = {
     name: pa.type_for_alias(kind) for kind, names in _DECLARED["types"].items() for name in names.split()
 }

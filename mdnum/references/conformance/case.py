@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -14,12 +12,11 @@ from annotated_types import Ge
 from numpy import ndarray
 from pydantic import FiniteFloat, PlainValidator, StrictBool
 
+from mdnum.plain import beside
 from mdnum.references.oracle import PairSet
 
 #: What a case is about, by the name of its area; in the order in which they are asked and reported.
-AREAS: Mapping[str, str] = MappingProxyType(
-    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["areas"]
-)
+AREAS: Mapping[str, str] = MappingProxyType(beside(__file__)["areas"])
 
 Pbc = tuple[StrictBool, StrictBool, StrictBool]
 

@@ -11,18 +11,18 @@ from __future__ import annotations
 
 import functools
 import inspect
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mdnum.errors import InputError
+from mdnum.plain import beside
 from mdnum.references.conformance.lists import LISTS, ListLimits, PairList, from_object, source_of
 from mdnum.references.load import place
 from mdnum.registry import nearest
 
-_DECLARED: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_DECLARED: dict[str, Any] = beside(__file__)
 
 
 def _declared(name: str) -> dict[str, Any]:

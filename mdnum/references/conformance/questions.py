@@ -6,11 +6,9 @@ cutoffs on and off the shells; `boxes()` gives (cell, pbc, words) alone.
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import hypothesis
@@ -18,6 +16,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy import ndarray
 
+from mdnum.plain import beside
 from mdnum.references.conformance.case import Case, Pbc, Still, gas, grid, once
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.motions import motions, movers, sequences
@@ -34,7 +33,7 @@ BREADTH = 5
 #: Random cases that are drawn together, which takes a second or two.
 _CHUNK = 500
 
-_WRITTEN = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_WRITTEN = beside(__file__)
 _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 

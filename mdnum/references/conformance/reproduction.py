@@ -9,7 +9,6 @@ import os
 import subprocess
 import tempfile
 import textwrap
-import tomllib
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from pprint import pformat
 import numpy as np
 
 from mdnum.deadline import Deadline
+from mdnum.plain import beside
 from mdnum.references.conformance import answer
 from mdnum.references.conformance.case import Case, Still
 from mdnum.references.conformance.judge import Conventions, Failed, Report
@@ -26,7 +26,7 @@ from mdnum.safe_path import environment, python
 
 _PRINTED = 60  # atoms whose coordinates are written out
 #: Parts of a script.
-_LINES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_LINES = beside(__file__)
 
 
 def script(
