@@ -27,8 +27,6 @@ Severity = Literal["info", "warning", "error"]
 Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 #: (what, why) of what was not asked, and why something was not that would have been.
 Skipped = tuple[str, str]
-TIME_UP = TimeUp.why
-CALLS_UP = "the calls of this check were used up"
 
 
 def idle(done: int, total: int, info: dict[str, Any]) -> None:
@@ -38,7 +36,10 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 class CallsUp(TimeUp):
     """The calls that a check or a search may make have been made: what is in progress is left."""
 
-    why = CALLS_UP
+    why = "the calls of this check were used up"
+
+
+TIME_UP, CALLS_UP = TimeUp.why, CallsUp.why
 
 
 class CalculatorError(MdnumError):
@@ -335,8 +336,7 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
         return "no"
     if "warning" in severities:
         return "with care"
-    needed, begun = needed_to(question), {result.name for result in results}
-    begun = set() if nothing_felt(results) else begun
+    needed, begun = needed_to(question), _begun(results)
     if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
         return "not asked"
     asked = {result.name for result in results if not largely_unasked(result)}
@@ -353,10 +353,13 @@ def nothing_felt(results: Sequence[CheckResult]) -> bool:
     return any(result.numbers.get("nothing_felt") for result in results)
 
 
+def _begun(results: Sequence[CheckResult]) -> set[str]:
+    return set() if nothing_felt(results) else {result.name for result in results}
+
+
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
     """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
-    begun, basic = {result.name for result in results}, {name for name in wanted if CHECKS[name].basic}
-    begun = set() if nothing_felt(results) else begun
+    begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 

@@ -426,13 +426,9 @@ def drift(time: Steps, values: Steps) -> Drift:
     enough; neighboring steps do not. There must be 16 values at least.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
-    x = np.array([time[block].mean() for block in blocks])
-    y = np.array([values[block].mean() for block in blocks])
-    x = x - x.mean()
-    square = float(np.sum(x**2))
-    slope = float(np.sum(x * y)) / square
-    left = y - y.mean() - slope * x
-    return Drift(slope, float(np.sqrt(np.sum(left**2) / (_BLOCKS - 2) / square)))
+    x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))
+    (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
+    return Drift(float(slope), float(np.sqrt(covariance[0, 0])))
 
 
 def wandering(time: Steps, increments: Steps) -> Drift:

@@ -54,7 +54,7 @@ def load_calculator(words: str) -> LoadedCalculator:
 
     def make() -> Any:
         value = spot.find(("calculator", "calc", "make"), anew=True)
-        if (isinstance(value, type) or not _is_calculator(value)) and callable(value):
+        if not _is_calculator(value) and callable(value):
             try:
                 value = value()
             except Exception as error:  # whatever a constructor raises
@@ -65,7 +65,7 @@ def load_calculator(words: str) -> LoadedCalculator:
         return value
 
     made = make()
-    if isinstance(made, type) or not _is_calculator(made):
+    if not _is_calculator(made):
         raise InputError(
             f"that is a {type(made).__name__}, not an ASE calculator (an object with get_potential_energy "
             "and get_forces)",
@@ -76,9 +76,9 @@ def load_calculator(words: str) -> LoadedCalculator:
 
 
 def _is_calculator(value: Any) -> bool:
+    methods, is_class = ("get_potential_energy", "get_forces"), isinstance(value, type)
     # atoms pass the question on to their calculator
-    methods = ("get_potential_energy", "get_forces")
-    return all(hasattr(value, one) for one in methods) and not hasattr(value, "get_positions")
+    return all(hasattr(value, one) for one in methods) and not (is_class or hasattr(value, "get_positions"))
 
 
 def _of_system(text: str) -> LoadedCalculator:

@@ -90,11 +90,16 @@ class Pair:
 
     @cached_property
     def _together(self) -> Atoms:
-        both = self.first + self.second
+        return self.surrounded(self.first + self.second)
+
+    def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
+        """Atoms in the cell that is around the two, moved to its middle where asked."""
         if self.box:
-            both.set_cell([self.box] * 3)
-        both.pbc = self.periodic
-        return both
+            atoms.set_cell([self.box] * 3)
+            if middle:
+                atoms.positions += self.box / 2
+        atoms.pbc = self.periodic
+        return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
         """Distances between the two of all atoms but the reference atoms, at a distance of those."""

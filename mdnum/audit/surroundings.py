@@ -205,7 +205,7 @@ def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
     count = max(_CUT_OUT // max(len(groups[0]), 1), 4)
-    cut = Atoms(cell=[pair.box] * 3 if pair.box else None, pbc=pair.periodic)
+    cut = pair.surrounded(Atoms())
     for group in (groups[k] for k in sorted(nearest[:count])):
         part = whole(atoms, group)
         part.positions += offsets[_lead(atoms, group)] + pair.box / 2
@@ -301,11 +301,8 @@ def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
         one, other = walk.pair.species
         side = np.radians(110.0)
         beside = (bond * np.cos(side), bond * np.sin(side), 0)
-        atoms = Atoms([one, other, other], [(0, 0, 0), beside, (0, 0, 0)])
-        if walk.pair.box:
-            atoms.set_cell([walk.pair.box] * 3)
-            atoms.positions += walk.pair.box / 2  # what lies outside of a box may be lost
-        atoms.pbc = walk.pair.periodic
+        # what lies outside of a box may be lost
+        atoms = walk.pair.surrounded(Atoms([one, other, other], [(0, 0, 0), beside, (0, 0, 0)]), middle=True)
         name = f"a third atom ({other}) toward {one}-{other}"
         route = Route(name, atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0]))
         found.append((route, max(float(walk.distance[0]), 0.8 * bond) + 6 * STEP, end))
@@ -407,12 +404,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     flat = np.sqrt(1 - height**2)
     directions = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
     positions = np.vstack([np.zeros(3), distance[:, None] * directions])
-    atoms = Atoms([pair.species[0]] * (count + 1), positions)
-    if pair.box:
-        atoms.set_cell([pair.box] * 3)
-        atoms.positions += pair.box / 2
-    atoms.pbc = pair.periodic
-    return atoms, distance
+    return pair.surrounded(Atoms([pair.species[0]] * (count + 1), positions), middle=True), distance
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
-from ase.calculators.calculator import Calculator, PropertyNotImplementedError
+from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
 from ase.stress import voigt_6_to_full_3x3_stress
 from numpy import ndarray
@@ -183,14 +183,11 @@ class SpeciesSum(ClassicalCalculator):
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
     """energy, forces, energies where there are any and, as six numbers, stress of atoms."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-    results: dict[str, Any] = {"energy": float(np.asarray(calculator.get_property("energy", bare)))}
-    for name in ("energies", "forces", *(["stress"] if stress else [])):
-        try:
-            results[name] = np.array(calculator.get_property(name, bare))
-        except PropertyNotImplementedError:
-            if name != "energies":  # ASE's EAM has the total only
-                raise
-    return results
+    names = ["energy", "forces", *(["stress"] if stress else [])]
+    if "energies" in calculator.implemented_properties:  # ASE's EAM has the total only
+        names.append("energies")
+    results: dict[str, Any] = {name: np.array(calculator.get_property(name, bare)) for name in names}
+    return {**results, "energy": float(results["energy"])}
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:

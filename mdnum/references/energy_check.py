@@ -152,19 +152,16 @@ def check_energy(
     )
 
 
-def narrowest(simulation: Simulation) -> str:
-    """The narrowest float type among the roles that energies and forces depend on."""
-    precision = simulation.policy
-    roles = (precision.state, precision.force, precision.accumulate)
-    return max(map(str, map(carrier, roles)), key=unit_roundoff)
+def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
+    """The narrowest float type among some roles; default those that energies and forces depend on."""
+    kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
+    return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
     """The narrowest float type of places: a force in sixteen bits has the displacements of the decision."""
-    precision = simulation.policy
-    if precision.force in WIDE:
-        return narrowest(simulation)
-    return max(map(str, map(carrier, (precision.state, precision.decision))), key=unit_roundoff)
+    wide = simulation.policy.force in WIDE
+    return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
 
 def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
@@ -363,16 +360,14 @@ class DynamicsReport:
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for about ten of the steps."""
-        shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int))
+        shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int)).tolist()
         return [
             {
-                "step": int(step),
-                "position, largest": self.position[step],
-                "velocity, largest": self.velocity[step],
-                "energy": self.energy[step],
+                "step": step, "position, largest": self.position[step],
+                "velocity, largest": self.velocity[step], "energy": self.energy[step],
             }
             for step in shown
-        ]
+        ]  # fmt: skip
 
 
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
@@ -427,10 +422,8 @@ def _forces(simulation: Simulation) -> Reference:
 
 
 def _sudden(position: Sequence[float], floor: float) -> int | None:
-    for step in range(2, len(position)):
-        if position[step] > _SUDDEN * max(position[step - 1], floor):
-            return step
-    return None
+    steps = range(2, len(position))
+    return next((step for step in steps if position[step] > _SUDDEN * max(position[step - 1], floor)), None)
 
 
 def _growth(position: Sequence[float]) -> float:

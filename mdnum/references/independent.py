@@ -13,7 +13,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations_with_replacement, pairwise
 from typing import Any, cast
 
@@ -53,18 +52,18 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     asked for slightly more, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
-    return _edges(*(array.tobytes() for array in arrays), reach)
+    key = (*(array.tobytes() for array in arrays), reach)
+    if key not in _LAST:
+        _LAST.clear()
+        _LAST[key] = _edges(atoms, reach)
+    return _LAST[key]
 
 
-@lru_cache(maxsize=1)
-def _edges(positions: bytes, numbers: bytes, cell: bytes, pbc: bytes, reach: float) -> Edges:
-    """As `edges_of`; the two judges of a frame ask for the same, one after the other."""
-    atoms = Atoms(
-        numbers=np.frombuffer(numbers, int),
-        positions=np.frombuffer(positions).reshape(-1, 3),
-        cell=np.frombuffer(cell).reshape(3, 3),
-        pbc=np.frombuffer(pbc, bool),
-    )
+#: Edges that were asked for last: the two judges of a frame ask for the same, one after the other.
+_LAST: dict[tuple[bytes | float, ...], Edges] = {}
+
+
+def _edges(atoms: Atoms, reach: float) -> Edges:
     n = len(atoms)
     listed = PrimitiveNeighborList(
         [0.5 * reach * (1 + SLACK)] * n, skin=0.0, self_interaction=False, bothways=False
@@ -377,13 +376,8 @@ class TersoffModel(_OneSpecies):
         g = self.gamma * (1.0 + c2 / d2 - c2 / (d2 + away**2))
         dg = -2.0 * self.gamma * c2 * away / (d2 + away**2) ** 2
         stretch = r[e] - r[f]
-        # exact zero when lambda3 is zero, whatever m is
-        grow = np.exp((self.lambda3 * stretch) ** self.m) if self.lambda3 else np.ones_like(stretch)
-        dgrow = (
-            self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow
-            if self.lambda3
-            else 0.0 * stretch
-        )
+        grow = np.exp((self.lambda3 * stretch) ** self.m)
+        dgrow = self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow
         zeta = np.bincount(e, taper[f] * g * grow, len(r))
 
         x = (self.beta * zeta) ** self.n
