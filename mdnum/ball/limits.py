@@ -50,11 +50,9 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
 
     Error: exact up to the rounding of alpha k; tested against every small penetration.
     """
-    found = {}
-    for role in _ROLES[kind]:
-        name = getattr(precision, role)
-        found[role] = _stuck(name, gain) if role == "arithmetic" else smallest(name)
-    return found
+    formats = {role: getattr(precision, role) for role in _ROLES[kind]}
+    least = {role: smallest(name) for role, name in formats.items()}
+    return least | ({"arithmetic": _stuck(formats["arithmetic"], gain)} if "arithmetic" in formats else {})
 
 
 def _stuck(name: str, gain: float) -> float:

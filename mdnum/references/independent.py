@@ -11,9 +11,9 @@ F_i += g, F_j -= g, stress = sum(g outer d) / volume.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement, pairwise
+from itertools import combinations_with_replacement, pairwise, product
 from typing import Any, cast
 
 import numpy as np
@@ -222,18 +222,14 @@ class PairModel(Model):
     def reach(self) -> float:
         return max(form.r_cut for form in self.forms.values())
 
-    def groups(self, edges: Edges) -> list[tuple[PairForm, ndarray]]:
+    def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray]]:
         """The edges inside the cutoff, by the form that applies to them: (form, edge numbers)."""
-        found = []
-        present = sorted(set(edges.symbols.tolist()))
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
-        for a in present:
-            for b in present:
-                chosen = np.flatnonzero((first == a) & (second == b))
-                if len(chosen):
-                    form = self.forms[a, b]
-                    found.append((form, chosen[form.inside(edges.r[chosen])]))
-        return found
+        for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
+            chosen = np.flatnonzero((first == a) & (second == b))
+            if len(chosen):
+                form = self.forms[a, b]
+                yield form, chosen[form.inside(edges.r[chosen])]
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         energies, gradient = np.zeros(len(edges.symbols)), np.zeros_like(edges.d)

@@ -222,15 +222,13 @@ def _called_module(place: TracebackType) -> str:
         return ""
     function = _value(call.func, place)
     owner = getattr(function, "__self__", None)
-    for module in (
+    modules = (
         getattr(function, "__module__", None),
         getattr(owner, "__name__", None) if type(owner).__name__ == "module" else None,
         getattr(type(owner), "__module__", None) if owner is not None else None,
         getattr(type(function), "__module__", None),
-    ):
-        if isinstance(module, str) and module:
-            return module
-    return ""
+    )
+    return next((module for module in modules if isinstance(module, str) and module), "")
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
