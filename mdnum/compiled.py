@@ -19,8 +19,7 @@ NOT_KEPT = (
     "what was compiled cannot be kept, so that every command compiles it again: neither the installation nor "
     "a cache folder can be written. Set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that can be written."
 )
-# what could not be kept
-_missed: list[Any] = []
+_missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:

@@ -37,17 +37,12 @@ Status = Literal["ok", "info", "unsafe"]
 _WORDS: dict[str, Any] = beside(__file__)
 PACKAGES, PEERS = _WORDS["packages"]["needed"], _WORDS["packages"]["peers"]
 DIGEST_CODE, IMPORTS_CODE = (_WORDS[test]["code"] for test in ("second_process", "imports"))
-# beyond 16,384 elements XLA splits work between threads, by other code paths
-_COUNT = 20_011
+_COUNT = 20_011  # beyond 16,384 elements XLA splits work between threads, by other code paths
 _FUNCTION_ULPS = 16
-# argon: sigma (Å), epsilon (eV), cutoff and skin (Å)
-_SIGMA, _EPSILON, _R_CUT, _SKIN = 3.405, 0.0103235, 8.5125, 0.4
-# a product of three terms and a sum of three: a few units in the last place, whatever is contracted
-_R2_TOLERANCE = 1e-14
-# 24,000 terms of both signs, summed in any order
-_CRYSTAL_TOLERANCE = 1e-12
-# the promise of `mdnum check energy`
-_ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10
+_SIGMA, _EPSILON, _R_CUT, _SKIN = 3.405, 0.0103235, 8.5125, 0.4  # of argon (Å, eV, Å, Å)
+_R2_TOLERANCE = 1e-14  # three products and a sum of three: a few units in the last place
+_CRYSTAL_TOLERANCE = 1e-12  # 24,000 terms of both signs, summed in any order
+_ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10  # the promise of `mdnum check energy`
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from typing import Any, Protocol
 
 from mdnum.plain import beside
 
-#: Names of what is recorded.
-_RECORDED: dict[str, list[str]] = beside(__file__)
+_RECORDED: dict[str, list[str]] = beside(__file__)  # names of what is recorded
 
 
 class _System(Protocol):

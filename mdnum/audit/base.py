@@ -21,12 +21,10 @@ if TYPE_CHECKING:
     from mdnum.audit.subject import CalculatorSubject
 
 Item, T = TypeVar("Item"), TypeVar("T")
-#: (done, of how many, {"phase": words}) now and then.
-Progress = Callable[[int, int, dict[str, Any]], None]
+Progress = Callable[[int, int, dict[str, Any]], None]  # (done, of how many, {"phase": words}) now and then
 Severity = Literal["info", "warning", "error"]
 Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
-#: (what, why) of what was not asked, and why something was not that would have been.
-Skipped = tuple[str, str]
+Skipped = tuple[str, str]  # (what, why) of what was not asked, and why something was not that would have been
 
 
 def idle(done: int, total: int, info: dict[str, Any]) -> None:
@@ -313,10 +311,8 @@ def needed_to(question: str) -> set[str]:
 
 # -- what the checks add up to ---------------------------------------------------------------------
 
-#: Of the ways of a check: from here on it counts as asked.
-_NEARLY = 0.9
-#: Of the share of the forces that is wrong: a curl that would be seen of this is absent.
-_FAR_BELOW = 0.1
+_NEARLY = 0.9  # of the ways of a check: from here on it counts as asked
+_FAR_BELOW = 0.1  # of the share of the forces that is wrong: a curl that would be seen of this is absent
 _QUESTIONS = ("run", "differentiate")
 
 

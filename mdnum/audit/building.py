@@ -25,16 +25,12 @@ _LAST_ELEMENT = 95
 #: Calls for building a structure, at most; of them in each direction of a search for the least energy.
 BUILDING_CALLS, _SCALES = 400, 15
 _MOST_ATOMS, _FEWEST_ATOMS = 500, 32
-#: Å between molecules of water, as in the liquid.
-_SPACING = 3.1
-#: Molecules along an edge: some calculators want a box of two cutoffs.
-_WATER_EDGES = (4, 5, 6, 8)
+_SPACING = 3.1  # Å between molecules of water, as in the liquid
+_WATER_EDGES = (4, 5, 6, 8)  # molecules along an edge: some calculators want a box of two cutoffs
 #: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
 _DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
-#: A nearest distance above the first part of the cutoff is made to be the second part of it.
-_BARELY, _PRESSED = 0.9, 0.6
-#: Seconds of processor time of a calculation above which the crystal is made no larger.
-_SLOW = 0.15
+_BARELY, _PRESSED = 0.9, 0.6  # a nearest distance above so much of the cutoff is made to be so much of it
+_SLOW = 0.15  # seconds of processor time of a calculation above which the crystal is made no larger
 #: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
 _RATTLE = 0.02
 #: Distances at which two atoms are asked about, from the farthest inward.
@@ -43,12 +39,9 @@ _DISTANCES = FARTHEST * 1.12 ** -np.arange(35.0)
 _NAMES = ("elements", "species", "symbols", "atom_types", "chemical_symbols", "type_map", "parameters")
 _NUMBERS = ("atomic_numbers", "z_table", "zs")
 _MODELS = ("model", "models", "potential")
-#: A calculator that names more elements than these is meant for many: the usual ones come first.
-_MANY = 3
-#: Names of elements that are words of English as well.
-_WORDS = ("lead", "tin")
-#: Of the energy: a second element that changes it by less is none to this calculator.
-_SAME = 1e-9
+_MANY = 3  # a calculator that names more elements than these is meant for many: the usual ones come first
+_WORDS = ("lead", "tin")  # names of elements that are words of English as well
+_SAME = 1e-9  # of the energy: a second element that changes it by less is none to this calculator
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:

@@ -15,42 +15,27 @@ from statistics import median
 import numpy as np
 from jaxtyping import Float
 
-#: One-sided first derivative from five points, error fourth power of the spacing.
-_SLOPE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
-#: Spacings (relative) at which scatter is measured: a float32 calculator is constant over the first.
-_CLOSER = (3e-9, 1e-7, 1e-6, 1e-5)
-#: Spacings from which a one-sided slope is taken; the one with the smallest error is kept.
-_WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-#: A value is predicted half a spacing beyond the last of four points (Lagrange's cubic).
-_EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])
-#: How much each zoom narrows: four of the divisions are kept.
-_DIVISIONS, _NARROWER = 24, 6
+_SLOPE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0  # one-sided, error fourth power of the spacing
+_CLOSER = (3e-9, 1e-7, 1e-6, 1e-5)  # relative spacings for scatter: float32 is constant over the first
+_WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # spacings of a one-sided slope; that of the smallest error is kept
+_EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])  # half a spacing beyond four points (cubic)
+_DIVISIONS, _NARROWER = 24, 6  # how much each zoom narrows: four of the divisions are kept
 _LEVELS = 10
-#: A mismatch this many times those around it is a suspect.
-_OUTLIER = 4.0
+_OUTLIER = 4.0  # a mismatch this many times those around it is a suspect
 #: The same of an eighth difference, which may be all rounding: the largest of some hundred is five times the
 #: median.
 _STANDS_OUT = 10.0
-#: A step so many times what stands out of a scan is also located, wherever it is in its interval.
-_TOLD = 3.0
+_TOLD = 3.0  # a step so many times what stands out of a scan is also located, wherever it is in its interval
 _EIGHTH = np.array([1.0, -8.0, 28.0, -56.0, 70.0, -56.0, 28.0, -8.0, 1.0])
-#: A step of 1 makes the two eighth differences whose middle is beside it so large.
-_OF_A_STEP = 35.0
-#: How near to 2 the power is with which a mismatch falls where a second derivative jumps.
-_SQUARE = 0.15
-#: Times the mismatch of the others at which one of them is alone.
-_ALONE = 6.0
-#: Zooms at which it does so, at least; what cannot be resolved does for one or two.
-_SEEN = 3
-#: Of a force a little before an end: below, its decay tells nothing.
-_FELT = 1e-13
-#: A power above which two places are enough to tell that no low derivative jumps.
-_STEEPEST = 8.0
-#: A jump this many times what rounding and truncation could make of nothing is one.
-_SURE = 6.0
+_OF_A_STEP = 35.0  # a step of 1 makes the two eighth differences whose middle is beside it so large
+_SQUARE = 0.15  # how near to 2 the power is with which a mismatch falls where a second derivative jumps
+_ALONE = 6.0  # times the mismatch of the others at which one of them is alone
+_SEEN = 3  # zooms at which it does so, at least; what cannot be resolved does for one or two
+_FELT = 1e-13  # of a force a little before an end: below, its decay tells nothing
+_STEEPEST = 8.0  # a power above which two places are enough to tell that no low derivative jumps
+_SURE = 6.0  # a jump this many times what rounding and truncation could make of nothing is one
 
-#: Order given to a threshold at which neither energy, force nor curvature jumps, and no more is known.
-SMOOTH = 3
+SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature jumps, if no more is known
 
 
 class Curve:

@@ -23,25 +23,16 @@ from mdnum.audit.structures import exchanged
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
 
-#: Å before and after a crossing at which the energy is asked for.
-_BESIDE = 1e-7
-#: Flips whose jumps are measured; the others get the mean of these.
-_MEASURED = 240
-#: Steps with flips that a sample must have.
-_ENOUGH = 30
-#: Halvings of a step's way: what is left of it then is a millionth of an Å.
-_LEVELS = 15
-#: After this many, a force that is no gradient has spread over sixteen parts, a jump is still in one.
-_SPREAD_AT = 4
-#: Of the largest: a part with less than this is not followed. Of a spread each of sixteen has less.
-_FOLLOWED = 0.15
-#: Steps that are searched for jumps, and calls after which no further one is.
-_MOST_STEPS, _CALLS = 40, 800
-#: Of kT: what a step leaves unexplained below this is not searched.
-_SMALL = 1e-6
+_BESIDE = 1e-7  # Å before and after a crossing at which the energy is asked for
+_MEASURED = 240  # flips whose jumps are measured; the others get the mean of these
+_ENOUGH = 30  # steps with flips that a sample must have
+_LEVELS = 15  # halvings of a step's way: what is left of it then is a millionth of an Å
+_SPREAD_AT = 4  # after this many, a force that is no gradient is in sixteen parts, a jump still in one
+_FOLLOWED = 0.15  # of the largest: a part with less is not followed, and of a spread each of sixteen has less
+_MOST_STEPS, _CALLS = 40, 800  # steps that are searched for jumps, and calls after which no further one is
+_SMALL = 1e-6  # of kT: what a step leaves unexplained below this is not searched
 _BLOCKS = 8
-#: Å by which a list of pairs reaches further than the threshold, so that it lasts for some steps.
-_SKIN = 1.0
+_SKIN = 1.0  # Å by which a list of pairs reaches further than the threshold, so that it lasts for some steps
 
 Steps = Float[np.ndarray, "steps"]
 

@@ -26,12 +26,9 @@ _INDEPENDENT = 0.28
 #: another order of summation scatters more than moving along a line. And how often a difference of two
 #: answers may be above by chance.
 _ALLOWED, _BY_CHANCE = 40.0, 1e-6
-#: Å by which atoms are moved from where they were given, so that no distance sits on a threshold by design.
-RATTLE = 0.03
-#: Structures of which the quietest is taken, and random moves of the size of rounding.
-_TRIES, _DRAWS = 5, 8
-#: Atoms below which symmetry may hide the noise.
-FEW = 8
+RATTLE = 0.03  # Å by which atoms are moved, so that no distance sits on a threshold by design
+_TRIES, _DRAWS = 5, 8  # structures of which the quietest is taken, and random moves of the size of rounding
+FEW = 8  # atoms below which symmetry may hide the noise
 #: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
 _STEP_SPACINGS = (1e-4, 1.6e-3, 2.5e-2)
 _STEP_POINTS = 17
@@ -43,27 +40,20 @@ _STAYS, _STAIRS = 3, 0.1
 _ALIKE = 1e-3
 #: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
-#: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
-_QUIETER = 1e-3
+_QUIETER = 1e-3  # a line so much quieter than another has no threshold on it; rounding differs by less
 #: Orders of the atoms that are compared with the given one; Å between the points of a line on which two are
 #: compared, and how many: far enough for the terms of a sum to be rounded anew.
 _ORDERS, _ORDER_SPACING, _ORDER_POINTS = 3, 1e-3, 9
 #: Of a difference between two orders: what scatters by more from point to point is no smooth function. Of the
 #: energy and of what the forces are worth over the structure: rounding of a sum is below the second.
 _AT_RANDOM, _SUMMED = 0.05, 1e-5
-#: Decimals of a number that are taken for rounding, at most: a double of more is too near to its own.
-_MOST_DECIMALS = 9
-#: Different answers, 0 aside, from which is judged.
-_FEWEST = 4
-#: Noise, in units of the rounding of a double, above which fewer digits are reported.
-_NOISY = 1e5
-#: Of the root mean square force: half a step of forces above is one that a run and a derivative feel.
-_SMALL = 1e-4
-#: Of kT: what an energy in single precision may be rounded to.
-_SMALL_ENERGY = 1e-2
-#: Bits of a significand by the name of the format, the narrowest first.
+_MOST_DECIMALS = 9  # that are taken for rounding, at most: a double of more is too near to its own
+_FEWEST = 4  # different answers, 0 aside, from which is judged
+_NOISY = 1e5  # noise, in units of the rounding of a double, above which fewer digits are reported
+_SMALL = 1e-4  # of the root mean square force: half a step above is one that a run and a derivative feel
+_SMALL_ENERGY = 1e-2  # of kT: what an energy in single precision may be rounded to
 _HALF = 11
-_FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision"))
+_FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision"))  # bits of a significand
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from mdnum.audit.base import CalculatorError
 from mdnum.audit.noise import NoiseFloor, in_order
 from mdnum.audit.subject import CalculatorSubject, differences
 
-#: Places of a list that are tried, and other places that an ordinary one is looked for in.
-_PLACES, _CANDIDATES = 48, 4
+_PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordinary one
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ _WAYS = (
     "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
 )
 _SCRIPT: str = beside(__file__)["script"]
-#: Where structures are kept that show a finding.
-STRUCTURES = "structures"
+STRUCTURES = "structures"  # where structures are kept that show a finding
 
 
 def load_calculator(words: str) -> LoadedCalculator:

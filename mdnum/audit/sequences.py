@@ -15,8 +15,7 @@ from mdnum.audit.structures import Pair, modified
 #: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
 _BEYOND = tuple(0.15 * 1.5**n for n in range(8))
 _STEPS = 8
-#: Å inside the cutoff at which they are asked about.
-_INSIDE = (0.02, 0.1, 0.25)
+_INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked about
 
 
 class SequenceStep(NamedTuple):

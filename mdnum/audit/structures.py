@@ -18,12 +18,9 @@ from mdnum.audit.subject import CalculatorSubject
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK_STRUCTURE, ase_images, reading
 
-#: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
-_SURROUNDINGS = ((False, False), (True, False), (True, True))
-#: A scan does not go further apart than this, in the unit of length.
-FARTHEST = 30.0
-#: Distances are walked from the first.
-_NEAREST = 0.3
+_SURROUNDINGS = ((False, False), (True, False), (True, True))  # (a cell, periodic), simplest first
+FARTHEST = 30.0  # a scan does not go further apart than this, in the unit of length
+_NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:

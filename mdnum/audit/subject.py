@@ -22,24 +22,18 @@ from mdnum.store.files import write_text
 from mdnum.systems.structures import to_extxyz
 from mdnum.units import METAL, Units
 
-#: A calculator that fails is asked hundreds of times; this many structures are kept.
-_MOST_SAVED = 20
-#: k_B times 300 K, eV.
-_ROOM_TEMPERATURE = 0.025852
+_MOST_SAVED = 20  # a calculator that fails is asked hundreds of times; this many structures are kept
+_ROOM_TEMPERATURE = 0.025852  # k_B times 300 K, eV
 #: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
 #: answers to one question that differ by more are no rounding.
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
-#: Answers that stick out are asked for again, in one audit no more often than this.
-_MOST_AGAIN = 100
-#: Of info, what has the same representation in a copy.
-_PLAIN = (str, int, float, list, tuple, dict, np.ndarray)
+_MOST_AGAIN = 100  # answers that stick out are asked for again, in one audit no more often than this
+_PLAIN = (str, int, float, list, tuple, dict, np.ndarray)  # info with the same repr in a copy
 
 _objects = itertools.count()
 Forces = Float[np.ndarray, "atoms 3"]
-#: Energy, eV, and forces, eV/Å; None where they were not asked for.
-EnergyForces = tuple[float, Forces | None]
-#: Energy and forces, or why there are none.
-Answered = tuple[float, Forces] | CalculatorError
+EnergyForces = tuple[float, Forces | None]  # energy, eV, and forces, eV/Å; None where they were not asked for
+Answered = tuple[float, Forces] | CalculatorError  # energy and forces, or why there are none
 
 
 @dataclass

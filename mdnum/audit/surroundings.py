@@ -26,27 +26,17 @@ from mdnum.audit.structures import Pair, exchanged, molecules, whole
 from mdnum.audit.subject import CalculatorSubject, differences
 from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, PairWalk, walk_pairs
 
-#: Half the stretch around an expected crossing in which it is located, length.
-_SIDE = 1e-7
-#: Crossings of one threshold that are measured, each by another atom.
-_MOST_CROSSINGS = 2
-#: Crossings of known thresholds in the structure that are measured, by 170 calls or so each.
-_CROSSINGS = 4
-#: Through the structure, scanned for unknown thresholds by 430 calls or so each.
-_ROUTES = 2
-#: Of a structure of more atoms than the second, so many are kept to be walked through.
-_CUT_OUT, _MANY = 40, 500
+_SIDE = 1e-7  # half the stretch around an expected crossing in which it is located, length
+_MOST_CROSSINGS = 2  # crossings of one threshold that are measured, each by another atom
+_CROSSINGS = 4  # crossings of known thresholds in the structure that are measured, by 170 calls or so each
+_ROUTES = 2  # through the structure, scanned for unknown thresholds by 430 calls or so each
+_CUT_OUT, _MANY = 40, 500  # of a structure of more atoms than the second, so many are walked through
 _MOST_TRIPLES = 4
-#: Of a route through the structure, length.
-_LENGTH = 0.6
-#: So near to where two neighbors change places they are tied, length.
-_TIED = 1e-6
-#: Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere.
-_MOST = 160
-#: Of which a calculator that refuses more is given.
-_FEWEST = 4
-#: The crowd is between these fractions of the cutoff.
-_NEAR, _FAR = 0.5, 0.94
+_LENGTH = 0.6  # of a route through the structure, length
+_TIED = 1e-6  # so near to where two neighbors change places they are tied, length
+_MOST = 160  # neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120
+_FEWEST = 4  # of which a calculator that refuses more is given
+_NEAR, _FAR = 0.5, 0.94  # the crowd is between these fractions of the cutoff
 #: How far to either side of a tie is asked, in the last digit of the largest coordinate in float32: some sort
 #: neighbors by distances that are rounded so.
 _SIDE_OF_TIE = 4.0

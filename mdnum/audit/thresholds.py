@@ -33,39 +33,24 @@ from mdnum.audit.noise import digits
 from mdnum.audit.structures import FARTHEST, Pair, coarse_scan, pairs
 from mdnum.audit.subject import CalculatorSubject
 
-#: Spacing of a scan, in the unit of length. Two thresholds closer than this may be taken for one.
-STEP = 0.025
+STEP = 0.025  # spacing of a scan, in the unit of length. Two thresholds closer than this may be taken for one
 #: For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
 #: that stands out of it. A pair whose share is less than the fewest is not walked.
 _CALLS, _FEWEST_CALLS, WALKING_CALLS = 4200, 900, 4700
-#: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
-STEPS = 2.5
-#: Distances are walked down to where two particles cost so many kT.
-_COSTLY = 1000.0
-#: So near to a threshold that was found a second one may be hidden, length: what a scan compares with.
-BESIDE = 0.35
-#: Of the energy of two particles of several atoms, and of all forces on them: what rounding may change.
-_ROUNDING = 1e-15
-#: More jumps of a third derivative than these are the knots of a table.
-_KNOTS = 3
-#: Orders above this are reported as this one: that smooth or smoother.
-SMOOTHEST = 6
-#: So near to its end a smooth force may be lost in rounding, length.
-_LOST = 0.01
-#: Of a distance: a force that would be 0 so little further on is no jump where it ends.
-_HAIR = 3e-8
-#: Past the scan: ratio of the two ends of an interval, and how many intervals.
-_RATIO, _MOST = 1.15, 20
-#: Within a cell the search does not go further, in the unit of length: the cell has to have room.
-_WIDEST = 120.0
-#: Places in an interval of -1 to 1 (Chebyshev-Lobatto): its ends are shared with the next.
-_NODES = np.cos(np.pi * np.arange(8, -1, -1) / 8)
-#: Of the force, and of the energy's change: the highest terms of a smooth decay are far below (1e-10).
-_SMOOTH_TERMS = 1e-6
-#: An interval in which something lies is halved to this width, and then scanned.
-_NARROW = 0.6
-#: Of kT: where no more than this is left to be lost, the search ends.
-_NOTHING = 1e-7
+STEPS = 2.5  # of answers that are rounded to decimals: a jump of so many steps is more than rounding
+_COSTLY = 1000.0  # distances are walked down to where two particles cost so many kT
+BESIDE = 0.35  # so near to a known threshold another may be hidden, length: what a scan compares with
+_ROUNDING = 1e-15  # of the energy of two particles of several atoms, and of all forces on them
+_KNOTS = 3  # more jumps of a third derivative than these are the knots of a table
+SMOOTHEST = 6  # orders above this are reported as this one: that smooth or smoother
+_LOST = 0.01  # so near to its end a smooth force may be lost in rounding, length
+_HAIR = 3e-8  # of a distance: a force that would be 0 so little further on is no jump where it ends
+_RATIO, _MOST = 1.15, 20  # past the scan: ratio of the two ends of an interval, and how many intervals
+_WIDEST = 120.0  # within a cell the search does not go further, length: the cell has to have room
+_NODES = np.cos(np.pi * np.arange(8, -1, -1) / 8)  # places in -1 to 1 (Chebyshev-Lobatto), ends shared
+_SMOOTH_TERMS = 1e-6  # of the force, and the energy's change: a smooth decay's highest terms are far below
+_NARROW = 0.6  # an interval in which something lies is halved to this width, and then scanned
+_NOTHING = 1e-7  # of kT: where no more than this is left to be lost, the search ends
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,8 @@ from mdnum.errors import InputError
 Times = float | Shaped[np.ndarray, "*times"]
 Counts = int | float | Shaped[np.ndarray, "*counts"]
 
-#: Imaginary step of a derivative: its square is far below rounding.
-_STEP = 1e-40
-#: Contacts after which something is wrong: each damped one takes a share of the energy.
-_MOST = 100_000
+_STEP = 1e-40  # imaginary step of a derivative: its square is far below rounding
+_MOST = 100_000  # contacts after which something is wrong: each damped one takes a share of the energy
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from mdnum.ball.step import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 from mdnum.numerics.formats import check_scale, scaled_gradient
 
-#: Parameters of the start rather than of the world; a value moves the whole batch.
-START = ("y0", "v0")
+START = ("y0", "v0")  # parameters of the start rather than of the world; a value moves the whole batch
 
 
 class BallLoss(Protocol):

@@ -22,8 +22,7 @@ from mdnum.numerics.events import Ledger
 from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.rounding import gamma
 
-#: Balls times steps that leave the device at once.
-_CHUNK = 2**21
+_CHUNK = 2**21  # balls times steps that leave the device at once
 
 
 @dataclass(frozen=True)

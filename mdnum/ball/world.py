@@ -34,10 +34,8 @@ from mdnum.numerics.formats import stochastic_round
 from mdnum.numerics.roles import RolePrecision
 from mdnum.plain import beside
 
-#: What is known of each parameter.
-PARAMETERS: Mapping[str, Mapping[str, Any]] = beside(__file__)
-#: Iterations are counted in 32 bits.
-_MOST_ITERATIONS = 2**31 - 1
+PARAMETERS: Mapping[str, Mapping[str, Any]] = beside(__file__)  # what is known of each parameter
+_MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 
 
 class World(eqx.Module):

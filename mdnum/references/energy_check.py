@@ -24,12 +24,9 @@ from mdnum.systems.structures import with_images
 
 #: What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale.
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
-#: Steps to the later of the two frames compared by default.
-SOME_STEPS = 200
-#: Larger systems are compared by a sample: groups of atoms with all their neighbors.
-SAMPLED = 10_000
-#: What narrower precision must meet: this many times the rounding expected of one typical number.
-ROUNDINGS = 5.0
+SOME_STEPS = 200  # steps to the later of the two frames compared by default
+SAMPLED = 10_000  # larger systems are compared by a sample: groups of atoms with all their neighbors
+ROUNDINGS = 5.0  # that narrower precision must meet, of those expected of a typical number
 
 
 @dataclass(frozen=True)
@@ -436,8 +433,7 @@ def _growth(position: Sequence[float]) -> float:
 
 # --- a few atoms of a large system with all their neighbors: small enough to be evaluated by anybody -----
 
-#: Places at random, and atoms nearest to each whose energies and forces are compared.
-PLACES, ATOMS = 8, 32
+PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energies and forces are compared
 
 
 def neighborhoods(

@@ -40,8 +40,7 @@ class Edges:
     r: ndarray  # its length
 
 
-#: What `edges_of` adds to the length it is asked for, relative.
-SLACK = 1e-12
+SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 
 
 def edges_of(atoms: Atoms, reach: float) -> Edges:

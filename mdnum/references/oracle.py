@@ -13,8 +13,7 @@ from numpy import ndarray
 from mdnum.errors import InputError
 
 Positions = Float[ndarray, "atoms 3"]
-#: Lattice vectors as rows.
-Vectors = Float[ndarray, "3 3"]
+Vectors = Float[ndarray, "3 3"]  # lattice vectors as rows
 Axes = Bool[ndarray, "3"]
 Shift = Int[ndarray, "3"] | tuple[int, int, int]
 

@@ -16,8 +16,7 @@ from mdnum.audit.base import AuditCheck, CheckResult, Observed, Progress, Severi
 from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject, Forces, bits, differences, largest
 
-#: Seeds of generators, to tell numbers that are drawn from a seed that is set: any two.
-_SEEDS = (271828, 314159)
+_SEEDS = (271828, 314159)  # two, to tell numbers that are drawn from a seed that is set
 #: What some calculators read from `Atoms.info`.
 _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 

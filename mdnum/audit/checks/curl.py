@@ -14,14 +14,10 @@ from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
 from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
-#: Å; the loop with the smaller error counts.
-_RADII = (0.03, 0.003, 0.0003)
-#: Points on a loop: equally spaced ones integrate a smooth periodic function to all orders below this.
-_POINTS = 12
-#: Work over its error from which it is significant.
-_SIGNIFICANT = 10.0
-#: Antisymmetric over symmetric part of the derivative of the forces: below, it is precision.
-_SMALL = 1e-4
+_RADII = (0.03, 0.003, 0.0003)  # Å; the loop with the smaller error counts
+_POINTS = 12  # on a loop: equally spaced, they integrate a smooth periodic function to all orders below
+_SIGNIFICANT = 10.0  # work over its error from which it is significant
+_SMALL = 1e-4  # antisymmetric over symmetric part of the derivative of the forces: below, it is precision
 
 Displacement = Float[np.ndarray, "atoms 3"]
 

@@ -34,22 +34,15 @@ _FEW_STEPS, _FEW_COMPARED, _FEW_ITERATIONS = 16, 2, 3
 #: Share of the thermal energy of an atom that may drift away in a ps before a run is not one at constant
 #: energy: within 100 ps all of it.
 _MUCH = 1e-2
-#: Of kT: a sum of jumps that wanders less in a unit of time is not reported.
-_WANDERS = 1e-4
-#: Of kT: energy of an atom that may come and go without a flip or the integrator.
-_SWING = 1e-2
-#: Steps in the period of the fastest vibration.
-_STEPS_A_PERIOD = 40
-#: Å that the fastest atom of a thermal run may cover in a step.
-_FURTHEST = 0.06
+_WANDERS = 1e-4  # of kT: a sum of jumps that wanders less in a unit of time is not reported
+_SWING = 1e-2  # of kT: energy of an atom that may come and go without a flip or the integrator
+_STEPS_A_PERIOD = 40  # steps in the period of the fastest vibration
+_FURTHEST = 0.06  # Å that the fastest atom of a thermal run may cover in a step
 _POWER_ITERATIONS = 10
-#: Kinetic over initial kinetic energy from which a run has blown up.
-_BLOWN_UP = 1e3
-#: Of the thermal force of the stiffest spring: below, atoms are in their places.
-_RELAXED = 0.2
+_BLOWN_UP = 1e3  # kinetic over initial kinetic energy from which a run has blown up
+_RELAXED = 0.2  # of the thermal force of the stiffest spring: below, atoms are in their places
 _MOST_SWEEPS = 500
-#: Relative to a squared length, and of a momentum to the largest.
-_TOLERANCE = 1e-13
+_TOLERANCE = 1e-13  # relative to a squared length, and of a momentum to the largest
 _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 
 

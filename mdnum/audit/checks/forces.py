@@ -27,12 +27,9 @@ from mdnum.audit.noise import NoiseFloor, digits, direction, displaced, measured
 from mdnum.audit.places import WrongPlaces, wrong_places
 from mdnum.audit.subject import CalculatorSubject, no_rounding, rms
 
-#: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
-_LADDER = 0.064 * 0.25 ** np.arange(9)
-#: Difference over estimated error from which forces and energy disagree.
-_SIGNIFICANT = 10.0
-#: Of the root mean square force: below, a disagreement is one of tables or precision.
-_SMALL = 1e-4
+_LADDER = 0.064 * 0.25 ** np.arange(9)  # Å, each a quarter of the one before: 0.064 Å to 1e-6 Å
+_SIGNIFICANT = 10.0  # difference over estimated error from which forces and energy disagree
+_SMALL = 1e-4  # of the root mean square force: below, a disagreement is one of tables or precision
 #: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
 #: other is more than single precision explains.
 _DROWNED, _LOUD = 0.1, 1e-3
@@ -40,18 +37,15 @@ _DIRECTIONS, _ATOMS = 3, 4
 #: Atoms of the cluster that is taken where rounding hides the forces on more, and Å of a cell around it that
 #: does not repeat.
 _CLUSTER, _BOX = 24, 75.0
-#: Of the largest disagreement: below, one factor explains it.
-_SAME = 0.01
+_SAME = 0.01  # of the largest disagreement: below, one factor explains it
 #: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
 #: between two ways of writing one structure down, above the other is an error.
 _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
 #: Of two energies of one structure: changes of their difference that rounding explains, of doubles and of
 #: numbers of single precision.
 _ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
-#: eV/Å: a force below is none, where no noise is louder.
-_NOTHING = 1e-12
-#: Å to either side, for the derivative of that difference, and the error of it, roughly.
-_STEP, _CENTRAL = 1e-3, 1e-3
+_NOTHING = 1e-12  # eV/Å: a force below is none, where no noise is louder
+_STEP, _CENTRAL = 1e-3, 1e-3  # Å to either side, for the derivative of that difference, and its error
 
 Displacement = Float[np.ndarray, "atoms 3"]
 

@@ -20,8 +20,7 @@ from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest,
 #: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
 #: are said to differ.
 _NEARLY = 30.0
-#: Of kT for the whole structure, and of the root mean square force: a difference below is one of precision.
-_SMALL = 1e-3
+_SMALL = 1e-3  # of kT, and of the root mean square force: a difference below is one of precision
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
 #: rectangular cells alone, or molecules by the order of their atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")

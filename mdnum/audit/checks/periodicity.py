@@ -11,8 +11,7 @@ from mdnum.audit.checks.invariance import InvarianceCheck, Same, ulp
 from mdnum.audit.noise import displaced
 from mdnum.audit.structures import FARTHEST, modified, nearest_distance
 
-#: Of the nearest distance: length of a free vector with which every atom would feel its own image.
-_SHORT = 1.3
+_SHORT = 1.3  # of the nearest distance: length of a free vector with which atoms would feel their own images
 
 
 class PeriodicityCheck(InvarianceCheck):

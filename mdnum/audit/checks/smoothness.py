@@ -19,14 +19,12 @@ ORDERS = (
     "energy", "force", "curvature", "third derivative", "fourth derivative", "fifth derivative",
     "none up to the fifth",
 )  # fmt: skip
-#: Representable distances shown on either side of a jump.
-_ULPS = 12
+_ULPS = 12  # representable distances shown on either side of a jump
 _DRAWN = 4
 #: An energy jump above so many kT is an error: a thousand of them in one direction make one kT; one below the
 #: second, or of the force below so many kT per unit of length, is information.
 _LARGE, _SMALL, _SMALL_FORCE = 1e-3, 1e-7, 1e-5
-#: A switch whose curvature is this many times that of the well is what limits the time step.
-_STEEP = 5.0
+_STEEP = 5.0  # a switch whose curvature is this many times that of the well is what limits the time step
 
 
 #: Codes that report a jump of the energy, and of the force alone.

@@ -19,12 +19,9 @@ from mdnum.audit.thresholds import find_thresholds
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
 #: and by new objects.
 _AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
-#: Å by which an atom is moved a little further each time.
-_TINY = 10.0 ** np.arange(-9, -1)
-#: An answer that should have changed by so many of its last digits, and has not at all, was kept.
-_KEPT = 100.0
-#: Å: what is kept within less is a matter of precision.
-_HARMLESS = 1e-7
+_TINY = 10.0 ** np.arange(-9, -1)  # Å by which an atom is moved a little further each time
+_KEPT = 100.0  # an answer that should have changed by so many of its last digits, and did not, was kept
+_HARMLESS = 1e-7  # Å: what is kept within less is a matter of precision
 _EPS = np.finfo(float).eps
 
 

@@ -28,8 +28,7 @@ Code = Literal[
     "VECTORS", "MALFORMED", "NO_ANSWER", "CHANGED_INPUT", "RAISED",
 ]  # fmt: skip
 CODES: tuple[Code, ...] = get_args(Code)
-#: Those of cases in which nothing came back.
-SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
+SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing came back
 
 
 @dataclass(frozen=True)

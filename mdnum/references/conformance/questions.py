@@ -25,13 +25,10 @@ from mdnum.references.oracle import PairSet, completed, widths
 #: (name, positions, cell, pbc, r_cut), of which the last ones may be left out as in `once`.
 Named = Iterator[tuple[Any, ...]]
 
-#: Atoms along an edge of the lattices: some 5,000 atoms, and 100,000.
-SMALL_EDGE, LARGE_EDGE = 17, 47
+SMALL_EDGE, LARGE_EDGE = 17, 47  # atoms along an edge of the lattices: some 5,000 atoms, and 100,000
 
-#: Cases of each area that are asked before the others: a verdict rests on these at least.
-BREADTH = 5
-#: Random cases that are drawn together, which takes a second or two.
-_CHUNK = 500
+BREADTH = 5  # cases of each area that are asked before the others: a verdict rests on these at least
+_CHUNK = 500  # random cases that are drawn together, which takes a second or two
 
 _WRITTEN = beside(__file__)
 _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0

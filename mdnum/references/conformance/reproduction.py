@@ -25,8 +25,7 @@ from mdnum.references.conformance.lists import PairList
 from mdnum.safe_path import environment, python
 
 _PRINTED = 60  # atoms whose coordinates are written out
-#: Parts of a script.
-_LINES = beside(__file__)
+_LINES = beside(__file__)  # parts of a script
 
 
 def script(
@@ -115,8 +114,7 @@ _RUN = (
     "import runpy, sys; from mdnum.safe_path import guard; guard(int(sys.argv[2])); "
     "runpy.run_path(sys.argv[1], run_name='__main__')"
 )
-#: Seconds that a script may take.
-_SECONDS = 60.0
+_SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:

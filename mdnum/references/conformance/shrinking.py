@@ -20,14 +20,11 @@ from mdnum.references.oracle import completed, widths
 if TYPE_CHECKING:
     from mdnum.references.conformance.suite import Examiner
 
-#: Questions and seconds that a shrink may take; a slow list has this many questions, and at most so long.
-TRIES, SECONDS = 600, 8.0
+TRIES, SECONDS = 600, 8.0  # questions and seconds of a shrink; those below are of a slow list
 LEAST_TRIES, PATIENCE = 80, 60.0
 _MOST_IMAGES = 3000
-#: Seconds for a question on the way to a smaller one.
-_TRY = 5.0
-#: How much of the smallest motion a lost pair is followed for.
-_FURTHEST = 2.5
+_TRY = 5.0  # seconds for a question on the way to a smaller one
+_FURTHEST = 2.5  # how much of the smallest motion a lost pair is followed for
 
 Failures = Callable[[Case], Sequence[Failure]]
 

@@ -40,19 +40,13 @@ from mdnum.references.conformance.shrinking import reduced
 Progress = Callable[[int, int, dict[str, Any]], None]
 Saved = Callable[[bool], None]
 
-#: Random cases by default; a list that is asked for a share of them has fewer.
-CASES = 500
-#: Seconds that the 100,000 atoms may be expected to take.
-_PATIENCE = 30.0
-#: Share of wrong answers above which one that would be right in float32 shows nothing about precision.
-_MISTAKES = 0.1
-#: Atoms, edge and seed of the crowd that shows how far a list that is kept has all pairs, and its skin.
-_CROWD = (160, 6.0, 130)
+CASES = 500  # random cases by default; a list that is asked for a share of them has fewer
+_PATIENCE = 30.0  # seconds that the 100,000 atoms may be expected to take
+_MISTAKES = 0.1  # share of wrong answers above which a right one in float32 shows no precision
+_CROWD = (160, 6.0, 130)  # atoms, edge and seed of a crowd that shows how far a kept list has all pairs
 _SKIN = 0.3
-#: Share of the time after which failures are reproduced, if there are any.
-_ASKING = 0.75
-#: Refusals that are examined; a list with more kinds of them has other worries.
-_REFUSALS = 6
+_ASKING = 0.75  # share of the time after which failures are reproduced, if there are any
+_REFUSALS = 6  # refusals that are examined; a list with more kinds of them has other worries
 
 
 class Examiner:
