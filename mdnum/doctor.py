@@ -50,8 +50,7 @@ class DoctorRow:
     """One test of the installation."""
 
     name: str  # what was tested
-    # "info" for a fact that changes bits without making them wrong; "unsafe" when numbers computed here, or
-    # the claims mdnum makes about them, cannot be trusted
+    # "info": changes bits without making them wrong; "unsafe": numbers, or claims about them, may be wrong
     status: Status
     seen: str
     remedy: str | None = None  # what to do, when something should be done
@@ -225,8 +224,7 @@ def functions() -> DoctorRow:
     a, b = _numbers(3), _numbers(4) / 10
     ulps = {}
     for name, given in {"exp": [-a], "log": [a], "cos": [a], "power": [a, b]}.items():
-        # near a zero of the cosine the last place is a small one
-        above = 2.0 if name == "cos" else 0.0
+        above = 2.0 if name == "cos" else 0.0  # near a zero of the cosine the last place is a small one
         expected = getattr(np, name)(*given) + above
         ours = jax.jit(lambda *x, function=getattr(jnp, name), above=above: function(*x) + above)
         got = np.asarray(ours(*map(jnp.asarray, given)))
@@ -377,20 +375,19 @@ def digest(steps: int = 50) -> str:
     """SHA-256 of a short jitted rollout, to be compared between processes.
 
     Args:
-        steps: velocity Verlet steps of a 32-atom Lennard-Jones crystal.
+        steps: velocity Verlet steps of 32 argon atoms.
     """
-    positions = _fcc(2) * 1.6
-    positions += np.random.default_rng(7).normal(scale=0.05, size=positions.shape)
-    box, step = 3.2, 0.002
+    positions = _fcc(2) * 5.26
+    positions += np.random.default_rng(7).normal(scale=0.05 * _SIGMA, size=positions.shape)
+    box, step = 2 * 5.26, 0.05
 
-    def force(x: jax.Array) -> jax.Array:
+    def energy(x: jax.Array) -> jax.Array:
         separation = x[:, None] - x[None, :]
         separation = separation - box * jnp.round(separation / box)
-        r2 = jnp.sum(separation * separation, axis=-1)
-        inside = (r2 > 0) & (r2 < 1.5**2)
-        inverse = jnp.where(inside, 1.0 / jnp.where(inside, r2, jnp.ones_like(r2)), jnp.zeros_like(r2))
-        sixth = inverse * inverse * inverse
-        return jnp.sum((24 * inverse * (2 * sixth * sixth - sixth))[..., None] * separation, axis=1)
+        return 0.5 * pair_energy(jnp.sum(separation * separation, axis=-1))
+
+    def force(x: jax.Array) -> jax.Array:
+        return -jax.grad(energy)(x)
 
     @jax.jit
     def roll(x: jax.Array) -> tuple[jax.Array, jax.Array]:
