@@ -390,8 +390,7 @@ def _least_energy(
             scale, here = scale * direction, there
         else:
             return start, False
-    ended = np.isfinite(here)
-    return (scale, True) if ended else (start, False)
+    return (scale, True) if np.isfinite(here) else (start, False)
 
 
 def _small(cell: Atoms, scale: float) -> Atoms:

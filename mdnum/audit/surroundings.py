@@ -42,8 +42,7 @@ _NEAR, _FAR = 0.5, 0.94  # the crowd is between these fractions of the cutoff
 _SIDE_OF_TIE = 4.0
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
-#: With how many neighbors ties are tried, three calls each; the share of one of several species is less.
-_TIES = 160
+_TIES = 160  # neighbors for which ties are tried, by three calls each; of several species, a share
 #: Ties that are tried in any case.
 _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
 

@@ -221,14 +221,8 @@ def _morse(form: PairForm, begin: float, end: float) -> Calculator:
     from ase.calculators.morse import MorsePotential
 
     depth, alpha, r0 = (form.constants[key] for key in ("depth", "alpha", "r0"))
-    return MorsePotential(
-        epsilon=depth,
-        rho0=alpha * r0,
-        r0=r0,
-        rcut1=begin / r0,
-        rcut2=end / r0,
-        neighbor_list=_inside_list(form),
-    )
+    lengths = {"rho0": alpha * r0, "r0": r0, "rcut1": begin / r0, "rcut2": end / r0}
+    return MorsePotential(epsilon=depth, **lengths, neighbor_list=_inside_list(form))
 
 
 def _at_cutoff(form: PairForm) -> float:
@@ -276,12 +270,8 @@ def _short_listed_eam(file: Path) -> Calculator:
             self.Nelements = len(self.elements)
             self.index = np.array([self.elements.index(symbol) for symbol in atoms.get_chemical_symbols()])
             self.pbc = atoms.get_pbc()
-            self.neighbors = NeighborList(
-                np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12)),
-                skin=0.0,
-                self_interaction=False,
-                bothways=True,
-            )
+            reach = np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12))
+            self.neighbors = NeighborList(reach, skin=0.0, self_interaction=False, bothways=True)
             self.neighbors.update(atoms)
 
     return ShortListed(potential=str(file), form="alloy", skin=0.0)

@@ -385,13 +385,8 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
     judge = _forces(simulation) if judge is None else judge
     narrow = simulation.policy.state == "float32"
     start = simulation.positions.astype(np.float32).astype(np.float64) if narrow else simulation.positions
-    atoms = Atoms(
-        numbers=simulation.structure.numbers,
-        positions=start,
-        cell=simulation.structure.cell,
-        pbc=simulation.structure.pbc,
-        masses=simulation.masses,
-    )
+    given = simulation.structure
+    atoms = Atoms(given.numbers, start, cell=given.cell, pbc=given.pbc, masses=simulation.masses)
     atoms.set_velocities(simulation.velocities)
     atoms.calc = judge.make()
     integrator = VelocityVerlet(atoms, timestep=float(simulation.integrator.timestep))

@@ -64,9 +64,8 @@ _LAST: dict[tuple[bytes | float, ...], Edges] = {}
 
 def _edges(atoms: Atoms, reach: float) -> Edges:
     n = len(atoms)
-    listed = PrimitiveNeighborList(
-        [0.5 * reach * (1 + SLACK)] * n, skin=0.0, self_interaction=False, bothways=False
-    )
+    ranges = [0.5 * reach * (1 + SLACK)] * n
+    listed = PrimitiveNeighborList(ranges, skin=0.0, self_interaction=False, bothways=False)
     vectors = complete_cell(np.where(atoms.pbc[:, None], atoms.cell, 0.0))
     listed.build(atoms.pbc, vectors, atoms.positions)
     i = np.repeat(np.arange(n), [len(row) for row in listed.neighbors])
@@ -199,9 +198,8 @@ def _morse(r: ndarray, depth: float, alpha: float, r0: float) -> tuple[ndarray, 
 
 def _soft_sphere(r: ndarray, sigma: float, epsilon: float, alpha: float) -> tuple[ndarray, ndarray]:
     overlap = np.maximum(1.0 - r / sigma, 0.0)
-    return epsilon / alpha * overlap**alpha, -epsilon / sigma * np.where(
-        overlap > 0, overlap ** (alpha - 1.0), 0.0
-    )
+    slope = np.where(overlap > 0, overlap ** (alpha - 1.0), 0.0)
+    return epsilon / alpha * overlap**alpha, -epsilon / sigma * slope
 
 
 _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {

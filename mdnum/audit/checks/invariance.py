@@ -24,8 +24,7 @@ _SMALL = 1e-3  # of kT, and of the root mean square force: a difference below is
 #: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
 #: rectangular cells alone, or molecules by the order of their atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
-#: Findings of what differs, beside the codes of the ways.
-_REPORTS = ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES")
+_REPORTS = ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES")  # findings beside the codes of ways
 
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.

@@ -247,11 +247,9 @@ def _through(shift: ndarray) -> str:
 
 def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
     """Every pair of the truth from both of its atoms."""
-    return (
-        np.concatenate([truth.i, truth.j]),
-        np.concatenate([truth.j, truth.i]),
-        np.concatenate([truth.shift, -truth.shift]),
-    )
+    columns = (truth.i, truth.j), (truth.j, truth.i), (truth.shift, -truth.shift)
+    i, j, shift = map(np.concatenate, columns)
+    return i, j, shift
 
 
 def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, ndarray]:

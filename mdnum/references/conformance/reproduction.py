@@ -125,9 +125,8 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
     seconds = min(_SECONDS, deadline.left)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reproduce.py"
-        path.write_text(
-            script(tested, failed, report.how, report.superset, report.reach(failed.case)), encoding="utf-8"
-        )
+        lines = script(tested, failed, report.how, report.superset, report.reach(failed.case))
+        path.write_text(lines, encoding="utf-8")
         command = python("-c", _RUN, str(path), str(os.getpid()))
         try:
             done = subprocess.run(
