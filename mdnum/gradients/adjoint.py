@@ -80,13 +80,31 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
     model, cut = force.model, force.model.cutoff
     at, back_to_model = jax.vjp(lambda model: model.at_cutoff(), model)
     types_of = model.pair_types
-    by_parameter = (model.potential, at) if MODEL in wanted else ()
+    own, shared = model.potential.split()
+
+    def distances(d, dw, inside):
+        # the argument is masked, not only the result: a padded slot may be at distance zero
+        r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
+        return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
+
+    def onto_parameters(r2, along, inside, types, *, of_all: bool):
+        """The cotangents of each slot's own parameters and end; `of_all`, of the shared ones in all slots."""
+        # each slot has parameters of its own, so that no sum over slots stands inside the loop
+        slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
+
+        def ended(slots, shared):
+            potential, end = slots
+            u, s = eqx.combine(potential, shared).evaluate(r2)
+            return cut.cut(r2, u, s, end)
+
+        onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
+        if of_all:
+            return jax.vjp(lambda shared: ended(slots, shared), shared)[1](onto)[0]
+        return jax.vjp(lambda slots: ended(slots, shared), slots)[1](onto)[0]
 
     def terms(d, dw, inside, types) -> list[Array]:
         """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted."""
-        # the argument is masked, not only the result: a padded slot may be at distance zero
-        r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
-        along = jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
+        r2, along = distances(d, dw, inside)
         (_, slope), (_, bend) = jax.jvp(lambda q: model.evaluate(q, types, at), (r2,), (jnp.ones_like(r2),))
         slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
         # derivative by r² of what this slot adds to energy and virial
@@ -98,19 +116,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         if SCALE in wanted:
             made += [2 * r2 * (shared - bend * along)]
         if MODEL in wanted:
-            # each slot has parameters of its own, so that no sum over slots stands inside the loop
-            own = jax.tree.map(
-                lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (model.potential, at)
-            )
-
-            def ended(own):
-                potential, end = own
-                u, s = potential.evaluate(r2)
-                return cut.cut(r2, u, s, end)
-
-            _, back = jax.vjp(ended, own)
-            onto_u = jnp.where(inside, 0.5 * energy, 0)
-            leaves = jax.tree.leaves(back((onto_u, -jnp.where(inside, along + virial * r2, 0)))[0])
+            leaves = jax.tree.leaves(onto_parameters(r2, along, inside, types, of_all=False))
             made += [
                 leaf if types is None else jnp.where(types == kind, leaf, 0)
                 for leaf in leaves
@@ -126,37 +132,61 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
     onto_model = jax.tree.map(jnp.zeros_like, model)
     if MODEL in wanted:
         flat = jnp.stack([jnp.sum(total) for total in sums]).reshape(-1, types_of)
-        onto_potential, onto_at = jax.tree.unflatten(jax.tree.structure(by_parameter), list(flat))
+        onto_own, onto_at = jax.tree.unflatten(jax.tree.structure((own, at)), list(flat))
+        onto_shared = shared
+        if jax.tree.leaves(shared):
+
+            def block(total, d, inside, types):
+                r2, along = distances(d[:3], d[3:], inside)
+                added = onto_parameters(r2, along, inside, types, of_all=True)
+                return jax.tree.map(jnp.add, total, added)
+
+            start = jax.tree.map(jnp.zeros_like, shared)
+            onto_shared = _over_groups(block, start, columns, cell, tables, bits)
         (onto_model,) = back_to_model(onto_at)
-        direct = jax.tree.map(jnp.add, onto_model.potential, onto_potential)
+        direct = jax.tree.map(jnp.add, onto_model.potential, eqx.combine(onto_own, onto_shared))
         onto_model = CutPotential(direct, cut, onto_model.r_cut, onto_model.r_onset)
     return ForceCotangents(on_x, onto_model, scale, made)
+
+
+def _differences(cell, own, other):
+    """Of two vectors of two atoms, the first a position."""
+    d = [b - a for a, b in zip(own, other, strict=True)]
+    return [*cell.minimum_image(*d[:3]), *d[3:]]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
     """Sums over the slots of each atom of what they add, from the differences of two vectors."""
 
-    def differences(own, other):
-        d = [b - a for a, b in zip(own, other, strict=True)]
-        return *cell.minimum_image(*d[:3]), *d[3:]
-
     def pair(own, other, types, inside):
         # padding is nowhere
-        d = [jnp.where(inside, c, 0) for c in differences(own, other)]
+        d = [jnp.where(inside, c, 0) for c in _differences(cell, own, other)]
         return terms(d[:3], d[3:], inside, types)
 
     made = kernel.over_pairs(pair, columns, tables, flags=(bits,)) if in_one_loop else None
     if made is not None:
         return made.sums
-    own, (index, types), halves = tuple(columns), tables.groups(), halves_of(bits)
+    index, types = tables.groups()
+    d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * 3
+    inside = jax.ShapeDtypeStruct(index.shape[1:], np.bool_)
+    first = jax.eval_shape(terms, d, d, inside, None if types is None else types[0])
+    start = (jnp.zeros_like(columns[0]),) * len(first)
+    return _over_groups(
+        lambda sums, d, inside, types: _added(sums, terms(d[:3], d[3:], inside, types)),
+        start, columns, cell, tables, bits,
+    )  # fmt: skip
 
-    def added(j, types, told):
-        d = differences(own, [c.at[j].get(mode="promise_in_bounds") for c in own])
-        return terms(d[:3], d[3:], unpacked(told), types)
 
-    first = jax.eval_shape(added, index[0], None if types is None else types[0], halves[0])
-    start = (jnp.zeros_like(own[0]),) * len(first)
-    return lax.scan(lambda sums, slots: (_added(sums, added(*slots)), None), start, (index, types, halves))[0]
+def _over_groups(add, start, columns, cell, tables: Tables, bits):
+    """A sum over the groups of slots, of what `add` makes of the differences in one."""
+    own = tuple(columns)
+
+    def group(sums, slots):
+        j, types, told = slots
+        d = _differences(cell, own, [c.at[j].get(mode="promise_in_bounds") for c in own])
+        return add(sums, d, unpacked(told), types), None
+
+    return lax.scan(group, start, (*tables.groups(), halves_of(bits)))[0]
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:

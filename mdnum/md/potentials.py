@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -33,7 +34,7 @@ def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> N
 
 
 class PairPotential(eqx.Module):
-    """A bare pair potential; every array leaf is a parameter with one entry per pair type.
+    """A bare pair potential; a field is a parameter with one entry per pair type, but for `shared`.
 
     Example:
         >>> class Inverse(mdnum.PairPotential):
@@ -45,32 +46,38 @@ class PairPotential(eqx.Module):
     """
 
     name: ClassVar[str]
+    #: Parameters that all pairs share, as the weights of a network: any pytree of arrays.
+    shared: ClassVar[Any] = ()
 
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
 
-    @classmethod
     def reference(
-        cls, r: Float[np.ndarray, "pairs"], **constants: float
+        self, r: Float[np.ndarray, "pairs"], **constants: float
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
         """u(r) and u'(r) on the host: the judge of `evaluate`, its slope the derivative of its energy.
 
         Args:
             r: distances, length.
-            constants: of the pair.
+            constants: of the pair; shared parameters are its own.
         """
-        made = cls(**{name: jnp.atleast_1d(value) for name, value in constants.items()})
+        made = self.with_leaves({name: jnp.atleast_1d(value) for name, value in constants.items()})
         energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
-        return jax.tree.map(lambda leaf: of_type(leaf, types), self)
+        own, shared = self.split()
+        return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
+
+    def split(self) -> tuple[Any, Any]:
+        """It with its parameters by pair type alone, and with the shared ones alone; None for the others."""
+        return self, jax.tree.map(lambda _: None, self)
 
     @property
     def leaves(self) -> dict[str, Any]:
-        """Its parameters by name, each of shape (types,) with one entry per pair type."""
+        """Its parameters by pair type, by name, each of shape (types,)."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:
@@ -78,7 +85,7 @@ class PairPotential(eqx.Module):
         return replace(self, **leaves)
 
     def constants(self, kind: int) -> dict[str, float]:
-        """Its parameters for one pair type."""
+        """Its parameters for one pair type, but for those that all share."""
         return {name: float(leaf[kind]) for name, leaf in self.leaves.items()}
 
 
@@ -157,7 +164,9 @@ class PairFunction(PairPotential):
     Args:
         function: of jax operations, elementwise in its first argument, whose name says whether that is the
             distance, `r` (length), or its square, `r2`.
-        parameters: by name, a number for all pairs or one for each pair of species, {"Ni-P": 0.2, ...}.
+        parameters: by name, a number for all pairs or one for each pair of species, {"Ni-P": 0.2, ...}: these
+            have an entry per pair type. Or arrays, lists, dictionaries or modules of arrays, as the weights
+            of a network: these are shared by all pairs. A list of numbers is an array.
 
     Raises:
         InputError: the first argument is neither, or the parameters are not those of the function.
@@ -165,9 +174,12 @@ class PairFunction(PairPotential):
 
     function: Callable[..., Any] = eqx.field(static=True)
     parameters: dict[str, Any]  # in a simulation, arrays with one entry per pair type
+    shared: dict[str, Any]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, function: Callable[..., Any], **parameters: Any):
-        self.function, self.parameters = function, parameters
+        self.function = function
+        self.parameters = {key: value for key, value in parameters.items() if _is_by_type(value)}
+        self.shared = {key: value for key, value in parameters.items() if key not in self.parameters}
         arguments = list(inspect.signature(function).parameters)
         if arguments[:1] not in (["r"], ["r2"]):
             raise InputError(
@@ -188,27 +200,36 @@ class PairFunction(PairPotential):
     name = property(lambda self: _name_of(self.function))  # type: ignore[assignment]
 
     def evaluate(self, r2):
-        ones = jnp.ones_like(r2)
+        ones, parameters = jnp.ones_like(r2), self.parameters | self.shared
         if next(iter(inspect.signature(self.function).parameters)) == "r2":
-            return jax.jvp(lambda q: self.function(q, **self.parameters), (r2,), (ones,))
+            return jax.jvp(lambda q: self.function(q, **parameters), (r2,), (ones,))
         r = jnp.sqrt(r2)
-        energy, slope = jax.jvp(lambda r: self.function(r, **self.parameters), (r,), (ones,))
+        energy, slope = jax.jvp(lambda r: self.function(r, **parameters), (r,), (ones,))
         return energy, slope / (r + r)
 
-    def reference(self, r, **constants):  # type: ignore[override]
-        return PairFunction(self.function, **constants)._on_host(r)
-
-    def _on_host(self, r):
-        r = jnp.asarray(r)
-        energy, slope = jax.jvp(lambda r: self.evaluate(r * r)[0], (r,), (jnp.ones(r.shape),))
-        return np.asarray(energy), np.asarray(slope)
+    def split(self):
+        own, shared = copy(self), copy(self)
+        object.__setattr__(own, "shared", jax.tree.map(lambda _: None, self.shared))
+        object.__setattr__(shared, "parameters", jax.tree.map(lambda _: None, self.parameters))
+        return own, shared
 
     @property
     def leaves(self):
         return self.parameters
 
     def with_leaves(self, leaves):
-        return PairFunction(self.function, **{**self.parameters, **leaves})
+        made = copy(self)
+        for part in ("parameters", "shared"):
+            changed = {key: leaves.get(key, value) for key, value in getattr(self, part).items()}
+            object.__setattr__(made, part, changed)
+        return made
+
+
+def _is_by_type(value: Any) -> bool:
+    """Whether a parameter is a number, or one for each pair of species; all else is shared."""
+    if isinstance(value, Mapping):
+        return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
+    return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
 
 
 def _name_of(function: Callable[..., Any]) -> str:

@@ -17,7 +17,7 @@ from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.lattice import Lattice, LatticeDecider
-from mdnum.md.manybody import ManyBody
+from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
 from mdnum.md.potentials import CutPotential, PairPotential, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
@@ -168,7 +168,33 @@ def cut(
     if cutoff.switches:
         r_onset = ONSET_FRACTION * r_cut if onset is None else table(onset, "cutoff.onset")
     leaves = {key: table(value, f"potential.{key}") for key, value in potential.leaves.items()}
+    tree = jax.tree.map(
+        lambda one: np.array(one) if _is_array(one) else one, potential.shared, is_leaf=_is_array
+    )
+    shared = [_shared(leaf, f"potential.{path}") for path, leaf in leaves_by_path(tree).items()]
+    leaves |= dict(jax.tree.unflatten(jax.tree.structure(tree), shared))
     return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset)
+
+
+def _is_array(value: Any) -> bool:
+    """Whether a list is one of numbers, or of equally long lists of them, as a file writes an array."""
+    numbers = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(value))
+    try:
+        return type(value) in (list, tuple) and numbers and np.array(value).dtype.kind in "iuf"
+    except ValueError:
+        return False
+
+
+def _shared(value: Any, what: str):
+    """An array of numbers that all pairs share."""
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not np.isfinite(numbers).all():
+        remedy = "Keep what is no parameter in the function"
+        raise InputError(f"{value!r}; expected finite numbers", where=what, remedy=remedy)
+    return jax.device_put(numbers)
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
@@ -267,7 +293,8 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         places = np.array([old.index(one) for one in symbols])
         first, second = np.triu_indices(len(places))
         kinds = pair_type(places[first], places[second], len(old))
-        model = jax.tree.map(lambda leaf: leaf[kinds], model)
+        ends = (leaf[kinds] for leaf in (model.r_cut, model.r_onset))
+        model = CutPotential(model.potential.of(kinds), model.cutoff, *ends)
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,
         simulation.decider.compare, replace(simulation.rule, skin=skin), simulation.builder,

@@ -164,10 +164,12 @@ def _start(simulation: Simulation) -> str:
 
 
 def _constants(simulation: Simulation) -> dict[str, Any]:
+    potential, typed = simulation.potential, {}
     if simulation.pairwise:
-        return {name: by_pair(simulation, leaf) for name, leaf in simulation.potential.leaves.items()}
-    leaves = leaves_by_path(simulation.model)
-    return {name: plain_leaf(leaf) for name, leaf in leaves.items() if eqx.is_array_like(leaf)}
+        typed = {name: by_pair(simulation, leaf) for name, leaf in potential.leaves.items()}
+        potential = potential.shared
+    leaves = leaves_by_path(potential).items()
+    return typed | {name: plain_leaf(leaf) for name, leaf in leaves if eqx.is_array_like(leaf)}
 
 
 def _code(function: Any) -> dict[str, Any]:

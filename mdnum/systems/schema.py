@@ -151,8 +151,10 @@ class PythonTable(PairPotentialTable):
 
     kind: Literal["python"]
     function: str = Field(description='file and name, "mine.py:morse", relative to this file')
-    parameters: dict[str, float | dict[str, float]] = Field(
-        default_factory=dict, description='by name: a number, or one for each pair of species such as "Ni-P"'
+    parameters: dict[str, Any] = Field(
+        default_factory=dict,
+        description='by name: a number, one for each pair of species such as "Ni-P", or lists and tables of '
+        "numbers that all pairs share",
     )
 
     @property
