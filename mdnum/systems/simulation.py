@@ -22,6 +22,7 @@ from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletLi
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, pair_type
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.structures import Draw
 from mdnum.units import Units
 
@@ -263,9 +264,14 @@ class Simulation:
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
-        """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
-        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
-        return replace(self, model=replace(self.model, cutoff=made))
+        """The same system with another treatment of its cutoff (its radius and pairs stay the same).
+
+        Switching begins where it did, and at 0.9 of the radius where it did not switch before.
+        """
+        made, model = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff, self.model
+        if made.switches != model.cutoff.switches:
+            model = replace(model, r_onset=model.r_cut * (ONSET_FRACTION if made.switches else 1))
+        return replace(self, model=replace(model, cutoff=made))
 
     @property
     def continuous(self) -> Simulation:
