@@ -5,6 +5,7 @@ A simulation is made of objects, or of a system file:
     >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
     >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
     >>> sim = mdnum.build("argon/liquid-864")
+    >>> sim = mdnum.changed(sim, {"cutoff.radius": 8.0})
 
 Verbs take either, or the name or path of a system file, and leave a folder:
 
@@ -17,9 +18,10 @@ Verbs take either, or the name or path of a system file, and leave a folder:
     conform             does a neighbor list find every pair?
     bounce, demonstrate the same questions about a ball
 
-Nouns: `Simulation`, pair potentials (`LennardJones`, `Morse`, `SoftSphere`, `PairFunction` for one of your
-own), `Cut`, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and `Integrator` to write one),
-`PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and `MdnumCalculator` for ASE.
+Nouns: `Simulation` and its `parameters` by path, pair potentials (`LennardJones`, `Morse`, `SoftSphere`,
+`PairFunction` for one of your own), `Cut`, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and
+`Integrator` to write one), `PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and
+`MdnumCalculator` for ASE.
 
 The names below are imported on first use (PEP 562), because jax takes half a second to import and
 jax_md takes six, and `mdnum --help` needs neither.
@@ -74,6 +76,8 @@ if TYPE_CHECKING:
     from mdnum.systems.code import allow_code as allow_code
     from mdnum.systems.construct import Cut as Cut
     from mdnum.systems.construct import simulation as simulation
+    from mdnum.systems.parameters import changed as changed
+    from mdnum.systems.parameters import parameters as parameters
     from mdnum.systems.simulation import Simulation as Simulation
     from mdnum.verbs.audit import audit as _audit
     from mdnum.verbs.ball import bounce as bounce

@@ -74,21 +74,18 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:
     """Keys whose values differ, with both values."""
-    first, second = (flat(one) for one in _tables(a, b))
+    if isinstance(a, BallSystem):
+        tables = tuple(one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
+    else:
+        from mdnum.systems.describe import keys_of
+
+        tables = keys_of(a, b)
+    first, second = map(flat, tables)
     return {
         key: [first.get(key), second.get(key)]
         for key in dict.fromkeys((*first, *second))
         if first.get(key) != second.get(key)
     }
-
-
-def _tables(a: Any, b: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    if isinstance(a, BallSystem):
-        first, second = (one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
-        return first, second
-    from mdnum.systems.describe import keys_of
-
-    return keys_of(a, b)
 
 
 def floats(system: Any) -> dict[str, float]:

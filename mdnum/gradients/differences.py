@@ -298,7 +298,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
         NumericalError: the run before the start blew up.
     """
     masses = simulation.masses
-    kT = simulation.units.k_B * float(parameters.value(simulation, "dynamics.temperature"))
+    kT = simulation.units.k_B * simulation.draw.temperature
     random = np.random.default_rng((seed, simulation.draw.seed))
     v = random.standard_normal((len(masses), 3)) * np.sqrt(kT / masses)[:, None]
     # a velocity that all atoms share is no temperature

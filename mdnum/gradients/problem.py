@@ -286,7 +286,9 @@ def value_and_grad(
         UserWarning: a derivative that is exactly zero, with the reason.
     """
     chosen, full = _chosen(problem, names, method)
-    asked = {parameters.resolve(problem.simulation, [name])[0]: name for name in reversed(names)}
+    # a word for several parameters is none of them
+    spelled = {word: parameters.resolve(problem.simulation, [word]) for word in reversed(names)}
+    asked = {name: name for name in full} | {one[0]: word for word, one in spelled.items() if len(one) == 1}
 
     def function(values: Values | None = None):
         found = _differentiated(chosen, problem.at(_in_full(problem, values or {}, full)), full)
@@ -335,7 +337,8 @@ def differentiable(
             watch(found)
         by_name = {}
         for name, value in values.items():
-            derivative = found.gradient[parameters.resolve(problem.simulation, [name])[0]]
+            (one,) = parameters.resolve(problem.simulation, [name])
+            derivative = found.gradient[one]
             dtype = np.promote_types(jnp.result_type(value), np.complex64)
             by_name[name] = jnp.asarray(derivative).astype(dtype)
         return jnp.asarray(found.value), by_name

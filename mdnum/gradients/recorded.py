@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -271,8 +270,8 @@ class Surrogate(Method):
     def twin(self, problem: Problem) -> Problem:
         """The problem that is differentiated."""
         made = problem.simulation.with_cutoff(self.cutoff)
-        model = eqx.tree_at(lambda m: m.r_onset, made.model, made.model.r_cut * self.onset)
-        return replace(problem, simulation=replace(made, model=model))
+        onset = parameters.value(made, "cutoff.radius") * self.onset
+        return replace(problem, simulation=made).at({"cutoff.onset": onset})
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         found = self.method(self.twin(problem), names, progress)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,30 @@ def leaves_by_path(potential: Any) -> dict[str, Any]:
     """The arrays of a potential by where they are in it, such as "pair.values"."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def quantities_of(potential: Any) -> dict[str, Any]:
+    """The parameters of a many-body potential: its arrays and its constants, by name."""
+    found = {name: leaf for name, leaf in leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
+    for field in fields(potential):
+        value = getattr(potential, field.name)
+        # constants that a formula holds; the radius of a table is where it ends, and not one of them
+        if type(value) is float and field.name != "r_cut":
+            found[field.name] = jnp.asarray(value, jnp.float64)
+    return found
+
+
+def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
+    """The potential with other quantities; inside jit too."""
+    names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
+    leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
+    whole = jax.tree.unflatten(tree, leaves)
+    # constants are static fields, so that a module would warn of an array; here they only live for a trace
+    out = object.__new__(type(potential))
+    for field in fields(potential):
+        static = field.name in values and field.name not in names
+        object.__setattr__(out, field.name, values[field.name] if static else getattr(whole, field.name))
+    return out
 
 
 class StillingerWeber(ManyBody):

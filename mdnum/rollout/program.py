@@ -19,7 +19,7 @@ from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, 
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
 from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
 from mdnum.rollout.tracks import Handed, Track
-from mdnum.systems.parameters import dial, unit
+from mdnum.systems import parameters
 from mdnum.systems.simulation import Simulation
 
 #: A loss of the final state: of the simulation, unwrapped positions and velocities per internal time.
@@ -182,13 +182,15 @@ class MdProgram:
         )
 
     def number(self, key: str) -> Number:
-        """A number of the system, as `dial` names them."""
-        found = dial(self.simulation, key)
+        """A number of the system, by its path."""
+        simulation = self.simulation
+        name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
         def at(value: float) -> MdProgram:
-            return replace(self, simulation=found.turn(self.simulation, value))
+            return replace(self, simulation=parameters.with_number(simulation, name, value))
 
-        return Number(found.key, found.value, unit(self.simulation, found.key), at, found.positive)
+        here, unit = parameters.number(simulation, name), parameters.unit(simulation, name)
+        return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
         """What a run decides (see `Program.history`); the loss is the squared displacement by default."""

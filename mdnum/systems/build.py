@@ -26,7 +26,7 @@ from mdnum.systems.structures import species_of
 if TYPE_CHECKING:
     from ase import Atoms
 
-_CHANGE_OBJECTS = "Change the objects: mdnum.systems.parameters.changed(simulation, {...})"
+_CHANGE_OBJECTS = "Change the objects: mdnum.changed(simulation, {...})"
 
 
 def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, "types"]:

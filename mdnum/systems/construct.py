@@ -171,8 +171,8 @@ def cut(
     tree = jax.tree.map(
         lambda one: np.array(one) if _is_array(one) else one, potential.shared, is_leaf=_is_array
     )
-    shared = [_shared(leaf, f"potential.{path}") for path, leaf in leaves_by_path(tree).items()]
-    leaves |= dict(jax.tree.unflatten(jax.tree.structure(tree), shared))
+    shared = (_finite(leaf, f"potential.{path}") for path, leaf in leaves_by_path(tree).items())
+    leaves |= jax.device_put(dict(jax.tree.unflatten(jax.tree.structure(tree), shared)))
     return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset)
 
 
@@ -183,18 +183,6 @@ def _is_array(value: Any) -> bool:
         return type(value) in (list, tuple) and numbers and np.array(value).dtype.kind in "iuf"
     except ValueError:
         return False
-
-
-def _shared(value: Any, what: str):
-    """An array of numbers that all pairs share."""
-    try:
-        numbers = np.array(value, np.float64)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if not np.isfinite(numbers).all():
-        remedy = "Keep what is no parameter in the function"
-        raise InputError(f"{value!r}; expected finite numbers", where=what, remedy=remedy)
-    return jax.device_put(numbers)
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
@@ -211,7 +199,14 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
             remedy = "Give one for every pair of species, or one number for all"
             raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
         value = [given[pair_key(*one.split("-"))] for one in names]
-    numbers = np.broadcast_to(np.asarray(value, np.float64), (len(names),)).copy()
+    return np.broadcast_to(_finite(value, what), (len(names),)).copy()
+
+
+def _finite(value: Any, what: str) -> Float[np.ndarray, "..."]:
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
     if not np.isfinite(numbers).all():
         raise InputError(f"{value!r}; expected finite numbers", where=what)
     return numbers

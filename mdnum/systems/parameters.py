@@ -1,47 +1,366 @@
-"""Numbers and words of a simulation by name: what they are, their units, and the simulation with others.
+"""Parameters of a simulation by path: what they are, their units, and the simulation with others.
 
-Names are the keys of system files where those have them.
+A parameter is a number or an array of them, and its name a path: the key of a system file where that has one
+("potential.sigma", "cutoff.radius", "dynamics.timestep"), and on down into what a potential is made of
+("potential.layers.0.weight"). One entry of it is a parameter too: "potential.pairs.Ni-P.sigma" as in files,
+"position.17.x", "velocity.17.x", or the path and the indices, "potential.layers.0.weight.3.2".
+
+`dynamics.temperature` is that of velocities that were drawn, which go with its root, and of a thermostat.
+Velocities that were given stay as they are; `velocity.scale` scales any. `cutoff.radius` moves the onset,
+too, where nothing switches. `box.scale` is a common factor of the box and all positions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from pydantic import ValidationError
 
 from mdnum.errors import InputError
+from mdnum.md.cell import Cell
+from mdnum.md.manybody import leaves_by_path, quantities_of, with_quantities
 from mdnum.md.neighbors import check_radius
+from mdnum.md.potentials import CutPotential
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
 from mdnum.registry import nearest
 from mdnum.systems import schema, structures, toml
 from mdnum.systems.build import build
 from mdnum.systems.construct import in_whole_numbers
+from mdnum.systems.load import System
 from mdnum.systems.simulation import Simulation
+
+#: Other words for a parameter.
+_ALIASES = {
+    "r_cut": "cutoff.radius", "r_onset": "cutoff.onset", "dt": "dynamics.timestep",
+    "x0": "initial.positions", "v0": "initial.velocities", "scale": "box.scale", "box": "box.scale",
+}  # fmt: skip
+#: Units by the last word of a name, or by what a field of an integrator is.
+_UNITS = {
+    "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}", "skin": "{length}",
+    "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",
+    "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
+    "velocity": "{length}/{time}",
+}  # fmt: skip
+#: Parameters of a cutoff, by the name of their field.
+_ENDS = {"cutoff.radius": "r_cut", "cutoff.onset": "r_onset"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a simulation, or an array of them.
+
+    Attributes:
+        value: in `unit`; of shape (), or with an entry for each of `by`, or of the shape of an array that all
+            pairs share.
+        unit: in the units of the simulation; "" for a pure number, and "[alpha]" for an alpha of which it is
+            not known. Of initial velocities that of length per internal time.
+        by: "pair type" or "atom"; "" where it is one for all.
+    """
+
+    value: Float[np.ndarray, "..."]
+    unit: str
+    by: str
+
+
+def parameters(simulation: Simulation) -> dict[str, Parameter]:
+    """All parameters of a simulation by path; `changed` gives it other values.
+
+    Example:
+        >>> mdnum.parameters(sim)["potential.sigma"].value
+        >>> mdnum.changed(sim, {"potential.sigma": 3.41, "dynamics.timestep": 0.001})
+    """
+    return {
+        name: Parameter(value(simulation, name), unit(simulation, name), by(simulation, name))
+        for name in names(simulation)
+    }
+
+
+def names(simulation: Simulation) -> tuple[str, ...]:
+    """The paths of all parameters, those of single entries aside."""
+    model, draw = simulation.model, simulation.draw
+    if simulation.pairwise:
+        potential = model.potential
+        found = [f"potential.{key}" for key in (*potential.leaves, *leaves_by_path(potential.shared))]
+        found += ["cutoff.radius", *["cutoff.onset"] * simulation.cutoff.switches]
+    else:
+        found = [f"potential.{key}" for key in quantities_of(model)]
+    keys = dict.fromkeys(("timestep", *["temperature"] * draw.drawn, *simulation.integrator.numbers()))
+    start = ("initial.positions", "initial.velocities", "box.scale", "velocity.scale", "neighbors.skin")
+    return (*found, *(f"dynamics.{key}" for key in keys), *start)
+
+
+def numbers(simulation: Simulation) -> tuple[str, ...]:
+    """The paths of all parameters that are one number, those of single coordinates and weights aside."""
+    file = simulation.origin.system
+    # as its file has it the radius would move along with sigma
+    moving = "sigma" if file and file.spec.cutoff and file.spec.cutoff.in_sigma is not None else None
+    found = (*names(simulation), *_of_pairs(simulation))
+    return tuple(name for name in found if _is_number(simulation, name) and name.rpartition(".")[2] != moving)
+
+
+def _is_number(simulation: Simulation, name: str) -> bool:
+    here = value(simulation, name)
+    # a radius of all pairs is one
+    return here.ndim == 0 or (name.startswith("cutoff.") and bool(np.all(here == here[0])))
+
+
+def number(simulation: Simulation, name: str) -> float:
+    """The value of one of `numbers`."""
+    return float(value(simulation, name).flat[0])
+
+
+def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
+    """The simulation with another value of one of `numbers`, without compiling anew."""
+    return with_values(simulation, {name: np.full(value(simulation, name).shape, given)})
+
+
+def is_positive(simulation: Simulation, name: str) -> bool:
+    """Whether only values above 0 make sense of a number: not of coordinates and weights."""
+    whole = entry(simulation, name).whole
+    if whole.startswith("potential."):
+        return _is_typed(simulation, whole) and number(simulation, name) > 0
+    return not whole.startswith("initial.")
+
+
+def by(simulation: Simulation, name: str) -> str:
+    """What a parameter has an entry for: "pair type" or "atom"; "" where it is one for all."""
+    if name.startswith("initial."):
+        return "atom"
+    return "pair type" if _is_typed(simulation, name) and simulation.pair_types > 1 else ""
+
+
+def _is_typed(simulation: Simulation, name: str) -> bool:
+    typed = getattr(simulation.potential, "leaves", ())
+    return name in _ENDS or name.removeprefix("potential.") in typed
+
+
+def unit(simulation: Simulation, name: str) -> str:
+    """The unit of a parameter: "" for none, its own name in brackets where none is known."""
+    table, last = name.partition(".")[0], entry(simulation, name).whole.rpartition(".")[2]
+    field = simulation.integrator.keys().get(last) if table == "dynamics" else None
+    word = last if field is None else field.metadata.get("unit")
+    word = "velocity" if table == "velocity" and last == "velocities" else word
+    return _UNITS.get(word, f"[{last}]").format_map(vars(simulation.units))
+
+
+def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
+    """The value of a parameter: a scalar where the simulation has one pair type, else one for each."""
+    place = entry(simulation, name)
+    if place.index:
+        return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
+    table, _, key = name.partition(".")
+    if table in ("potential", "cutoff"):
+        array = np.array(leaf_of(simulation.model, name), np.float64)
+        return array.reshape(()) if array.shape == (1,) and _is_typed(simulation, name) else array
+    if name == "dynamics.temperature" and simulation.draw.temperature:
+        return np.asarray(float(simulation.draw.temperature))
+    if table == "dynamics":
+        known = key in simulation.integrator.numbers()
+        return np.asarray(simulation.integrator.number(key, simulation.units) if known else 0.0)
+    if table == "initial":
+        return np.array(getattr(simulation, key))
+    return np.asarray(simulation.rule.skin if key == "skin" else 1.0)
+
+
+def leaf_of(model: Any, name: str) -> Any:
+    """Where a parameter of a potential, or of its end, is in it."""
+    if name in _ENDS:
+        return getattr(model, _ENDS[name])
+    # the only potential; one of several would be found by its own prefix
+    key = name.removeprefix("potential.")
+    if not isinstance(model, CutPotential):
+        return quantities_of(model)[key]
+    return {**model.potential.leaves, **leaves_by_path(model.potential.shared)}[key]
+
+
+def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
+    """The simulation with other values of some parameters, whatever its file would make of them.
+
+    Raises:
+        InputError: a value that is not finite, complex, of another shape, or that it could not have.
+    """
+    for name, given in values.items():
+        here, new = value(simulation, name), np.asarray(given)
+        if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
+            raise InputError(
+                f"{name}: shape {new.shape}, {new.dtype}, finite: {bool(np.isfinite(new).all())}; expected "
+                f"finite numbers of shape {here.shape}, and none that is complex"
+            )
+        place = entry(simulation, name)
+        whole = value(simulation, place.whole)
+        whole[place.index] = new / place.factor
+        simulation = _with(simulation, place.whole, whole)
+    return simulation
+
+
+def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
+    """The simulation with another value, which has the right shape."""
+    table, _, key = name.partition(".")
+    model, integrator = simulation.model, simulation.integrator
+    if table == "potential" and not simulation.pairwise:
+        constant = key not in leaves_by_path(model)
+        model = with_quantities(model, {key: float(new) if constant else jnp.asarray(new)})
+        # its radius may follow
+        decider = replace(simulation.decider, r_cut=(float(model.r_cut),))
+        return replace(simulation, model=model, decider=decider)
+    if table in ("potential", "cutoff"):
+        leaf = jnp.asarray(new.reshape(leaf_of(model, name).shape))
+        model = eqx.tree_at(lambda one: leaf_of(one, name), model, leaf)
+        if table == "potential":
+            return replace(simulation, model=model)
+        if not model.cutoff.switches:
+            model = eqx.tree_at(lambda one: one.r_onset, model, leaf)
+        radius, onset = np.asarray(model.r_cut), np.asarray(model.r_onset)
+        if model.cutoff.switches and np.any(onset >= radius):
+            seen = f"an onset of {float(np.max(onset))!r} is not below"
+            raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
+        check_radius(simulation.cell, float(np.max(radius)), simulation.rule.skin)
+        decider = replace(simulation.decider, r_cut=tuple(radius.tolist()))
+        return replace(simulation, model=model, decider=decider)
+    if table == "dynamics":
+        if key in integrator.numbers():
+            simulation = replace(simulation, integrator=integrator.with_number(key, new, simulation.units))
+        return _heated(simulation, float(new)) if key == "temperature" else simulation
+    if table == "initial":
+        return replace(simulation, **{key: new})
+    if name == "velocity.scale":
+        return replace(simulation, velocities=simulation.velocities * float(new))
+    if name == "box.scale":
+        cell = Cell.create(np.asarray(simulation.cell.matrix) * float(new), simulation.pbc)
+        return replace(simulation, positions=simulation.positions * float(new)).with_cell(cell)
+    # another skin: another list, hence another order of the same sums from the first rebuild on
+    check_radius(simulation.cell, simulation.r_cut, float(new))
+    return replace(simulation, rule=replace(simulation.rule, skin=float(new)))
+
+
+def _heated(simulation: Simulation, new: float) -> Simulation:
+    """Drawn velocities of another temperature: those of a start other than the draw's are scaled."""
+    old = simulation.draw
+    heated = replace(simulation, draw=replace(old, temperature=new))
+    if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
+        # of the thermostat alone
+        return simulation if old.drawn else heated
+    if np.array_equal(_drawn(simulation).velocities, simulation.velocities):
+        return _drawn(heated)
+    if not (new > 0 and old.temperature > 0):
+        seen = f"temperature {old.temperature:g} to {new:g}"
+        raise InputError(f"{seen}; expected both above 0", where="dynamics")
+    return replace(heated, velocities=simulation.velocities * np.sqrt(new / old.temperature))
+
+
+# --- names -------------------------------------------------------------------------------------------
+
+
+class Entry(NamedTuple):
+    """Where a path leads."""
+
+    whole: str  # path of the parameter
+    index: tuple[int, ...] = ()  # which of its entries; empty for all of it
+    factor: float = 1.0  # of the unit of the entry
+
+
+def entry(simulation: Simulation, name: str) -> Entry:
+    """The parameter or the entry of one that a path names; the path itself where there is none such."""
+    if (kind := _of_pairs(simulation).get(name)) is not None:
+        table, _, _, key = name.split(".", 3)
+        return Entry(f"{table}.{key}", (kind,))
+    table, *at = name.split(".")
+    if table in ("position", "velocity") and len(at) == 2 and at[1] in ("x", "y", "z"):
+        if not at[0].isdigit() or int(at[0]) >= simulation.atoms:
+            remedy = f"Use an atom from 0 to {simulation.atoms - 1}"
+            raise InputError(f"{name!r}: there is no atom {at[0]}", remedy=remedy)
+        whole = "initial.positions" if table == "position" else "initial.velocities"
+        factor = 1.0 if table == "position" else simulation.units.time_factor
+        return Entry(whole, (int(at[0]), "xyz".index(at[1])), factor)
+    known, parts = names(simulation), name.split(".")
+    for k in range(len(parts) - 1, 0, -1):
+        whole, index = ".".join(parts[:k]), parts[k:]
+        if whole in known and all(one.isdigit() for one in index):
+            shape, at = value(simulation, whole).shape, tuple(map(int, index))
+            if len(at) == len(shape) and all(one < size for one, size in zip(at, shape, strict=True)):
+                return Entry(whole, at)
+    return Entry(name)
+
+
+def _of_pairs(simulation: Simulation) -> dict[str, int]:
+    """The pair types of the paths of single pairs of species, where there are several."""
+    if not simulation.pairwise or simulation.pair_types == 1:
+        return {}
+    pairs = enumerate(schema.pair_names(simulation.symbols))
+    return {f"potential.pairs.{pair}.{key}": k for k, pair in pairs for key in simulation.potential.leaves}
+
+
+def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
+    """The path that a word means: of those known, or of a single entry of one.
+
+    Args:
+        word: a path, an alias as "r_cut" or "dt", or the end of one path alone.
+
+    Raises:
+        InputError: no such parameter, or several; the known ones are listed.
+    """
+    full = _ALIASES.get(word, word)
+    for name in (word, full):
+        if name in known:
+            return name
+    for paths in (known, tuple(_of_pairs(simulation))):
+        ends = [name for name in paths if name.endswith(f".{word}")]
+        if len(ends) == 1:
+            return ends[0]
+        if ends:
+            several = f"{word!r} could be any of {', '.join(ends)}"
+            raise InputError(several, remedy="Write one of them in full")
+    if entry(simulation, word).index:
+        return word
+    meant = nearest(word, [*known, *(name.rpartition(".")[2] for name in known)])
+    hint = f"Did you mean {meant}? " if meant else ""
+    listed = ", ".join((*known, "position.ATOM.x", "velocity.ATOM.x"))
+    raise InputError(f"no parameter {word!r}", where=simulation.name, remedy=f"{hint}There are {listed}")
+
+
+# --- keys of system files, words among them ------------------------------------------------------------
 
 
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """The simulation with other values of some keys, checked.
+    """The simulation with other values of some keys of a system file or parameters, checked.
+
+    One of a file is made again from the file with these keys, and stays one of that file; not with parameters
+    that a file has no key for.
+
+    Example:
+        >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})
+        >>> mdnum.changed(sim, {"potential.layers.0.weight": weight, "position.17.x": 0.5})
 
     Args:
-        values: dotted key to value. A key of the structure makes the atoms of a file again.
+        values: path to value. A key of the structure makes the atoms of a file again.
 
     Raises:
         InputError: a value that it could not have, or no such key.
     """
-    system = simulation.file
-    if system is None:
-        for key, value in values.items():
-            simulation = _with(simulation, key, value)
-        return simulation
+    keys: dict[str, Any] = {}
+    if simulation.file is not None:
+        has, here = toml.flat(simulation.file.spec.model_dump()), names(simulation)
+        keys = {
+            key: given for key, given in values.items()
+            if (key in has and not np.ndim(given)) or not (key in here or entry(simulation, key).index)
+        }  # fmt: skip
+        simulation = _of_file(simulation.file, keys) if keys else simulation
+    for key in (key for key in values if key not in keys):
+        simulation = _changed(simulation, key, values[key])
+    return simulation
+
+
+def _of_file(system: System, values: Mapping[str, Any]) -> Simulation:
     data = system.spec.model_dump(mode="python", exclude_none=True)
-    keys = {toml.dotted(key): value for key, value in values.items()}
+    keys = {toml.dotted(key): given for key, given in values.items()}
     toml.apply_overrides(data, keys, schema.SystemSpec)
     try:
         spec = schema.SystemSpec.model_validate(data)
@@ -53,14 +372,47 @@ def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     return build(replace(system, spec=spec, atoms=atoms))
 
 
+def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
+    """A simulation of objects with another value of one key."""
+    table, _, name = key.partition(".")
+    if key == "precision.reduction":
+        return replace(simulation, reduction=REDUCTIONS.parse(given))
+    if table == "precision":
+        policy = replace(simulation.policy, **{name: given})
+        if simulation.lattice is not None:
+            message = "a state of whole numbers cannot become another"
+            raise InputError(message, where=key, remedy="Make it again")
+        other = simulation.with_policy(policy)
+        return in_whole_numbers(other) if policy.state == LATTICE else other
+    if key == "neighbors.builder":
+        return replace(simulation, builder=given)
+    if key.startswith("neighbors.rebuild."):
+        return replace(simulation, rule=replace(simulation.rule, **{name.rpartition(".")[2]: given}))
+    if key == "cutoff.kind":
+        return simulation.with_cutoff(given)
+    if key == "cutoff.compare":
+        return replace(simulation, decider=replace(simulation.decider, compare=given))
+    if key == "dynamics.seed":
+        simulation = replace(simulation, draw=replace(simulation.draw, seed=given))
+        if (integrator := simulation.integrator).random is not None:
+            integrator = eqx.tree_at(lambda one: one.random, integrator, jax.random.key(given))
+            simulation = replace(simulation, integrator=integrator)
+        return redrawn(simulation) if simulation.draw.drawn else simulation
+    name = resolve(simulation, key, names(simulation))
+    one = np.ndim(given) == 0 and _is_number(simulation, name)
+    return with_number(simulation, name, given) if one else with_values(simulation, {name: given})
+
+
 def redrawn(simulation: Simulation) -> Simulation:
     """The simulation with drawn velocities instead of those of its structure."""
     if simulation.file is not None:
         return changed(simulation, {"structure.velocities": "drawn"})
-    draw = replace(simulation.draw, drawn=True)
-    return replace(
-        simulation, draw=draw, velocities=draw.velocities(simulation.masses, simulation.units, None)
-    )
+    return _drawn(replace(simulation, draw=replace(simulation.draw, drawn=True)))
+
+
+def _drawn(simulation: Simulation) -> Simulation:
+    v = simulation.draw.velocities(simulation.masses, simulation.units, None)
+    return replace(simulation, velocities=v)
 
 
 def floats(simulation: Simulation) -> dict[str, float]:
@@ -68,234 +420,5 @@ def floats(simulation: Simulation) -> dict[str, float]:
     if simulation.file is not None:
         data = simulation.file.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"})
         return {key: value for key, value in toml.flat(data).items() if isinstance(value, float)}
-    return {one.key: one.value for one in _fixed(simulation).values() if one.key != "velocity.scale"}
-
-
-def _with(simulation: Simulation, key: str, value: Any) -> Simulation:
-    """A simulation of objects with another value of one key."""
-    table, _, name = key.partition(".")
-    rule, draw = simulation.rule, simulation.draw
-    if table == "precision":
-        if name == "reduction":
-            return replace(simulation, reduction=REDUCTIONS.parse(value))
-        policy = replace(simulation.policy, **{name: value})
-        if simulation.lattice is not None:
-            raise InputError(
-                "a state of whole numbers cannot become another", where=key, remedy="Make it again"
-            )
-        other = simulation.with_policy(policy)
-        return in_whole_numbers(other) if policy.state == LATTICE else other
-    if table == "neighbors" and name != "skin":
-        word = name.rpartition(".")[2]
-        if word == "builder":
-            return replace(simulation, builder=value)
-        return replace(simulation, rule=replace(rule, **{word: value}))
-    if key == "cutoff.kind":
-        return simulation.with_cutoff(value)
-    if key == "cutoff.compare":
-        return replace(simulation, decider=replace(simulation.decider, compare=value))
-    if key == "dynamics.seed":
-        draw, field = replace(draw, seed=value), simulation.integrator.keys().get("seed")
-        if field is not None:
-            at: Any = lambda one: getattr(one, field.name)  # noqa: E731
-            integrator = eqx.tree_at(at, simulation.integrator, jax.random.key(value))
-            simulation = replace(simulation, integrator=integrator)
-        return redrawn(replace(simulation, draw=draw)) if draw.drawn else replace(simulation, draw=draw)
-    if key == "dynamics.temperature":
-        draw = replace(draw, temperature=float(value))
-        if "temperature" in simulation.integrator.numbers():
-            simulation = _integrator("temperature")(simulation, float(value))
-        return redrawn(replace(simulation, draw=draw)) if draw.drawn else replace(simulation, draw=draw)
-    return dial(simulation, key).turn(simulation, float(value))
-
-
-# --- numbers that can be turned without compiling anew: arguments of the compiled epochs ---------------
-
-Turn = Callable[[Simulation, float], Simulation]
-_SHORT = {
-    "timestep": "dynamics.timestep",
-    "temperature": "dynamics.temperature",
-    "friction": "dynamics.friction",
-    "radius": "cutoff.radius",
-    "r_cut": "cutoff.radius",
-    "onset": "cutoff.onset",
-    "dt": "dynamics.timestep",
-}
-
-
-@dataclass(frozen=True)
-class Dial:
-    """One number of a system."""
-
-    key: str  # its name, as system files have it where they do
-    value: float  # what the system says, in the units of its file
-    turn: Turn  # the simulation with another value, without compiling anew
-    positive: bool = True  # whether only values above 0 make sense
-
-
-def dial(simulation: Simulation, key: str) -> Dial:
-    """The number that a key names.
-
-    Args:
-        simulation: the system as objects.
-        key: "dynamics.timestep", "potential.sigma" ("potential.pairs.Ni-P.sigma" for one pair of species),
-            "cutoff.radius", "cutoff.onset", "neighbors.skin", "position.17.x", "velocity.17.x",
-            "velocity.scale"; of Langevin dynamics also "dynamics.temperature" and "dynamics.friction". The
-            last word alone will do where only one number ends so.
-
-    Raises:
-        InputError: no such number, or several; the known ones are listed.
-    """
-    dials = _fixed(simulation)
-    word = _SHORT.get(key, key)
-    found = [word] if word in dials else [name for name in dials if name.endswith(f".{word}")]
-    if len(found) == 1:
-        return dials[found[0]]
-    if found:
-        raise InputError(f"{key!r} could be any of {', '.join(found)}", remedy="Write one of them in full")
-    started = _start(simulation, key)
-    if started is not None:
-        return started
-    known = [*dials, "position.ATOM.x", "velocity.ATOM.x"]
-    ends = {name.rpartition(".")[2]: name for name in dials}
-    meant = nearest(key, [*known, *ends])
-    hint = "" if meant is None else f"Did you mean {ends.get(meant, meant)}? "
-    raise InputError(
-        f"{key!r} is no number that can be turned", remedy=f"{hint}Use one of: {', '.join(known)}"
-    )
-
-
-def unit(simulation: Simulation, key: str) -> str:
-    """The unit of a number in the user's words; empty for a pure number and where it is not known."""
-    units, last = simulation.units, key.rpartition(".")[2]
-    if key.startswith("velocity.") and last != "scale":
-        return f"{units.length}/{units.time}"
-    if key.startswith(("position.", "cutoff.")) or last in ("sigma", "skin"):
-        return units.length
-    named = {
-        "timestep": units.time,
-        "friction": f"1/{units.time}",
-        "temperature": units.temperature,
-        "epsilon": units.energy,
-    }
-    return named.get(last, "")
-
-
-def names(simulation: Simulation) -> tuple[str, ...]:
-    """The keys of a system, those of single coordinates aside."""
-    return tuple(_fixed(simulation))
-
-
-def _fixed(simulation: Simulation) -> dict[str, Dial]:
-    integrator, units = simulation.integrator, simulation.units
-    # velocities that are drawn are drawn at the temperature: then it is more than one number
-    drawn = simulation.draw.drawn
-    keys = [key for key in integrator.numbers() if not (drawn and key == "temperature")]
-    first, *others = [
-        Dial(f"dynamics.{key}", integrator.number(key, units), _integrator(key)) for key in keys
-    ]
-    dials = [
-        first,
-        Dial("velocity.scale", 1.0, _scaled),
-        Dial("neighbors.skin", simulation.rule.skin, _skin),
-        *others,
-    ]
-    if simulation.pairwise:
-        dials += _constants(simulation) + _radii(simulation)
-    return {one.key: one for one in dials}
-
-
-def _integrator(key: str) -> Turn:
-    def turn(simulation: Simulation, value: float) -> Simulation:
-        changed = simulation.integrator.with_number(key, value, simulation.units)
-        return replace(simulation, integrator=changed)
-
-    return turn
-
-
-def _skin(simulation: Simulation, value: float) -> Simulation:
-    """Another skin: another list, hence another order of the same sums from the first rebuild on."""
-    check_radius(simulation.cell, simulation.r_cut, value)
-    return replace(simulation, rule=replace(simulation.rule, skin=value))
-
-
-def _scaled(simulation: Simulation, value: float) -> Simulation:
-    return replace(simulation, velocities=simulation.velocities * value)
-
-
-def _constants(simulation: Simulation) -> list[Dial]:
-    """Constants of the potential: one for each, or one for each and pair of species."""
-    dials = []
-    for name, values in simulation.potential.leaves.items():
-        if name == "sigma" and simulation.in_sigma:
-            # the radius would move along
-            continue
-        leaf = np.asarray(values)
-        for kind, name_of_pair in enumerate(schema.pair_names(simulation.symbols)):
-            pair = "" if len(leaf) == 1 else f"pairs.{name_of_pair}."
-            value = float(leaf[kind])
-            dials.append(Dial(f"potential.{pair}{name}", value, _constant(name, kind), value > 0))
-    return dials
-
-
-def _constant(name: str, kind: int) -> Turn:
-    def turn(simulation: Simulation, value: float) -> Simulation:
-        leaf = np.array(simulation.potential.leaves[name], np.float64)
-        leaf[kind] = value
-        model = eqx.tree_at(lambda m: m.potential.leaves[name], simulation.model, jnp.asarray(leaf))
-        return replace(simulation, model=model)
-
-    return turn
-
-
-def _radii(simulation: Simulation) -> list[Dial]:
-    radii = simulation.decider.r_cut
-    if len(set(radii)) > 1:
-        return []
-    dials = [Dial("cutoff.radius", radii[0], _radius)]
-    if simulation.cutoff.switches:
-        dials.append(Dial("cutoff.onset", float(np.asarray(simulation.model.r_onset)[0]), _onset))
-    return dials
-
-
-def _onset(simulation: Simulation, value: float) -> Simulation:
-    if value >= simulation.r_cut:
-        raise InputError(f"an onset of {value!r} is not below the cutoff radius {simulation.r_cut!r}")
-    leaf = jnp.full_like(simulation.model.r_onset, np.float64(value))
-    return replace(simulation, model=eqx.tree_at(lambda m: m.r_onset, simulation.model, leaf))
-
-
-def _radius(simulation: Simulation, value: float) -> Simulation:
-    """Another cutoff radius; the onset of switching stays where it is."""
-    check_radius(simulation.cell, value, simulation.rule.skin)
-    model = simulation.model
-    if simulation.cutoff.switches and value <= float(np.max(model.r_onset)):
-        onset = float(np.max(model.r_onset))
-        raise InputError(f"a cutoff radius of {value!r} is not above its onset, {onset!r}")
-    leaf = jnp.full_like(model.r_cut, np.float64(value))
-    model = eqx.tree_at(lambda m: m.r_cut, model, leaf)
-    if not simulation.cutoff.switches:
-        model = eqx.tree_at(lambda m: m.r_onset, model, leaf)
-    decider = replace(simulation.decider, r_cut=(float(value),) * len(simulation.decider.r_cut))
-    return replace(simulation, model=model, decider=decider)
-
-
-def _start(simulation: Simulation, key: str) -> Dial | None:
-    parts = key.split(".")
-    if len(parts) != 3 or parts[0] not in ("position", "velocity") or parts[2] not in ("x", "y", "z"):
-        return None
-    if not parts[1].isdigit() or int(parts[1]) >= simulation.atoms:
-        raise InputError(
-            f"{key!r}: there is no atom {parts[1]}", remedy=f"Use an atom from 0 to {simulation.atoms - 1}"
-        )
-    place = int(parts[1]), "xyz".index(parts[2])
-    name, factor = (
-        ("positions", 1.0) if parts[0] == "position" else ("velocities", simulation.units.time_factor)
-    )
-
-    def turn(simulation: Simulation, value: float) -> Simulation:
-        array = getattr(simulation, name).copy()
-        array[place] = value / factor
-        return replace(simulation, **{name: array})
-
-    return Dial(key, float(getattr(simulation, name)[place]) * factor, turn, positive=False)
+    found = (name for name in numbers(simulation) if name not in ("velocity.scale", "box.scale"))
+    return {name: number(simulation, name) for name in found}

@@ -112,14 +112,6 @@ class Simulation:
         return self.origin.system if same else None
 
     @property
-    def in_sigma(self) -> bool:
-        """Whether its file gives the cutoff in units of sigma, so that it follows sigma."""
-        system = self.origin.system
-        return (
-            system is not None and system.spec.cutoff is not None and system.spec.cutoff.in_sigma is not None
-        )
-
-    @property
     def timestep(self) -> float:
         """The time step in the unit of time of `units`."""
         step, factor = float(self.integrator.timestep), self.units.time_factor

@@ -312,10 +312,8 @@ def _entries(simulation: Simulation, name: str) -> list[str] | None:
     from mdnum.gradients import parameters
     from mdnum.systems.schema import pair_names
 
-    several = np.ndim(parameters.value(simulation, name)) and not name.startswith("initial.")
-    if not simulation.pairwise or not several:
-        return None
-    return pair_names(simulation.symbols)
+    of_pairs = parameters.by(simulation, name) == "pair type"
+    return pair_names(simulation.symbols) if of_pairs else None
 
 
 def _keep_arrays(answer: Answer) -> None:

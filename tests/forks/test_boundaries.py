@@ -13,7 +13,7 @@ from mdnum.forks.boundaries import boundaries
 from mdnum.forks.processes import digests, digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.systems.build import build
-from mdnum.systems.parameters import names
+from mdnum.systems.parameters import numbers
 
 # processes of their own, and hundreds of runs
 pytestmark = pytest.mark.slow
@@ -137,4 +137,4 @@ def test_bad_input_is_refused(key, low, high, words):
     system = meeting()
     with pytest.raises(InputError, match=words) as error:
         boundaries(system, key, low, high)
-    assert key != "sgima" or all(name in str(error.value) for name in names(build(system)))
+    assert key != "sgima" or all(name in str(error.value) for name in numbers(build(system)))
