@@ -282,7 +282,8 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
         out.print(Text(title, style="bold"))
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(columns))
     for column in columns:
-        table.add_column(column, overflow="fold")
+        # not a string, in which a unit in brackets would be markup
+        table.add_column(Text(column), overflow="fold")
     for row in rows:
         table.add_row(*(Text(show(cell), style=_STYLE.get(str(cell), "")) for cell in row))
     out.print(table)

@@ -183,6 +183,8 @@ def _value(value: Any) -> str:
         return _string(value)
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + "}"
     raise TypeError(f"no TOML for {type(value).__name__}")
 
 

@@ -365,7 +365,7 @@ def _browse(table: Mapping[str, np.ndarray]) -> Browse:
         Column("radial speed", table["radial_speed"]),
         Column("weight", table["weight"]),
         *(
-            Column(f"adds to {one.removeprefix('contribution.').rpartition('.')[2]}", table[one])
+            Column(f"adds to {one.removeprefix('contribution.').partition('.')[2]}", table[one])
             for one in added
         ),
         Column("", table["grazing"], "word", words=("", "grazing")),
