@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mdnum.rollout import Engine, ListHealth, PairRecorder, flip_columns
+from mdnum.md.ledger import FlipTable
+from mdnum.rollout import Engine, ListHealth, PairRecorder
 from mdnum.systems import Simulation
 
 Columns = dict[str, np.ndarray]
@@ -23,7 +24,7 @@ class Recorded:
         potential: potential energy at each step.
         conserved: total energy at each step, less what a thermostat put in.
         displacement: largest at each step since the list in use was built, length.
-        flips: a row per flip, in the columns of flips.parquet.
+        flips: a row per flip.
         health: rebuilds, dangerous builds and lost pairs.
     """
 
@@ -31,7 +32,7 @@ class Recorded:
     potential: np.ndarray
     conserved: np.ndarray
     displacement: np.ndarray
-    flips: Columns
+    flips: FlipTable
     health: ListHealth
 
 
@@ -39,11 +40,11 @@ def record(simulation: Simulation, steps: int) -> Recorded:
     """Roll a simulation out to a last step and keep energies, flips and the health of its lists."""
     recorder, health = PairRecorder(simulation), ListHealth(simulation)
     series: list[Columns] = []
-    flips: list[Columns] = []
+    flips: list[FlipTable] = []
     for segment in Engine(simulation, steps).segments():
         # copied: the engine takes a segment's record back after the next one
         series.append({name: segment.rows_of(name).copy() for name in _NUMBERS})
-        flips.append(flip_columns(recorder.flips(segment)))
+        flips.append(recorder.flips(segment))
         health.take(segment, recorder.missed)
     numbers = _joined(series)
     return Recorded(
@@ -51,7 +52,7 @@ def record(simulation: Simulation, steps: int) -> Recorded:
         numbers["potential"],
         numbers["potential"] + numbers["kinetic"] - numbers["heat"],
         numbers["moved"],
-        _joined(flips),
+        FlipTable.concatenate(flips),
         health,
     )
 

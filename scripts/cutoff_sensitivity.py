@@ -81,7 +81,7 @@ def study(system: System, kind: str, scale: float, steps: int) -> Row:
         float(made.potential[0]) / atoms,
         float(np.std(conserved)) / atoms,
         float(np.polyfit(time, conserved - conserved[0], 1)[0]) / atoms,
-        len(made.flips["step"]) / atoms / steps,
+        len(made.flips) / atoms / steps,
         float(energy_jump[worst]),
         float(force_jump[worst]),
         simulation.cutoff.smoothness,

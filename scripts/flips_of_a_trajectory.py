@@ -30,7 +30,8 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 import mdnum
-from mdnum.trajectories import CutoffRule, FlipTable, Tracker, open_trajectory
+from mdnum.md.ledger import FlipTable
+from mdnum.trajectories import CutoffRule, Tracker, open_trajectory
 
 
 def made(folder: Path, steps: int) -> Path:

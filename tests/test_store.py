@@ -19,6 +19,8 @@ from mdnum.safe_path import environment, python
 from mdnum.store import COLUMNS, TABLES, RunFolder, columns_of, files, tables
 from mdnum.store import checkpoint as frames
 
+UNKNOWN = {"frame", "before", "margin_before"}
+
 
 def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
     steps = np.arange(start, stop)
@@ -34,7 +36,9 @@ def flip_rows(start: int, stop: int) -> dict[str, np.ndarray]:
     columns = {}
     for name, kind in COLUMNS["flips"].items():
         columns[name] = np.cos(steps * 0.1 + len(name)) if str(kind) == "double" else steps % 7
-    return columns | {"step": steps, "entered": steps % 2 == 0, "ambiguous": steps % 5 == 0}
+    known = columns | {"step": steps, "entered": steps % 2 == 0, "ambiguous": steps % 5 == 0}
+    # what a run does not know, and a word that is that of all rows
+    return {name: known[name] for name in known.keys() - UNKNOWN} | {"decided_by": "program"}
 
 
 def epoch_row(index: int) -> dict[str, object]:
@@ -91,11 +95,12 @@ def whole(tmp_path_factory):
 def test_what_is_appended_is_read_back_bit_for_bit(whole):
     for name, expected in (("series", series_rows(0, 480)), ("flips", flip_rows(0, 480))):
         found = RunFolder.open(whole.path).read(name)
-        assert list(found) == list(expected)
+        assert list(found) == [key for key in COLUMNS[name] if key in expected]
         for key, values in expected.items():
             np.testing.assert_array_equal(found[key], values, err_msg=key)
     table = pq.read_table(whole.path / "flips.parquet")
     assert {field.name: field.type for field in table.schema} == dict(COLUMNS["flips"])
+    assert {name for name in table.column_names if table[name].null_count == len(table)} == UNKNOWN
     assert not (whole.path / "parts").exists()
     for step, atoms in enumerate(ase_read(whole.path / "trajectory.traj", index=":")):
         assert atoms.positions.tobytes() == frame(10 * step).positions.tobytes()
@@ -302,6 +307,49 @@ def test_a_table_that_nobody_resumes_is_written_as_it_grows(tmp_path, monkeypatc
     # no part, and nothing of a file that did not become whole
     left = [path.name for path in folder.path.rglob("*") if "parquet" in path.name or "part" in path.name]
     assert left == ["heights.parquet"] * (ends == "finished")
+
+
+def test_what_rows_leave_out_is_in_the_table(tmp_path):
+    """Parts, which are read once more and removed, do not hold what every row has."""
+    same = {"rule": np.broadcast_to(np.int32(0), 30), "rank": np.broadcast_to(np.int32(0), 30)}
+    images = {"rank": np.arange(30) % 2, "decided_by": "positions"}
+    folder = RunFolder.create(tmp_path / "run")
+    for start, more in ((0, same), (10, same | images), (20, same)):
+        # with other columns in one part than in the next
+        folder.append("flips", flip_rows(start, start + 10) | more)
+    folder.checkpoint(state_at(30), force=True)
+    held = [set(pq.read_schema(path).names) for path in sorted(folder.path.glob("parts/flips-*"))]
+    constant = {"rule", "rank", "decided_by"}
+    assert [constant & names for names in held] == [set(), {"rank", "decided_by"}, set()]
+    assert not any(UNKNOWN & names for names in held)
+    first = RunFolder.open(folder.path).read("flips")
+    folder.finalize()
+    rows, written = RunFolder.open(folder.path).read("flips"), pq.read_schema(folder.path / "flips.parquet")
+    assert written.names == list(COLUMNS["flips"])
+    assert rows["rank"].tolist() == [0] * 30 + images["rank"].tolist() + [0] * 30
+    assert rows["decided_by"].tolist() == ["program"] * 30 + ["positions"] * 30 + ["program"] * 30
+    for name, values in rows.items():
+        np.testing.assert_array_equal(first[name], values, err_msg=name)
+
+
+def test_a_run_of_an_earlier_version_is_read_and_resumed(tmp_path, whole):
+    folder = RunFolder.create(tmp_path / "run")
+    write_run(folder, 0, 300)
+    folder.finalize()
+    file, early = folder.path / "flips.parquet", UNKNOWN | {"rule", "rank", "decided_by"}
+    pq.write_table(pq.read_table(file).drop_columns(sorted(early)), file)
+    files.update(folder.path, {file.name: [files.digest(file)]})
+    old = RunFolder.open(folder.path).read("flips")
+    assert not old["rule"].any() and not old["rank"].any() and set(old["decided_by"]) == {"program"}
+    again = RunFolder.open(folder.path)
+    again.resume()
+    write_run(again, 300, 480)
+    again.finalize()
+    new = RunFolder.open(folder.path).read("flips")
+    assert pq.read_schema(file).equals(pq.read_schema(whole.path / "flips.parquet"))
+    for name, values in whole.read("flips").items():
+        expected = np.where(np.arange(1440) < 900, 0, values) if name in ("rule", "rank") else values
+        np.testing.assert_array_equal(new[name], expected, err_msg=name)
 
 
 def test_row_groups_do_not_depend_on_the_parts(tmp_path, monkeypatch):

@@ -106,8 +106,10 @@ def taped(program: MdProgram, last: int, watch: Callable[[Segment], None]) -> De
         ledgers.append(recorder.flips(segment))
         end = segment.last
         watch(segment)
-    step = np.concatenate([ledger.step for ledger in ledgers]).astype(np.int64)
-    i, j = np.concatenate([ledger.subject for ledger in ledgers]).astype(np.int64).T
-    entered, key = np.concatenate([ledger.entered for ledger in ledgers]), i * simulation.atoms + j
+    step, i, j, entered = (
+        np.concatenate([getattr(ledger, name) for ledger in ledgers])
+        for name in ("step", "i", "j", "entered")
+    )
+    key = i * simulation.atoms + j
     order = np.lexsort((key, step))
     return DecisionTape(simulation.atoms, end, first, step[order], key[order], entered[order])

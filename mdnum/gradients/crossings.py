@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
-from mdnum.numerics import Ledger
+from mdnum.md.ledger import FlipTable
 from mdnum.systems.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class MetRows(NamedTuple):
 class Crossings:
     """The flips of one stretch, as events with a time."""
 
-    ledger: Ledger  # the flips
+    ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
     # i, j: its atoms in the order of the stretch's list
     i: Int[np.ndarray, "crossings"]
@@ -239,7 +239,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     if ledger is None:
         raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
     row = (ledger.step - stretch.first).astype(np.int64)
-    low, high = ledger.subject[:, 0], ledger.subject[:, 1]
+    low, high = ledger.i, ledger.j
     i, j = stretch.table.place[low], stretch.table.place[high]
     cell, x, ahead = HostCell(simulation.cell), stretch.x.reshape(-1), stretch.x_before.reshape(-1)
     atoms = stretch.x.shape[2]
@@ -262,8 +262,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     # a distance that did not change has no time of crossing at all
     grazing = ~(np.abs(speed) > guard) | (speed == 0)
     safe = np.where(speed == 0, np.inf, speed)
-    force = np.asarray(ledger.extra["force_jump"], np.float64)
-    kind = np.asarray(simulation.type_of(low, high), np.int64)
-    energy, virial = np.asarray(ledger.jump, np.float64), force * np.asarray(simulation.decider.r_cut)[kind]
+    force, kind = ledger.force_jump, np.asarray(simulation.type_of(low, high), np.int64)
+    energy, virial = ledger.energy_jump, force * np.asarray(simulation.decider.r_cut)[kind]
     unknown = np.full(len(row), np.nan)
     return Crossings(ledger, row, i, j, normal, safe, force, energy, virial, kind, images, grazing, unknown)

@@ -484,7 +484,8 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
         def add(stretch: TapeStretch, met: set = met) -> None:
             assert stretch.ledger is not None
-            met.update(zip(stretch.ledger.step.tolist(), *stretch.ledger.subject.T.tolist(), strict=True))
+            columns = (stretch.ledger.step, stretch.ledger.i, stretch.ledger.j)
+            met.update(zip(*(column.tolist() for column in columns), strict=True))
 
         tape = RunTape(made.simulation, made.loss, made.steps, flips=True, budget=0, each=add)
         found.append((tape.value, met))

@@ -283,16 +283,15 @@ class Surrogate(Method):
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
     """Counts of the crossings, and those that weigh most."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
-    step, subject, entered = (joined(crossings, name, ledger=True) for name in ("step", "subject", "entered"))
+    flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))
     if len(weight) > _NAMED:
         # of half a million few are named: only those are sorted, and what weighs as much as the last
         heavy = np.flatnonzero(~(key > np.partition(key, _NAMED)[_NAMED]))
     rows = [
         {
-            "step": int(step[k]), "i": int(subject[k, 0]), "j": int(subject[k, 1]),
-            "entered": bool(entered[k]), "radial_speed": float(speed[k]), "weight": float(weight[k]),
-            "grazing": bool(grazing[k]),
+            **{name: column[k].item() for name, column in flips.items()},
+            "radial_speed": float(speed[k]), "weight": float(weight[k]), "grazing": bool(grazing[k]),
         }
         for k in heavy[np.argsort(key[heavy], kind="stable")[:_NAMED]]
     ]  # fmt: skip

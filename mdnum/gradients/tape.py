@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Int
 from mdnum.errors import NumericalError
 from mdnum.gradients.losses import NOT_REAL, Loss, LossContext, LossFrame
 from mdnum.md.integrators import unsorted
+from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
-from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point, room_for
 from mdnum.rollout.epoch import over_rows
@@ -53,7 +53,7 @@ class TapeStretch:
     potential: Float[np.ndarray, "room"]
     virial: Float[np.ndarray, "room"]
     table: PairTable  # the list
-    ledger: Ledger | None = None  # its flips; None where they were not asked for
+    ledger: FlipTable | None = None  # its flips; None where they were not asked for
 
     @property
     def nbytes(self) -> int:
@@ -90,7 +90,7 @@ class TapeStretch:
 _COLUMNS = ("x", "v", "images", "bits", "potential", "virial")
 
 
-def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> TapeStretch:
+def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
     """A copy of what a segment recorded from a start; the segment's own record is used again."""
     columns: dict[str, Any] = {name: np.asarray(getattr(segment.record, name)) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
@@ -155,7 +155,7 @@ class RunTape:
         self.frames = self.held = 0
         self._recorder = PairRecorder(simulation) if flips else None
         # stretches that are kept; of others what it takes to run them again
-        self._made: list[TapeStretch | tuple[Start, Ledger | None]] = []
+        self._made: list[TapeStretch | tuple[Start, FlipTable | None]] = []
         self._engine = Engine(simulation, steps, start=self.start)
         self._begin()
         for segment in self._engine.segments():
@@ -217,7 +217,7 @@ class RunTape:
     def __len__(self) -> int:
         return len(self._made)
 
-    def _whole(self, one: TapeStretch | tuple[Start, Ledger | None]) -> TapeStretch:
+    def _whole(self, one: TapeStretch | tuple[Start, FlipTable | None]) -> TapeStretch:
         return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one.roomy()
 
     def backward(self) -> Iterator[TapeStretch]:

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from mdnum.rollout.engine import Engine as Engine
     from mdnum.rollout.engine import unwrapped as unwrapped
     from mdnum.rollout.flips import PairRecorder as PairRecorder
-    from mdnum.rollout.flips import flip_columns as flip_columns
     from mdnum.rollout.summary import ListHealth as ListHealth
 
 __getattr__, __dir__, __all__ = on_first_use(__name__)

@@ -12,9 +12,10 @@ from mdnum.compiled import njit
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
 from mdnum.md.decide import Changes, note
+from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
-from mdnum.numerics import Ledger, count_set
+from mdnum.numerics import count_set
 from mdnum.rollout.engine import Segment
 from mdnum.systems.simulation import Simulation
 
@@ -76,8 +77,8 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
         first: step of the first row. factor: from velocities to those of the ledger.
 
     Returns:
-        step, labels and decision; then margin, bound, energy jump, distance, radial speed and force jump,
-        shape (6, flips).
+        step, labels, shape (2, flips), and decision; then margin, bound, energy jump, distance, radial
+        speed and force jump, shape (6, flips).
     """
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
@@ -89,7 +90,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
     order = digit_order(room, flips, len(bounds) * atoms * atoms)
     for f in range(flips):
         place[order[f]] = f
-    step, subject = np.empty(flips, np.int64), np.empty((flips, 2), np.int64)
+    step, subject = np.empty(flips, np.int64), np.empty((2, flips), np.int64)
     entered, out, contradicted = np.empty(flips, np.bool_), np.empty((6, flips)), False
     small, wide = np.float32, np.float64
     # as they were noted: they come from further away than their places, which are near one another
@@ -112,7 +113,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
         approach = wide(u0) * dx + wide(u1) * dy + wide(u2) * dz
         sign, margin = 1.0 if now else -1.0, by_type[0, k] - quantity
         contradicted |= now != (margin >= 0 if inclusive else margin > 0)
-        step[f], subject[f, 0], subject[f, 1], entered[f] = first + row, i[q], j[q], now
+        step[f], subject[0, f], subject[1, f], entered[f] = first + row, i[q], j[q], now
         out[0, f], out[1, f], out[2, f] = margin, bounds[row, k], sign * by_type[1, k]
         out[3, f], out[4, f], out[5, f] = distance, approach / distance * factor, sign * by_type[2, k]
     return step, subject, entered, out, contradicted
@@ -237,7 +238,7 @@ class PairRecorder:
             )
         return AmbiguousPairs.joined(parts)
 
-    def flips(self, segment: Segment) -> Ledger:
+    def flips(self, segment: Segment) -> FlipTable:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).
 
         Distance, margin and radial speed are those of the step of the flip, the margin with the bits that the
@@ -272,7 +273,7 @@ class PairRecorder:
             else:
                 self._held_segment = table, segment.held, int(segment.rows_of("inside")[-1])
             self._held_keys = None
-        step, labels, entered, numbers, contradicted = _columns(
+        step, (i, j), entered, numbers, contradicted = _columns(
             pairs, ends, table.order, self._species, self._kinds, self._by_type, self.bounds(segment),
             self._rule, self._cell.numbers, self._narrow, segment.first,
             # user units of time: the ledger is for people
@@ -284,8 +285,11 @@ class PairRecorder:
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
             )
         margin, bound, jump, distance, speed, force_jump = numbers
-        extra = {"distance": distance, "radial_speed": speed, "force_jump": force_jump}
-        return Ledger("pair", step, labels, entered, margin, bound, jump, extra)
+        return FlipTable(
+            i=i, j=j, rank=np.broadcast_to(np.int32(0), len(i)), entered=entered, distance=distance,
+            margin=margin, bound=bound, ambiguous=np.abs(margin) <= bound, decided_by="program",
+            step=step, radial_speed=speed, energy_jump=jump, force_jump=force_jump,
+        )  # fmt: skip
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""
@@ -323,23 +327,6 @@ class PairRecorder:
         self.missed = len(np.setdiff1d(looked_back, held, assume_unique=True))
         keys = np.setxor1d(held, now, assume_unique=True)
         return keys, np.isin(keys, now, assume_unique=True)
-
-
-def flip_columns(ledger: Ledger) -> dict[str, np.ndarray]:
-    """The rows of a pair ledger as the columns of flips.parquet."""
-    return {
-        "step": ledger.step,
-        "i": ledger.subject[:, 0],
-        "j": ledger.subject[:, 1],
-        "entered": ledger.entered,
-        "distance": ledger.extra["distance"],
-        "margin": ledger.margin,
-        "radial_speed": ledger.extra["radial_speed"],
-        "energy_jump": ledger.jump,
-        "force_jump": ledger.extra["force_jump"],
-        "bound": ledger.bound,
-        "ambiguous": ledger.ambiguous,
-    }
 
 
 def pair_keys(

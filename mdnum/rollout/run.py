@@ -18,9 +18,9 @@ from ase.stress import full_3x3_to_voigt_6_stress
 from mdnum import provenance, ranges
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.md import foreign
-from mdnum.numerics import Ledger
+from mdnum.md.ledger import FlipTable
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
-from mdnum.rollout.flips import PairRecorder, flip_columns
+from mdnum.rollout.flips import PairRecorder
 from mdnum.rollout.summary import (
     EnergyBudget,
     ListHealth,
@@ -188,7 +188,7 @@ class Rollout:
         rows = series_columns(self.simulation, segment, pairs, ambiguous, ledger)
         self.folder.append("series", rows)
         if len(ledger):
-            self.folder.append("flips", flip_columns(ledger))
+            self.folder.append("flips", ledger.columns())
         for row in done.health.take(segment, self.recorder.missed):
             self.folder.append("epochs", row)
         done.tally.take(segment, rows, ledger, self.recorder.bounds(segment))
@@ -199,11 +199,11 @@ class Rollout:
         self._close_budget(segment, ledger, interval)
         self._log(segment, pairs, ledger)
 
-    def _close_budget(self, segment: Segment, ledger: Ledger, interval: int) -> None:
+    def _close_budget(self, segment: Segment, ledger: FlipTable, interval: int) -> None:
         budget = self.done.budget
         if budget.start is None:
             self._examine(segment, 0, segment.start.v)
-        budget.jumps += float(np.sum(ledger.jump))
+        budget.jumps += float(np.sum(ledger.energy_jump))
         due = segment.first // interval != (segment.last + 1) // interval or segment.closes == "end"
         if due and segment.last:
             # a step after which nothing is finite has the velocities of its row
@@ -263,7 +263,7 @@ class Rollout:
             "save_every": self.save_every,
         }
 
-    def _log(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:
+    def _log(self, segment: Segment, pairs: np.ndarray, ledger: FlipTable) -> None:
         so_far = np.cumsum(np.bincount(ledger.step - segment.first, minlength=segment.rows))
         flips = self.done.tally.entered + self.done.tally.left - len(ledger)
         every = max(1, self.steps // _LOG_LINES)

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.md.cell import displacement, wrap_positions
-from mdnum.numerics import Ledger, unit_roundoff
+from mdnum.md.ledger import FlipTable
+from mdnum.numerics import unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
@@ -71,7 +72,7 @@ class RunTally:
     without_jumps: LineFit = field(default_factory=LineFit)
 
     def take(
-        self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger, bounds: Float[np.ndarray, "..."]
+        self, segment: Segment, rows: dict[str, np.ndarray], ledger: FlipTable, bounds: np.ndarray
     ) -> None:
         """Add a segment: its rows of series.parquet, its flips and the bounds of its margins."""
         self.bound = max(self.bound, float(np.max(bounds)))
@@ -199,7 +200,7 @@ def degrees_of_freedom(simulation: Simulation) -> int:
 
 
 def series_columns(
-    simulation: Simulation, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: Ledger
+    simulation: Simulation, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: FlipTable
 ) -> dict[str, np.ndarray]:
     """The rows of series.parquet for a segment.
 
@@ -231,7 +232,7 @@ def series_columns(
         "entered": entered,
         "left": left,
         "displacement": segment.rows_of("moved"),
-        "energy_jump": np.bincount(row, weights=ledger.jump, minlength=count),
+        "energy_jump": np.bincount(row, weights=ledger.energy_jump, minlength=count),
         "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
         "conserved": total - segment.rows_of("heat"),

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
-from mdnum.numerics import Ledger
 from mdnum.rollout.compared import Apart, PairFlips, ReferenceFrame, in_user_order
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.epoch import EpochRecord, EpochState, Pins, empty_record, run_epoch
@@ -147,9 +147,9 @@ class Track:
         return taken._replace(i=i, j=j)
 
 
-def _flips_of(ledger: Ledger, frame: ReferenceFrame) -> PairFlips:
+def _flips_of(ledger: FlipTable, frame: ReferenceFrame) -> PairFlips:
     """The columns that a comparison needs, in the labels of the first run."""
-    keys = frame.keys_of(ledger.subject[:, 0], ledger.subject[:, 1])
+    keys = frame.keys_of(ledger.i, ledger.j)
     return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 

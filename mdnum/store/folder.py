@@ -35,7 +35,7 @@ from mdnum.store.files import (
     refuse_link,
     write_text,
 )
-from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream, as_numpy
+from mdnum.store.tables import COLUMNS, TABLES, UNKNOWN, VERBS, TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -417,12 +417,13 @@ class RunFolder:
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
-        """As `table`, a numpy array by column name."""
+        """As `table`, a numpy array by column name, without the columns that this folder does not know."""
         table = self.table(name, columns, rows)
-        empty = [key for key in table.column_names if table[key].null_count]
-        if empty:
-            raise FolderError(f"column {empty[0]!r} of table {name!r} has gaps", where=str(self.path))
-        return {key: as_numpy(table[key]) for key in table.column_names}
+        gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
+        unknown = set() if columns else {key for key in UNKNOWN.get(name, ()) if gaps.get(key) == len(table)}
+        if odd := [key for key in gaps if key not in unknown]:
+            raise FolderError(f"column {odd[0]!r} of table {name!r} has gaps", where=str(self.path))
+        return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""

@@ -13,7 +13,7 @@ from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from queue import Full, Queue
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -25,16 +25,26 @@ from mdnum.store import files as manifest
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
 _DECLARED = beside(__file__)
+_WORD = pa.dictionary(pa.int32(), pa.string())
 _TYPES = {
-    name: pa.type_for_alias(kind) for kind, names in _DECLARED["types"].items() for name in names.split()
+    name: _WORD if kind == "word" else pa.type_for_alias(kind)
+    for kind, names in _DECLARED["types"].items()
+    for name in names.split()
 }
+#: Columns that a writer may not know, by table: they are null then.
+UNKNOWN = {
+    table: frozenset(word.rstrip("?") for word in columns.split() if word.endswith("?"))
+    for table, columns in _DECLARED["columns"].items()
+}
+# what a column holds where rows leave it out, by world, table and column
+_USUAL: Mapping[str, Mapping[str, Mapping[str, Any]]] = _DECLARED["usual"]
 
 
 def _columns(declared: Mapping[str, str]) -> Mapping[str, Mapping[str, pa.DataType]]:
     """Types by table and column; that of a column goes by its name where none is declared with it."""
     tables: dict[str, Mapping[str, pa.DataType]] = {}
     for table, columns in declared.items():
-        words = [word.partition(":") for word in columns.split()]
+        words = [word.rstrip("?").partition(":") for word in columns.split()]
         usual = {name: _TYPES.get(name, pa.float64()) for name, _, _ in words}
         own = {name: pa.type_for_alias(kind) for name, _, kind in words if kind}
         tables[table] = MappingProxyType(usual | own)
@@ -70,6 +80,8 @@ _GROUP_ROWS = 262_144
 # as the separation of two equal runs, are packed to next to nothing
 _MOST_TIMES, _MOST_UNPACKED = 100, 1 << 30
 _RESTORE = "Restore it from a copy, or run again in a new folder"
+# columns whose least and largest values in a row group help who looks for some rows
+_ORDERED = frozenset({"rule", "step", "frame", "time"})
 # columns whose values hardly repeat: a dictionary of them is made in vain, and takes as long as all the rest
 _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before", "radial_speed"})
 
@@ -90,9 +102,13 @@ class TableStream:
         #: digests of the part files that were written, by name
         self.written: dict[str, list[str]] = {}
         self._known = columns_of(world, name)
+        usual = _USUAL.get(world, {}).get(name, {})
+        # columns that rows may leave out, and what is in them then: parts that are written, read, packed and
+        # removed do not carry what is the same in every row
+        self._usual: dict[str, Any] = {**dict.fromkeys(UNKNOWN.get(name, ())), **usual}
         self.merged_path = root / f"{name}.parquet"
         self.parts_folder = root / "parts"
-        self._buffer: list[pa.Table] = []
+        self._buffer: list[Mapping[str, Any]] = []
         self._buffered = 0
         self._in_parts = world in _RESUMED
         self._writing: _Writing | None = None
@@ -101,7 +117,7 @@ class TableStream:
         self.flushed = sum(rows for _, rows in files)
         if files:
             with _parquet(files[0][0]) as file:
-                self._schema = file.schema_arrow
+                self._schema = self._whole(file.schema_arrow.empty_table()).schema
 
     @property
     def rows(self) -> int:
@@ -139,13 +155,34 @@ class TableStream:
         """Adds rows, in memory until the next flush.
 
         Args:
-            columns: equally long arrays by column name; at least the table's own columns.
+            columns: equally long arrays by column name, or a word for all rows; at least the table's own,
+                but for those that may be unknown.
         """
-        table = self._table(columns)
-        if not table.num_rows:
+        schema = self._schema
+        if schema is None:
+            known = self._known
+            extra = {key: pa.array(np.asarray(columns[key])).type for key in columns if key not in known}
+            schema = pa.schema([*known.items(), *extra.items()])
+        missing = [name for name in schema.names if name not in columns and name not in self._usual]
+        unknown = [name for name in columns if name not in schema.names]
+        if missing or unknown:
+            raise ValueError(f"table {self.name!r}: columns missing {missing}, not expected {unknown}")
+        lengths = {name: len(one) for name, one in columns.items() if not isinstance(one, str)}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
+        self._schema, rows = schema, max(lengths.values())
+        if not rows:
             return
-        self._buffer.append(table)
-        self._buffered += table.num_rows
+        # private copies: the caller may change its arrays before the flush
+        held = {
+            name: one if isinstance(one, str) else np.array(one)
+            for name, one in columns.items()
+            if not _repeats(one, self._usual.get(name))
+        }
+        if self._buffer and self._buffer[0].keys() != held.keys():
+            self.flush()
+        self._buffer.append(held)
+        self._buffered += rows
         if self._buffered >= _BUFFER_ROWS:
             self.flush()
 
@@ -153,10 +190,15 @@ class TableStream:
         """Writes what is in memory as one part file, or hands it to the thread that writes the table."""
         if not self._buffered:
             return
-        table = pa.concat_tables(self._buffer).combine_chunks()
+        held, schema = together(self._buffer), cast(pa.Schema, self._schema)
+        fields = [field for field in schema if field.name in held]
+        arrays = [as_arrow(held[field.name], field.type, self._buffered) for field in fields]
+        table = pa.Table.from_arrays(arrays, schema=pa.schema(fields))
         if self._in_parts:
             subfolder(self._root, "parts")
-            self._replace(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table])
+            self._replace(
+                self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table], table.schema
+            )
         else:
             if self._writing is None:
                 if self.flushed:
@@ -187,7 +229,7 @@ class TableStream:
             elif rows < first + count:
                 with _parquet(path) as file:
                     kept = file.read().slice(0, rows - first)
-                self._replace(path, [kept])
+                self._replace(path, [kept], kept.schema)
             first += count
         manifest.update(self._root, {}, [manifest.place(path)[1] for path in gone])
         for path in gone:
@@ -205,7 +247,7 @@ class TableStream:
         else:
             if self._schema is None:
                 self._schema = pa.schema(list(self._known.items()))
-            self._write_merged(self.batches())
+            self._write_merged(self._on_disk())
         parts = [path for _, path in self.parts()]
         merged = self.merged_path.name
         # rows of parts that are in the merged file are not looked at any more
@@ -222,6 +264,9 @@ class TableStream:
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """The rows on disk in order, a file or row group at a time."""
+        return (self._whole(table, columns) for table in self._on_disk(columns))
+
+    def _on_disk(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         for path, _ in self.files():
             with _parquet(path) as file:
                 self._refuse_columns(path, file.schema_arrow, columns)
@@ -251,7 +296,19 @@ class TableStream:
         return table if rows is None else table.slice(0, rows)
 
     def _write_merged(self, tables: Iterator[pa.Table]) -> None:
-        self._replace(self.merged_path, _regroup(tables, _GROUP_ROWS))
+        groups = map(self._whole, _regroup(tables, _GROUP_ROWS, self._whole))
+        self._replace(self.merged_path, groups, cast(pa.Schema, self._schema))
+
+    def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
+        """Rows with the columns that they leave out, in order; all columns where none are named."""
+        there = table.column_names
+        known = [name for name in self._known if name in there or name in self._usual]
+        names = columns or [*known, *(name for name in there if name not in self._known)]
+        if names == there:
+            return table
+        rows, kinds = len(table), self._known
+        made = {name: as_arrow(self._usual[name], kinds[name], rows) for name in names if name not in there}
+        return pa.table({name: made[name] if name in made else table[name] for name in names})
 
     def _row_count(self, path: Path) -> int:
         if self._check is not None:
@@ -259,19 +316,20 @@ class TableStream:
         with _parquet(path) as file:
             return file.metadata.num_rows
 
-    def _replace(self, path: Path, tables: Iterable[pa.Table]) -> None:
+    def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
         """Writes rows into a file of this table, which the manifest expects before it is there.
 
         Every page carries a checksum, which whoever reads the file can ask for.
         """
-        schema = self._schema
         # a part is read once more and removed: packing it takes longer than all the rest
         packed = "zstd" if path == self.merged_path else "none"
         with replacing(path) as file:
-            repeating: Any = [field.name for field in schema or () if field.name not in _DISTINCT]
+            repeating: Any = [name for name in schema.names if name not in _DISTINCT]
+            ordered: Any = [name for name in schema.names if name in _ORDERED]
             with pq.ParquetWriter(
-                file, schema, use_dictionary=repeating, compression=packed, write_page_checksum=True
-            ) as writer:
+                file, schema, use_dictionary=repeating, compression=packed, write_page_checksum=True,
+                write_statistics=ordered,
+            ) as writer:  # fmt: skip
                 for table in tables:
                     writer.write_table(table, row_group_size=_GROUP_ROWS)
             file.flush()
@@ -287,29 +345,12 @@ class TableStream:
         """Refuses columns of another type than this table's, and a file without those that are wanted."""
         found = {field.name: field.type for field in schema}
         other = [name for name, kind in self._known.items() if found.get(name, kind) != kind]
-        missing = [name for name in wanted or () if name not in found]
+        missing = [name for name in wanted or () if name not in found and name not in self._usual]
         if other or missing:
             seen = f"column {other[0]!r} holds {found[other[0]]}" if other else f"no column {missing[0]!r}"
             raise FolderError(
                 f"is not a table of {self.name} ({seen})", remedy="Run again in a new folder", where=str(path)
             )
-
-    def _table(self, columns: Mapping[str, Any]) -> pa.Table:
-        schema = self._schema
-        if schema is None:
-            known = self._known
-            extra = {key: pa.array(np.asarray(columns[key])).type for key in columns if key not in known}
-            schema = pa.schema([*known.items(), *extra.items()])
-        missing = [name for name in schema.names if name not in columns]
-        unknown = [name for name in columns if name not in schema.names]
-        if missing or unknown:
-            raise ValueError(f"table {self.name!r}: columns missing {missing}, not expected {unknown}")
-        arrays = [as_arrow(columns[field.name], field.type) for field in schema]
-        lengths = {field.name: len(array) for field, array in zip(schema, arrays, strict=True)}
-        if len(set(lengths.values())) > 1:
-            raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
-        self._schema = schema
-        return pa.Table.from_arrays(arrays, schema=schema)
 
 
 class _Writing:
@@ -346,10 +387,39 @@ class _Writing:
         self._pool.terminate()
 
 
-def as_arrow(values: Any, kind: pa.DataType) -> pa.Array:
-    """A column of values of a kind, by its buffers: `pa.array` imports pandas, which takes half a second."""
-    # a private copy: arrow would otherwise share the caller's memory until the flush
-    values = np.array(values)
+def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The rows of tables of the same columns; a word is that of all rows."""
+    columns = {name: [part[name] for part in parts] for name in parts[0]}
+    return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
+
+
+def _repeats(values: Any, value: Any) -> bool:
+    """Whether a column is this value in all rows, told from how it is given: a word, or a broadcast array."""
+    if isinstance(values, np.ndarray) and values.strides == (0,):
+        values = values[0]
+    return value is not None and np.ndim(values) == 0 and bool(values == value)
+
+
+def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
+    """A column of values of a kind, by its buffers: `pa.array` imports pandas, which takes half a second.
+
+    Args:
+        values: one for each row; one for all of them; or None for a column that is not known.
+        rows: needed where there is not one value for each.
+    """
+    if values is None:
+        return pa.nulls(rows, kind)
+    if isinstance(values, int):
+        values = np.full(rows, values)
+    if kind == _WORD:
+        every = isinstance(values, str)
+        words, codes = (
+            ([values], np.zeros(rows)) if every else np.unique(np.array(values, str), return_inverse=True)
+        )
+        return pa.DictionaryArray.from_arrays(
+            as_arrow(codes, kind.index_type), as_arrow(words, kind.value_type)
+        )
+    values = np.asarray(values)
     if pa.types.is_string(kind):
         texts = [text.encode() for text in values.tolist()]
         offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
@@ -365,6 +435,9 @@ def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
     parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     if pa.types.is_string(column.type):
         return np.array([text for part in parts for text in part.to_pylist()], object)
+    if column.type == _WORD:
+        words = [as_numpy(part.dictionary)[as_numpy(part.indices)] for part in parts]
+        return np.concatenate([np.zeros(0, object), *words])
     kind = np.dtype(column.type.to_pandas_dtype())
     read = [np.zeros(0, kind)]
     for part in filter(len, parts):
@@ -397,16 +470,21 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         ) from error
 
 
-def _regroup(tables: Iterator[pa.Table], rows: int) -> Iterator[pa.Table]:
+def _regroup(
+    tables: Iterator[pa.Table], rows: int, whole: Callable[[pa.Table], pa.Table]
+) -> Iterator[pa.Table]:
     held: list[pa.Table] = []
     count = 0
     for table in tables:
+        if held and held[0].schema != table.schema:
+            # one leaves out a column that another has
+            held, table = [whole(one) for one in held], whole(table)
         held.append(table)
         count += table.num_rows
         while count >= rows:
-            whole = pa.concat_tables(held)
-            yield whole.slice(0, rows).combine_chunks()
-            held = [whole.slice(rows)]
+            joined = pa.concat_tables(held)
+            yield joined.slice(0, rows).combine_chunks()
+            held = [joined.slice(rows)]
             count -= rows
     if count:
         yield pa.concat_tables(held).combine_chunks()

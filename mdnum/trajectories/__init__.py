@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from mdnum.trajectories.analysis import NeighborFlips as NeighborFlips
     from mdnum.trajectories.frame import Box as Box
     from mdnum.trajectories.frame import Frame as Frame
-    from mdnum.trajectories.ledger import FlipTable as FlipTable
     from mdnum.trajectories.rules import CutoffRule as CutoffRule
     from mdnum.trajectories.tracker import Tracker as Tracker
     from mdnum.trajectories.trajectory import open_trajectory as open_trajectory

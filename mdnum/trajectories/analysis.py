@@ -22,11 +22,11 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
+from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import FrameError, UnreadableFrame
 from mdnum.trajectories.collective import Collective
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.lattice import shortest
-from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.repeats import RepeatedFrames, digest
 from mdnum.trajectories.resolution import FLOAT32, Resolution, infer

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
+from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import EarlierFramesError
 from mdnum.trajectories.frame import AtomIndices, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
-from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
@@ -218,7 +218,7 @@ def _hand_on(
     else:
         one.neighbors.step(flips)
     if len(flips):
-        sink("flips", {"rule": np.full(len(flips), number), **vars(flips)})
+        sink("flips", flips.columns(number))
     fewest, mean, most = one.neighbors.count()
     entered = int(np.count_nonzero(flips.entered))
     row = {

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.bits import digit_order
+from mdnum.md.ledger import Columns, FlipTable, Members
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.ledger import Columns, FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is far faster
 _ROOM = 2**62

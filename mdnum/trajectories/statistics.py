@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.compiled import njit
+from mdnum.md.ledger import Columns
 from mdnum.trajectories.history import Contacts, History, Strides, Sums, contacts, doublings, mended
-from mdnum.trajectories.ledger import Columns
 from mdnum.trajectories.topology import AtomTable
 
 #: Stays from which the share that is inside again is taken: all of them in most files.

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from mdnum.bits import digit_order
 from mdnum.errors import InputError
+from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import FrameError
 from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
 from mdnum.trajectories.lattice import (
@@ -21,7 +22,6 @@ from mdnum.trajectories.lattice import (
     lattice_of,
     own_images,
 )
-from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.search import (
     Changed,
@@ -301,8 +301,9 @@ class Tracker:
         bound = self.bound + max(before.rounding, now.rounding)
         ambiguous = (np.abs(margin) <= bound) | (np.abs(margin_before) <= bound)
         return FlipTable(
-            np.full(count, self.frames), i[order], j[order], rank, entered, distance, distance_before,
-            margin, margin_before, np.full(count, bound), ambiguous,
+            i=i[order], j=j[order], rank=rank, entered=entered, distance=distance, margin=margin,
+            bound=np.full(count, bound), ambiguous=ambiguous, decided_by="positions",
+            frame=np.full(count, self.frames), before=distance_before, margin_before=margin_before,
         )  # fmt: skip
 
 

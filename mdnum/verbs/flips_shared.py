@@ -12,6 +12,7 @@ from mdnum.errors import InputError
 from mdnum.report.finding import Finding, Texts
 from mdnum.report.words import count, listed, number, plain
 from mdnum.store import RunFolder
+from mdnum.store.tables import together
 from mdnum.verbs.frame import Progress, View, asked_to_stop
 
 if TYPE_CHECKING:
@@ -106,8 +107,7 @@ class HeldRows:
 
     def _hand_over(self, folder: RunFolder) -> None:
         for table, parts in self._held.items():
-            whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-            folder.append(table, whole)
+            folder.append(table, together(parts))
         self._held, self._count = {}, 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.md.ledger import FlipTable, Members
 
 
 def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[FlipTable, Members]:
@@ -23,8 +23,11 @@ def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[FlipT
     nothing = np.full(len(rows), np.nan)
     entered = np.array([row[4] for row in rows], bool)
     flips = FlipTable(
-        *whole.T, entered, nothing, nothing, nothing, nothing, nothing, np.zeros(len(rows), bool)
-    )
+        **dict(zip(("frame", "i", "j", "rank"), whole.T, strict=True)),
+        entered=entered, decided_by="positions",
+        **dict.fromkeys(("distance", "before", "margin", "margin_before", "bound"), nothing),
+        ambiguous=np.zeros(len(rows), bool),
+    )  # fmt: skip
     start = np.array([name for name, row in zip(names, inside, strict=True) if row[0]], np.int64)
     start = start.reshape(-1, 3)
     return flips, Members(*start.T, np.zeros(len(start)))

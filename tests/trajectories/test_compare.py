@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
+from mdnum.md.ledger import Members
 from mdnum.trajectories.follow import SetDifference, distances
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.ledger import Members
 from mdnum.trajectories.separation import displacements, growth, same_lattice, separation
 
 

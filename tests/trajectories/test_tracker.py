@@ -16,9 +16,9 @@ from trajectories.brute_force import PERIODIC, as_dict, atoms, boxes, cube, diff
 from trajectories.files import arrays_held
 
 from mdnum.errors import InputError
+from mdnum.md.ledger import FlipTable
 from mdnum.trajectories import tiles
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.ledger import FlipTable
 from mdnum.trajectories.rules import NEVER, Capped, CutoffRule, Nearest, SpeciesCutoffs
 from mdnum.trajectories.tracker import HORIZON, Tracker
 

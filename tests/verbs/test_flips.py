@@ -11,12 +11,13 @@ from typing import Any
 
 import ase
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from ase.io import iread, write
 from trajectories import brute_force
 
 import mdnum
-from mdnum.errors import InputError
+from mdnum.errors import FolderError, InputError
 from mdnum.store import RunFolder
 from mdnum.verbs.flips import rules
 from mdnum.verbs.flips_page import judge, page
@@ -83,6 +84,30 @@ def test_a_run_of_mdnum_gives_its_own_ledger_row_for_row(crystal: Path, tmp_path
     assert abs(one["flux"]["lost"]) < 4 * one["flux"]["error"] / one["flux"]["rate"]
     assert one["stride"]["motion"]["moved"] == pytest.approx(1, abs=0.01)
     assert result.summary["resolution"]["kind"] == "float64" and result.summary["status"] == "complete"
+
+
+def test_a_run_and_its_trajectory_write_one_table(tmp_path: Path) -> None:
+    run = mdnum.run(
+        "argon/crystal-108", steps=60, save_every=1, out=tmp_path / "run", check=False, report=False
+    )
+    found = mdnum.flips(run.folder / "trajectory.traj", out=tmp_path / "f", report=False)
+    mine, theirs = (pq.read_table(one.folder / "flips.parquet") for one in (run, found))
+    assert mine.schema.equals(theirs.schema) and mine.num_rows == theirs.num_rows > 20
+    for name in ("rule", "i", "j", "rank", "entered"):
+        assert mine[name].equals(theirs[name]), name
+    assert mine["step"].equals(theirs["frame"])
+    # whether the program's mask or the positions decided it, in every row
+    for table, word in ((mine, "program"), (theirs, "positions")):
+        assert table["decided_by"].to_pylist() == [word] * table.num_rows
+    unknown = [{name for name in one.column_names if one[name].null_count} for one in (mine, theirs)]
+    jumps = {"radial_speed", "energy_jump", "force_jump"}
+    assert unknown == [{"frame", "before", "margin_before"}, {"step", *jumps}]
+    # a reader in numpy gets what is known
+    for outcome, lacking in zip((run, found), unknown, strict=True):
+        folder = RunFolder.open(outcome.folder)
+        assert folder.read("flips").keys() == set(mine.column_names) - lacking
+        with pytest.raises(FolderError, match="has gaps"):
+            folder.read("flips", [*lacking])
 
 
 def test_tables_agree_with_sets_worked_out_one_by_one(examined) -> None:

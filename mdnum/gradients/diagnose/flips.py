@@ -102,19 +102,18 @@ def flips(
         total = part.total
     met = made.crossings[::-1]
     weight, grazing, speed = (joined(met, name) for name in ("weight", "grazing", "speed"))
-    step, subject, entered, margin, bound = (
-        joined(met, name, ledger=True) for name in ("step", "subject", "entered", "margin", "bound")
-    )
+    names = ("step", "i", "j", "entered", "margin", "bound", "ambiguous")
+    known = {name: joined(met, name, ledger=True) for name in names}
     each = np.where(grazing[:, None], 0.0, weight[:, None] * np.concatenate(moved))
     # the largest share of what flips add to any of the numbers, so that numbers in other units do not vanish
     sums = np.abs(each).sum(axis=0)
     order = np.argsort(-np.max(np.abs(each) / np.where(sums > 0, sums, 1), axis=1), kind="stable")
     table = {
-        "step": step, "i": subject[:, 0], "j": subject[:, 1], "entered": entered,
-        "margin": margin, "bound": bound, "ambiguous": np.abs(margin) <= bound,
+        **known,
         "radial_speed": np.where(np.isinf(speed), 0.0, speed), "weight": weight, "grazing": grazing,
     }  # fmt: skip
     table |= {f"contribution.{number}": each[:, k] for k, number in enumerate(numbers)}
+    entered = known["entered"]
     smooth = dict(zip(numbers, by_column(made.tape, total).tolist(), strict=True))
     # a scalar has the empty index
     whole = {str(one): float(np.asarray(made.gradient[one.name])[one.index]) for one in columns}

@@ -188,7 +188,7 @@ def horizons(
             watch(part)
         ledger = part.stretch.ledger
         assert ledger is not None
-        flips.append(np.column_stack([ledger.step, ledger.subject, ledger.entered]).astype(np.int64))
+        flips.append(np.stack([ledger.step, ledger.i, ledger.j, ledger.entered], axis=1).astype(np.int64))
     values, slopes = [], []
     for k in range(len(at)):
         value, push = jax.linearize(lambda total, k=k: loss.of(total, k), tape.total)

@@ -1,0 +1,100 @@
+"""Pairs inside and their flips as columns, of a simulation and of anybody's trajectory alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+class Columns:
+    """A table: equally long columns, the fields of a frozen dataclass in their order, an array first.
+
+    What is no array stands for all rows: a word, or None for a column that is not known.
+    """
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, rows: Any) -> Any:
+        chosen = {k: v[rows] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        return type(self)(**chosen)
+
+    def equals(self, other: Columns) -> bool:
+        """Whether all columns are the same to the last bit."""
+        return all(map(np.array_equal, vars(self).values(), vars(other).values()))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Any]) -> Any:
+        """The rows of parts, one after the other; at least one part, and all know the same columns."""
+        first, rows = vars(parts[0]), [vars(one) for one in parts]
+        arrays = [name for name, column in first.items() if isinstance(column, np.ndarray)]
+        return cls(**first | {name: np.concatenate([one[name] for one in rows]) for name in arrays})
+
+
+@dataclass(frozen=True)
+class Members(Columns):
+    """The pairs inside at one frame, sorted by (i, j, rank), each once."""
+
+    i: Int[
+        np.ndarray, "pairs"
+    ]  # first atom, an index into the file's atoms; i <= j where a rule is symmetric
+    j: Int[np.ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
+    # 0 for the nearest image of j, 1 for the next, and so on, which wrapping an atom does not change
+    rank: Int[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]  # length
+
+    @classmethod
+    def none(cls) -> Members:
+        """No pair."""
+        none = np.zeros(0, np.int64)
+        return cls(none, none, none, np.zeros(0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlipTable(Columns):
+    """A row per decision on a pair that differs from the one before, sorted by (step or frame, i, j, rank).
+
+    A run's decisions are those that its program acted on, one of each pair at each step; those of a
+    trajectory, or of anybody's positions, follow from where atoms are at each frame.
+    """
+
+    i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
+    j: Int[np.ndarray, "flips"]
+    rank: Int[np.ndarray, "flips"]  # always 0 in a run: it decides on the nearest image alone
+    entered: Bool[np.ndarray, "flips"]  # whether the pair is inside from now on
+    distance: Float[np.ndarray, "flips"]  # now, length
+    # signed distance to the threshold now, positive inside: in the quantity's space in a run (r or r²), else
+    # a length; and how far it can be off by rounding, and by the resolution of a file
+    margin: Float[np.ndarray, "flips"]
+    bound: Float[np.ndarray, "flips"]
+    ambiguous: Bool[np.ndarray, "flips"]  # a margin is within the bound: it may have been decided otherwise
+    decided_by: Literal["program", "positions"]
+    # None where it is not known: the step of a run; the position among the frames examined, which is not the
+    # number in the file and never 0; distance (length) and margin at the frame before, nan for a pair that
+    # was nowhere near; radial speed (length per the user's time); what the flip adds to the energy, and to
+    # the force between the two
+    step: Int[np.ndarray, "flips"] | Any = None
+    frame: Int[np.ndarray, "flips"] | Any = None
+    before: Float[np.ndarray, "flips"] | Any = None
+    margin_before: Float[np.ndarray, "flips"] | Any = None
+    radial_speed: Float[np.ndarray, "flips"] | Any = None
+    energy_jump: Float[np.ndarray, "flips"] | Any = None
+    force_jump: Float[np.ndarray, "flips"] | Any = None
+
+    @classmethod
+    def none(cls) -> FlipTable:
+        """No row of a trajectory."""
+        whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
+        return cls(
+            i=whole, j=whole, rank=whole, entered=yes, distance=real, margin=real, bound=real, ambiguous=yes,
+            decided_by="positions", frame=whole, before=real, margin_before=real,
+        )  # fmt: skip
+
+    def columns(self, rule: int = 0) -> dict[str, Any]:
+        """What is known, by the names of flips.parquet; all rows are of one rule."""
+        known = {name: column for name, column in vars(self).items() if column is not None}
+        return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}
