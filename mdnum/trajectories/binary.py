@@ -283,17 +283,17 @@ class XtcTrajectory(Trajectory):
             whole = file.whole_frames()
             # a frame that is cut is one to read
             self._count = whole + (not file.ends_at(whole))
-        self._has(atoms)
+        self.has_atoms(atoms)
         # of the last frame, which has the same box as the next in most files
         self._box = b"", Box()
         self.notes = (*self.notes, *self.table.notes)
 
     @contextmanager
-    def _reader(self) -> Iterator[Callable[[int], Any]]:
+    def raw_frames(self) -> Iterator[Callable[[int], Any]]:
         with closing(self._file(self.path)) as file:
             yield file.read
 
-    def _frame(self, number: int, raw: Any) -> Frame:
+    def decoded(self, number: int, raw: Any) -> Frame:
         return Frame(number, float(raw.time), (raw.x * _TEN).astype(np.float64), self._box_of(raw.box))
 
     def _box_of(self, vectors: np.ndarray) -> Box:
@@ -317,7 +317,7 @@ class TrrTrajectory(XtcTrajectory):
     notes = ()
     _file = TrrFile
 
-    def _frame(self, number: int, raw: Any) -> Frame:
+    def decoded(self, number: int, raw: Any) -> Frame:
         time, vectors, x, v = raw
         box, ten = Box(), x.dtype.type(10)
         if vectors is not None and vectors.any():

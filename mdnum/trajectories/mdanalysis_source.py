@@ -190,7 +190,7 @@ class MDAnalysisTrajectory(Trajectory):
         return universe, [str(one.message) for one in caught]
 
     @contextmanager
-    def _reader(self) -> Iterator[Callable[[int], Frame]]:
+    def raw_frames(self) -> Iterator[Callable[[int], Frame]]:
         trajectory, at = self.universe.trajectory, None
         with reading(self.path):
             frames = LibraryFrames(trajectory)
@@ -208,7 +208,7 @@ class MDAnalysisTrajectory(Trajectory):
     def _behind(self) -> str | None:
         return left_over(self.universe.trajectory)
 
-    def _frame(self, number: int, raw: Frame) -> Frame:
+    def decoded(self, number: int, raw: Frame) -> Frame:
         return raw
 
 
@@ -423,11 +423,11 @@ class NetcdfTrajectory(Trajectory):
             raise self._unreadable(0, self._ends)
         self.bits = 8 * file.variables["coordinates"].itemsize()
         self.time = "ps" if "time" in file.variables else "frame"
-        self._has(atoms)
+        self.has_atoms(atoms)
         self.notes = self.table.notes
 
     @contextmanager
-    def _reader(self) -> Iterator[Callable[[int], dict[str, np.ndarray]]]:
+    def raw_frames(self) -> Iterator[Callable[[int], dict[str, np.ndarray]]]:
         names = {"coordinates", "velocities", "time", "cell_lengths", "cell_angles"}
         variables = {name: one for name, one in self._file.variables.items() if name in names and one.isrec}
 
@@ -442,7 +442,7 @@ class NetcdfTrajectory(Trajectory):
     def _ends(self) -> str:
         return f"the file ends in it, and its head tells of {max(self._file.told, 0):,} frames"
 
-    def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
+    def decoded(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
         box, velocities = Box(), raw.get("velocities")
         if {"cell_lengths", "cell_angles"} <= set(raw):
             box = box_of(np.concatenate([raw["cell_lengths"], raw["cell_angles"]]).astype(np.float32))

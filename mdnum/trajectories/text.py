@@ -64,7 +64,7 @@ class AseFrames(Trajectory):
         order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
         return AtomTable.plain(_SYMBOLS[first.numbers[order]].tolist())
 
-    def _frame(self, number: int, raw: Any) -> Frame:
+    def decoded(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)
         momenta, velocities = atoms.arrays.get("momenta"), None
         if momenta is not None:
@@ -101,18 +101,18 @@ class AseTrajectory(AseFrames):
         if format == "traj":
             with reading(path, by="ASE"), TrajectoryReader(str(path)) as reader:
                 self._count = len(reader)
-        first = self._first()
+        first = self.first()
         with self._reading(0):
-            self._has(len(first), self._of_atoms(first))
+            self.has_atoms(len(first), self._of_atoms(first))
 
     @contextmanager
-    def _reader(self) -> Iterator[Callable[[int], Any]]:
+    def raw_frames(self) -> Iterator[Callable[[int], Any]]:
         if self.format == "traj":
             with TrajectoryReader(str(self.path)) as reader:
                 yield lambda number: with_elements(reader[number]) if number < len(reader) else None
             return
         images = ase_images(self.path, format=self.format)
-        yield self._in_order(lambda: next(images, None))
+        yield self.in_order(lambda: next(images, None))
 
 
 def format_of(path: Path) -> str:
@@ -121,10 +121,6 @@ def format_of(path: Path) -> str:
     Raises:
         InputError: it knows none for it, or the file cannot be read.
     """
-    # by its name, where ASE would look into it first and give up where it is cut
-    plain = path.with_suffix("") if path.suffix in (".gz", ".bz2") else path
-    if plain.suffix == ".extxyz":
-        return "extxyz"
     try:
         with reading(path, by="ASE"):
             return filetype(str(path))
@@ -207,10 +203,10 @@ class TextTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         super().__init__(path, topology, frames)
-        block = self._first()
+        block = self.first()
         with self._reading(0):
-            atoms, table = len(self._frame(0, block).positions), self._described(block)
-        self._has(atoms, table)
+            atoms, table = len(self.decoded(0, block).positions), self._described(block)
+        self.has_atoms(atoms, table)
 
     @abstractmethod
     def _block(self, lines: Any) -> list[str] | None:
@@ -225,11 +221,11 @@ class TextTrajectory(Trajectory):
         """What the first frame says of its atoms."""
 
     @contextmanager
-    def _reader(self) -> Iterator[Callable[[int], Any]]:
+    def raw_frames(self) -> Iterator[Callable[[int], Any]]:
         from ase.io.formats import open_with_compression
 
         with open_with_compression(str(self.path), "r") as lines:
-            yield self._in_order(lambda: self._block(lines))
+            yield self.in_order(lambda: self._block(lines))
 
 
 def _whole_number(line: str, what: str) -> int:
@@ -325,7 +321,7 @@ class LammpsDump(TextTrajectory):
         labels = _labels(columns, rows[self._order(0, columns, rows)])
         return AtomTable.plain(["X"] * len(rows) if labels is None else labels.tolist(), labels is not None)
 
-    def _frame(self, number: int, raw: list[str]) -> Frame:
+    def decoded(self, number: int, raw: list[str]) -> Frame:
         items = _items(raw)
         columns, rows = _atoms(items)
         rows = rows[self._order(number, columns, rows)]
@@ -450,7 +446,7 @@ class GroTrajectory(TextTrajectory):
         self.time = "ps" if _TIME.search(block[0]) else "frame"
         return AtomTable.of(topology_universe(self.path).atoms)
 
-    def _frame(self, number: int, raw: list[str]) -> Frame:
+    def decoded(self, number: int, raw: list[str]) -> Frame:
         rows = [line.rstrip("\n") for line in raw[2:-1]]
         if not rows:
             raise ValueError("no atoms")

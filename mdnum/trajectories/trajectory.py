@@ -20,13 +20,14 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import count, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Int
 
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import CHECK, FrameError, UnreadableFrame, check_claim, first_line, reading
+from mdnum.registry import Registry
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.topology import AtomTable, read_topology
@@ -36,7 +37,7 @@ SAMPLE = 8
 _SLICE = re.compile(r"(-?\d+)?(:(-?\d+)?(:(-?\d+)?)?)?")
 
 # MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
-_ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
+_ASE_SUFFIXES = frozenset({".traj", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
 # Amber's, of which MDAnalysis reads those that are whole
 _NETCDF = frozenset({"nc", "ncdf", "netcdf"})
 _LANGUAGE = (
@@ -53,8 +54,8 @@ IN_MEMORY = (
 class Trajectory(ABC):
     """Frames of one file, read lazily and in order, as often as wanted.
 
-    A reader says how many atoms there are (`_has`), finds frames (`_reader`) and decodes them (`_frame`).
-    What it raises in doing so becomes an unreadable frame.
+    A reader says how many atoms there are (`has_atoms`), finds frames (`raw_frames`) and decodes them
+    (`decoded`). What it raises in doing so becomes an unreadable frame.
 
     Args:
         path: the file.
@@ -87,7 +88,7 @@ class Trajectory(ABC):
         self.path, self.slice = path, slice
         self.topology = None if topology is None else Path(topology)
 
-    def _has(self, atoms: int, table: AtomTable | None = None) -> None:
+    def has_atoms(self, atoms: int, table: AtomTable | None = None) -> None:
         """Sets the table of atoms: the topology's, where there is one."""
         check_claim(self.path, atoms)
         if self.topology is not None:
@@ -149,7 +150,7 @@ class Trajectory(ABC):
                 with self._reading(number):
                     if (raw := get(number)) is None:
                         return
-                    frame = self._frame(number, raw)
+                    frame = self.decoded(number, raw)
                 if len(frame.positions) != self.atoms:
                     seen = f"has {len(frame.positions):,} atoms and the first {self.atoms:,}"
                     remedy = "Leave out the frames with another number of atoms: a flip needs the pair before"
@@ -189,12 +190,12 @@ class Trajectory(ABC):
         return ":".join("" if end is None else str(end) for end in ends)
 
     @abstractmethod
-    def _reader(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Opens the file: gives frames by ascending number, as `_frame` takes them; None at the end."""
+    def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
+        """Opens the file: gives frames by ascending number, as `decoded` takes them; None at the end."""
 
     @abstractmethod
-    def _frame(self, number: int, raw: Any) -> Frame:
-        """A frame from what `_reader` gave."""
+    def decoded(self, number: int, raw: Any) -> Frame:
+        """A frame, in the units that `length` and `time` name, from what `raw_frames` gave."""
 
     def _behind(self) -> str | None:
         """What is left in the file behind its last frame, in words."""
@@ -215,13 +216,13 @@ class Trajectory(ABC):
     def _opened(self) -> Iterator[Callable[[int], Any]]:
         with ExitStack() as stack:
             with reading(self.path, by=self.reader):
-                get = stack.enter_context(self._reader())
+                get = stack.enter_context(self.raw_frames())
             yield get
 
     def _reading(self, number: int) -> AbstractContextManager[None]:
         return reading(self.path, number, by=self.reader)
 
-    def _in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
+    def in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
         """Frames by number, of a reader that goes forward only."""
         at = 0
 
@@ -239,8 +240,8 @@ class Trajectory(ABC):
 
         return get
 
-    def _first(self) -> Any:
-        """The first of the file."""
+    def first(self) -> Any:
+        """The first frame of the file, as `decoded` takes it."""
         with self._opened() as get, self._reading(0):
             first = get(0)
         if first is None:
@@ -303,49 +304,58 @@ def open_trajectory(
         if not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
         check_claim(one)
-    opened = _reader_of(file, format)(file, topology, frames)
+    reader = _reader_of(file, format)
+    with reading(file, by=getattr(reader, "reader", "mdnum")):
+        opened = reader(file, topology, frames)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
     return opened
 
 
+def _concrete(reader: Any) -> None:
+    if missing := sorted(getattr(reader, "__abstractmethods__", ())):
+        raise TypeError(f"it has no {' and no '.join(missing)}")
+
+
+#: Formats in the word of `--format` and of the end of a file's name; others are MDAnalysis's or ASE's.
+READERS: Registry[Trajectory] = Registry(
+    "trajectory format", "mdnum.trajectories", kind=Trajectory, check=_concrete
+)
+for _words, _reader in {
+    "xtc": "binary:XtcTrajectory", "trr": "binary:TrrTrajectory", "gro": "text:GroTrajectory",
+    "lammpstrj lammpsdump lammps-dump-text": "text:LammpsDump", "extxyz": "text:ExtxyzTrajectory",
+    "vasp-xdatcar": "text:XdatcarTrajectory",
+}.items():  # fmt: skip
+    for _word in _words.split():
+        READERS.add(_word, f"mdnum.trajectories.{_reader}")
+
+
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
     """What opens a file, of its path, its topology and the frames asked for."""
-    from mdnum.trajectories import binary
-
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
-    if word in ("xtc", "trr"):
-        # without what the readers of all other formats import, which takes as long as reading many frames
-        return binary.XtcTrajectory if word == "xtc" else binary.TrrTrajectory
+    if word in READERS:
+        # of xtc without what the readers of other formats import, which takes as long as reading many frames
+        return cast(Any, READERS[word])
     import MDAnalysis
 
     from mdnum.trajectories import mdanalysis_source, text
 
-    own = dict.fromkeys(("lammpsdump", "lammpstrj", "lammps-dump-text"), text.LammpsDump)
-    own |= {"gro": text.GroTrajectory}
-    library = partial(mdanalysis_source.MDAnalysisTrajectory, format=format)
-    known: set[str] = set(MDAnalysis._READERS)
-    if format is not None and word in own:
-        return own[word]
     if word in _NETCDF and (head := mdanalysis_source.netcdf_of(file)) and head.whole < head.told:
         return mdanalysis_source.NetcdfTrajectory
-    if format is not None and word.upper() in known:
-        return library
-    by_ase = suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None)
-    if format is None and not by_ase:
-        if suffix == ".gro":
-            return own[word]
+    known = word.upper() in MDAnalysis._READERS
+    if format is None and (suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None)):
+        known = False
+    elif format is None:
         head, comment = _first_lines(file)
-        if word.upper() not in known and head.startswith("item:"):
+        if not known and head.startswith("item:"):
             return text.LammpsDump
         # the comment line of an extended XYZ file says what its columns are, or its box
-        extended = suffix == ".xyz" and ("lattice=" in comment or "properties=" in comment)
-        if word.upper() in known and not extended:
-            return library
+        known &= not (suffix == ".xyz" and ("lattice=" in comment or "properties=" in comment))
+    if known:
+        return partial(mdanalysis_source.MDAnalysisTrajectory, format=format)
     word = format or text.format_of(file)
-    blocks = {"extxyz": text.ExtxyzTrajectory, "vasp-xdatcar": text.XdatcarTrajectory}
-    return blocks.get(word) or partial(text.AseTrajectory, format=word)
+    return cast(Any, READERS[word]) if word in READERS else partial(text.AseTrajectory, format=word)
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
