@@ -144,4 +144,7 @@ def cut_energy(kind, r, rc, ro, u, slope, cos=np.cos, pi=np.pi):
         # HOOMD-blue's xplor; jax_md.energy.multiplicative_isotropic_cutoff; ase LennardJones(smooth=True)
         return u(r) * (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
     t = (r - ro) / (rc - ro)
-    return u(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5 if kind == "quintic" else (1 + cos(pi * t)) / 2)
+    switches = {"quintic": 1 - 10 * t**3 + 15 * t**4 - 6 * t**5, "cosine": (1 + cos(pi * t)) / 2}
+    if kind not in switches:
+        raise ValueError(f"no independent form of the cutoff {kind!r}: add one here")
+    return u(r) * switches[kind]

@@ -43,6 +43,12 @@ def closed_form(kind, r):
     return oracles.cut_energy(kind, r, rc, ro, bare, slope, mpmath.cos, mpmath.pi)
 
 
+def test_a_cutoff_without_an_independent_form_is_refused():
+    """Which would otherwise be compared with the form of another one."""
+    with pytest.raises(ValueError, match="no independent form of the cutoff 'tilted'"):
+        oracles.cut_energy("tilted", 1.5, 2.5, 2.0, bare, lambda r: 0.0)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_and_slope_are_those_of_the_closed_form(kind):
     # forty distances here and below: an operation is compiled for each number of them
