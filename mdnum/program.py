@@ -177,7 +177,7 @@ class PairRows:
             bits=self.bits[:rows],
             cross=self.cross[:rows],
             flips=[flip for flip in self.flips if flip.step <= last],
-            doubts={run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()},
+            doubts={run: doubt[doubt.step <= last] for run, doubt in self.doubts.items()},
             failed={run: word if ended[run] else "" for run, word in self.failed.items()},
         )
 

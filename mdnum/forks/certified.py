@@ -185,7 +185,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     decider, recorder = simulation.decider, PairRecorder(simulation)
     found: list[AmbiguousDecision] = []
     for segment in Engine(simulation, steps).segments():
-        for step, i, j, margin, bound in zip(*recorder.doubtful(segment), strict=True):
+        for step, i, j, margin, bound in zip(*vars(recorder.doubtful(segment)).values(), strict=True):
             x = segment.unsorted("x", int(step) - segment.first)
             kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
             exact, inside = exact_margin(decider, simulation.cell, x[i], x[j], kind)

@@ -152,8 +152,8 @@ def fork(
         for name, more in rows.doubts.items():
             held = doubts.get(name)
             room = FLIPS_KEPT - (0 if held is None else len(held.step))
-            more = more.where(slice(max(0, room)))
-            doubts[name] = more if held is None else type(more).joined([held, more])
+            more = more[: max(0, room)]
+            doubts[name] = more if held is None else type(more).concatenate([held, more])
         reached = rows.first + rows.rows - 1
         if progress is not None:
             shown = {"phase": "run", "separation": float(np.nanmax(rows.separation["B"], initial=0.0))}

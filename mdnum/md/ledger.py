@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,11 +28,18 @@ class Columns:
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
     @classmethod
+    def none(cls) -> Any:
+        """No row of any column; before the parts that are joined, where there may be none."""
+        kinds = {"Int": np.int64, "Bool": bool, "Float": np.float64}
+        types = [(one.name, kinds.get(str(one.type).partition("[")[0])) for one in fields(cast(Any, cls))]
+        return cls(**{name: np.zeros(0, kind) for name, kind in types if kind})
+
+    @classmethod
     def concatenate(cls, parts: Sequence[Any]) -> Any:
-        """The rows of parts, one after the other; at least one part, and all know the same columns."""
-        first, rows = vars(parts[0]), [vars(one) for one in parts]
-        arrays = [name for name, column in first.items() if isinstance(column, np.ndarray)]
-        return cls(**first | {name: np.concatenate([one[name] for one in rows]) for name in arrays})
+        """The rows of parts, one after the other; at least one part. Known is what all of them know."""
+        columns = {name: [vars(one)[name] for one in parts] for name in vars(parts[0])}
+        others = {k: [v for v in one if not isinstance(v, np.ndarray)] for k, one in columns.items()}
+        return cls(**{k: others[k][0] if others[k] else np.concatenate(one) for k, one in columns.items()})
 
 
 @dataclass(frozen=True)
@@ -46,12 +53,6 @@ class Members(Columns):
     # 0 for the nearest image of j, 1 for the next, and so on, which wrapping an atom does not change
     rank: Int[np.ndarray, "pairs"]
     distance: Float[np.ndarray, "pairs"]  # length
-
-    @classmethod
-    def none(cls) -> Members:
-        """No pair."""
-        none = np.zeros(0, np.int64)
-        return cls(none, none, none, np.zeros(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +73,7 @@ class FlipTable(Columns):
     margin: Float[np.ndarray, "flips"]
     bound: Float[np.ndarray, "flips"]
     ambiguous: Bool[np.ndarray, "flips"]  # a margin is within the bound: it may have been decided otherwise
-    decided_by: Literal["program", "positions"]
+    decided_by: Literal["program", "positions"] = "positions"
     # None where it is not known: the step of a run; the position among the frames examined, which is not the
     # number in the file and never 0; distance (length) and margin at the frame before, nan for a pair that
     # was nowhere near; radial speed (length per the user's time); what the flip adds to the energy, and to
@@ -84,15 +85,6 @@ class FlipTable(Columns):
     radial_speed: Float[np.ndarray, "flips"] | Any = None
     energy_jump: Float[np.ndarray, "flips"] | Any = None
     force_jump: Float[np.ndarray, "flips"] | Any = None
-
-    @classmethod
-    def none(cls) -> FlipTable:
-        """No row of a trajectory."""
-        whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
-        return cls(
-            i=whole, j=whole, rank=whole, entered=yes, distance=real, margin=real, bound=real, ambiguous=yes,
-            decided_by="positions", frame=whole, before=real, margin_before=real,
-        )  # fmt: skip
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
         """What is known, by the names of flips.parquet; all rows are of one rule."""

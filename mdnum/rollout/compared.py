@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, overload
+from typing import overload
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mdnum.compiled import njit
 from mdnum.md.cell import Cell
+from mdnum.md.ledger import Columns
 from mdnum.md.neighbors import PairTable
 
 
@@ -90,7 +91,8 @@ class CrossFlip:
     bound: float
 
 
-class PairFlips(NamedTuple):
+@dataclass(frozen=True)
+class PairFlips(Columns):
     """Flips of one run, in the labels of the first run, a column each."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
@@ -99,18 +101,6 @@ class PairFlips(NamedTuple):
     # margin, bound: of the decision, in the quantity's space
     margin: Float[np.ndarray, "flips"]
     bound: Float[np.ndarray, "flips"]
-
-    @classmethod
-    def joined(cls, parts: Sequence[PairFlips]) -> PairFlips:
-        """The flips of several stretches."""
-        if not parts:
-            whole, real = np.zeros(0, np.int64), np.zeros(0)
-            return cls(whole, whole, np.zeros(0, bool), real, real)
-        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-    def where(self, chosen) -> PairFlips:
-        """Some of them: a mask, a slice or indices."""
-        return PairFlips(*(column[chosen] for column in self))
 
 
 @dataclass(frozen=True)
@@ -131,7 +121,7 @@ class CrossFlips(Sequence[CrossFlip]):
     def __getitem__(self, at: slice) -> CrossFlips: ...
     def __getitem__(self, at: int | slice) -> CrossFlip | CrossFlips:
         if isinstance(at, slice):
-            return CrossFlips(self.flips.where(at), self.from_b[at], self.differs[at], self.atoms)
+            return CrossFlips(self.flips[at], self.from_b[at], self.differs[at], self.atoms)
         place = range(len(self))[at]
         return next(self._of(slice(place, place + 1)))
 
@@ -139,9 +129,10 @@ class CrossFlips(Sequence[CrossFlip]):
         return self._of(slice(None))
 
     def _of(self, rows: slice) -> Iterator[CrossFlip]:
-        flips = self.flips.where(rows)
+        flips = self.flips[rows]
         i, j = np.divmod(flips.key, self.atoms)
-        columns = (flips.step, i, j, self.differs[rows], self.from_b[rows], *flips[2:])
+        columns = flips.step, i, j, self.differs[rows], self.from_b[rows]
+        columns += flips.entered, flips.margin, flips.bound
         for step, i, j, differs, from_b, entered, margin, bound in zip(
             *(column.tolist() for column in columns), strict=True
         ):
@@ -176,16 +167,16 @@ class CrossRecorder:
             rows: number of steps.
             a, b: the flips of either run among them.
         """
-        every = PairFlips.joined([a, b])
+        every = PairFlips.concatenate([a, b])
         from_b = np.repeat([False, True], [len(a.step), len(b.step)])
         order = np.lexsort((from_b, every.key, every.step))
-        every, from_b = every.where(order), from_b[order]
+        every, from_b = every[order], from_b[order]
         # both runs flipped the pair at one step: what differed still does, and what did not does not
         alike = (np.diff(every.step) == 0) & (np.diff(every.key) == 0)
         alone = np.ones(len(order), bool)
         alone[:-1] &= ~alike
         alone[1:] &= ~alike
-        every, from_b = every.where(alone), from_b[alone]
+        every, from_b = every[alone], from_b[alone]
         differs = np.isin(every.key, self.differing) ^ (_times_before(every.key) % 2 == 0)
         counts = len(self.differing) + np.cumsum(np.append(0, np.where(differs, 1, -1)))
         reached = np.searchsorted(every.step, np.arange(first, first + rows), side="right")

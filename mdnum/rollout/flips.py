@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
@@ -12,7 +12,7 @@ from mdnum.compiled import njit
 from mdnum.errors import MdnumError
 from mdnum.md.cell import HostCell, displacement, nearest_image
 from mdnum.md.decide import Changes, note
-from mdnum.md.ledger import FlipTable
+from mdnum.md.ledger import Columns, FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
 from mdnum.numerics import count_set
@@ -130,7 +130,8 @@ def _noted(before, bits, index, x, v) -> Changes:
         room = int(made[2][0])
 
 
-class AmbiguousPairs(NamedTuple):
+@dataclass(frozen=True)
+class AmbiguousPairs(Columns):
     """Pair decisions that another legitimate rounding could have made otherwise, a row each."""
 
     step: Int[np.ndarray, "rows"]  # of the decision
@@ -140,18 +141,6 @@ class AmbiguousPairs(NamedTuple):
     # margin, bound: of the decision, and on the rounding error of its quantity; |margin| <= bound
     margin: Float[np.ndarray, "rows"]
     bound: Float[np.ndarray, "rows"]
-
-    def where(self, chosen) -> AmbiguousPairs:
-        """Some of the rows: a mask, a slice or indices."""
-        return AmbiguousPairs(*(column[chosen] for column in self))
-
-    @classmethod
-    def joined(cls, parts: list[AmbiguousPairs]) -> AmbiguousPairs:
-        """The rows of several, one after the other."""
-        whole, real = np.zeros(0, np.int64), np.zeros(0)
-        parts = [cls(whole, whole, whole, real, real), *parts]
-        step, i, j, margin, bound = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        return cls(step, i, j, margin, bound)
 
 
 class PairRecorder:
@@ -214,7 +203,7 @@ class PairRecorder:
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
         """The pairs that `ambiguous` counts, in the order of their steps."""
-        parts: list[AmbiguousPairs] = []
+        parts = [AmbiguousPairs.none()]
         bounds, table = self.bounds(segment), segment.table
         # almost always no pair comes that close; where one does, the host looks again
         close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max(axis=1))
@@ -236,7 +225,7 @@ class PairRecorder:
             parts.append(
                 AmbiguousPairs(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
             )
-        return AmbiguousPairs.joined(parts)
+        return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).

@@ -95,8 +95,8 @@ class Track:
         self._recorder = PairRecorder(simulation) if flips else None
         self._listener = listener
         self._ahead: list[Rows] = []
-        self._flips: list[PairFlips] = []
-        self._doubts: list[AmbiguousPairs] = []
+        self._flips = [PairFlips.none()]
+        self._doubts = [AmbiguousPairs.none()]
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
         self.failed = ""
 
@@ -134,17 +134,17 @@ class Track:
                 rows, rest = rows.cut(last - rows.first + 1)
                 self._ahead.insert(0, rest)
             taken.append(rows)
-        every = PairFlips.joined(self._flips)
-        self._flips = [every.where(every.step > last)]
-        return (joined(taken) if taken else None), every.where(every.step <= last)
+        every = PairFlips.concatenate(self._flips)
+        self._flips = [every[every.step > last]]
+        return (joined(taken) if taken else None), every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
         """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
-        every = AmbiguousPairs.joined(self._doubts)
-        taken = every.where(every.step <= last)
-        self._doubts = [every.where(every.step > last)]
+        every = AmbiguousPairs.concatenate(self._doubts)
+        taken = every[every.step <= last]
+        self._doubts = [every[every.step > last]]
         i, j = np.divmod(self.frame.keys_of(taken.i, taken.j), self.simulation.atoms)
-        return taken._replace(i=i, j=j)
+        return replace(taken, i=i, j=j)
 
 
 def _flips_of(ledger: FlipTable, frame: ReferenceFrame) -> PairFlips:

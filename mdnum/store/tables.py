@@ -196,9 +196,8 @@ class TableStream:
         table = pa.Table.from_arrays(arrays, schema=pa.schema(fields))
         if self._in_parts:
             subfolder(self._root, "parts")
-            self._replace(
-                self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table], table.schema
-            )
+            part = self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet"
+            self._replace(part, [table], table.schema)
         else:
             if self._writing is None:
                 if self.flushed:
@@ -412,13 +411,9 @@ def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
     if isinstance(values, int):
         values = np.full(rows, values)
     if kind == _WORD:
-        every = isinstance(values, str)
-        words, codes = (
-            ([values], np.zeros(rows)) if every else np.unique(np.array(values, str), return_inverse=True)
-        )
-        return pa.DictionaryArray.from_arrays(
-            as_arrow(codes, kind.index_type), as_arrow(words, kind.value_type)
-        )
+        words, codes = np.unique(np.array(values, str), return_inverse=True)
+        codes = as_arrow(np.resize(codes, rows), kind.index_type)
+        return pa.DictionaryArray.from_arrays(codes, as_arrow(words, kind.value_type))
     values = np.asarray(values)
     if pa.types.is_string(kind):
         texts = [text.encode() for text in values.tolist()]

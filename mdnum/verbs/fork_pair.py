@@ -291,7 +291,7 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
         for head, vectors in (("", around.positions), ("d", around.moved)):
             tables["neighborhood"] |= {f"{head}{name}": vectors[:, k] for k, name in enumerate("xyz")}
     sure = certified(made)
-    doubts = {name: made.doubts[name]._asdict() for name in sure.horizon}
+    doubts = {name: vars(made.doubts[name]) for name in sure.horizon}
     summary: dict[str, Any] = {
         "decision": decision, "r_cut": made.twin.a.simulation.r_cut,
         "certified_horizon": {name: one.step for name, one in sure.horizon.items()} or None,
