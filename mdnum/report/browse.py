@@ -23,16 +23,16 @@ class Column:
 
     # name, unit: its heading
     name: str
-    values: Any  # a value for each row; a pair of them for a "pair"
+    of: Any  # a value for each row; a pair of them for a "pair"
     # how a value is written and searched. A "count" is whole, and searched as `name:10..20`; a "pair" is two
     # subjects joined by a dash; a "word" is one of `words`, which are searched for; a "ratio" is in rounding
     # bounds, ambiguous at 1 and below; "fixed" has so many decimals, "number" digits
     kind: Literal["count", "pair", "number", "fixed", "word", "text", "ratio"] = "number"
     unit: str = ""
     digits: int = 3
-    words: tuple[str, ...] = ()  # for "word": what values 0, 1, ... are called
-    aliases: tuple[str, ...] = ()  # for "word": what else may be typed for them
-    colors: tuple[str, ...] = ()  # for "word": class of the cell by value
+    words: Sequence[str] = ()  # for "word": what values 0, 1, ... are called
+    aliases: Sequence[str] = ()  # for "word": what else may be typed for them
+    colors: Sequence[str] = ()  # for "word": class of the cell by value
     subject: bool = False  # whether a bare number, or the column's name and a number, is looked for in it
 
     @property
@@ -44,8 +44,8 @@ class Column:
     def plain(self) -> list[list[Any]]:
         """Lists of plain values, None for what is not finite."""
         if self.kind == "pair":
-            return [np.asarray(values).astype(int).tolist() for values in self.values]
-        values = np.asarray(self.values)
+            return [np.asarray(values).astype(int).tolist() for values in self.of]
+        values = np.asarray(self.of)
         if self.kind in ("count", "word"):
             return [values.astype(int).tolist()]
         if self.kind == "text":
@@ -62,16 +62,10 @@ class Column:
         if value is None:
             return self.missing
         if self.kind == "word":
-            return self.words[value]
+            return str(self.words[value])
         if self.kind == "count":
             return count(value)
         return number(value, self.digits) if self.kind in ("number", "ratio") else str(value)
-
-
-def flipped(entered: Any) -> Column:
-    """The column that says which way decisions went."""
-    return Column("decision", entered, "word", words=("left", "entered"), aliases=("out", "in"),
-                  colors=("out", "in"))  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -21,25 +21,42 @@ Code decides (code, values); a text file beside the verb has the sentences, by c
     y_scale = "log"
     caption = "How many steps each list served."
 
-A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3 significant
-digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}` "2 pairs"
-(`{n:# life lives}` with an irregular plural,
-`{n:# pair_step}` with a space), `{n:? was were}` one word or the other.
+    [keys]                                                   # numbers above a page: value and note
+    "Lost pairs" = ["{lost}", "in {lists:# list}, {dangerous} dangerous"]
+    "Speed" = [["{speed}", "steps per second"], ["–", "too short a run to tell"]]
+
+    [browse.flips]                                           # columns of a `browse.Browse`
+    noun = "flips"
+    placeholder = "atom 17, step:100..200"
+    columns = [
+      { name = "step", of = "step", kind = "count" },
+      { name = "distance", of = "distance", unit = "{length}" },
+    ]
+
+Where a list has several texts, the first counts whose fields all have a value; without one the row is left
+out. A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3
+significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
+"2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` one
+word or the other.
 """
 
 from __future__ import annotations
 
 import string
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from mdnum.plain import plain
 from mdnum.report import words
-from mdnum.report.section import Plot, Series
+from mdnum.report.browse import Browse, Column
+from mdnum.report.section import Key, Plot, Series
 
 if TYPE_CHECKING:
     from mdnum.store import RunFolder
@@ -70,7 +87,7 @@ class _Fields(string.Formatter):
         if format_spec.startswith("#"):
             return words.many(value, *(word.replace("_", " ") for word in format_spec[1:].split()))
         if format_spec.startswith("?"):
-            one, several = format_spec[1:].split()
+            one, several = (word.replace("_", " ") for word in format_spec[1:].split())
             return one if value == 1 else several
         if format_spec == "%":
             return words.percent(value)
@@ -161,17 +178,60 @@ class Texts:
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
         """Names and texts of a table, their fields filled in; without those that show a value of None."""
+        rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
+        return [(name, text) for name, text in rows if name is not None and text is not None]
+
+    def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
+        """The numbers above a page, from a table of values and notes; without those that show None."""
         found = []
-        for name, text in self.entries[table].items():
-            fields = [field for _, field, _, _ in string.Formatter().parse(f"{name} {text}") if field]
-            if all(values[field] is not None for field in fields):
-                found.append((fill(name, values), fill(text, values)))
+        for label, texts in self.entries[table].items():
+            ways = [texts] if isinstance(texts[0], str) else texts
+            shown = (way for way in ways if all(_known(text, values) for text in (label, *way)))
+            found += [Key(*(fill(text, values) for text in (label, *way))) for way in islice(shown, 1)]
         return found
+
+    def browse(
+        self,
+        name: str,
+        rows: Mapping[str, Any],
+        choices: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        /,
+        **values: Any,
+    ) -> Browse:
+        """A table to be searched, its columns those of a name in the table [browse] that the rows have.
+
+        Args:
+            rows: equally long columns; a "pair" is of two of them.
+            choices: words of columns of words, by column, where the text file does not have them.
+            values: for fields in names and units of columns.
+        """
+        told, columns = self.entries["browse"][name], []
+        for column in told["columns"]:
+            of, look = column["of"], {"words": choices.get(column["name"], ()), **column}
+            if all(end in rows for end in ([of] if isinstance(of, str) else of)):
+                texts = {key: fill(look[key], values) for key in ("name", "unit") if key in look}
+                held = rows[of] if isinstance(of, str) else [rows[end] for end in of]
+                columns.append(Column(**{**look, **texts, "of": held}))
+        return Browse(told.get("name", name), told["noun"], told["placeholder"], columns)
 
 
 def _plain(value: Any) -> Any:
     # infinite numbers are written as such in a sentence
     return value if isinstance(value, float) else plain(value)
+
+
+def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
+    """The text, or the first of several, whose fields all have a value, with these filled in."""
+    several = [texts] if isinstance(texts, str) else texts
+    return next((fill(text, values) for text in several if _known(text, values)), None)
+
+
+def _known(text: str, values: Mapping[str, Any]) -> bool:
+    """Whether all fields of a text have a value; a part of what has none has none either."""
+    names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
+    with suppress(TypeError):
+        return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
+    return False
 
 
 def fill(text: str, values: Mapping[str, Any]) -> str:

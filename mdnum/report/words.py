@@ -15,8 +15,12 @@ def power(exponent: int) -> str:
     return "10" + str(exponent).translate(_RAISED)
 
 
-def number(value: float | None, digits: int = 3, signed: bool = False) -> str:
-    """A number with so many significant digits; a power of ten where it is far from 1; "–" for none."""
+def number(value: float | None, digits: int = 3, signed: bool = False, whole: bool = True) -> str:
+    """A number with so many significant digits; a power of ten where it is far from 1; "–" for none.
+
+    Args:
+        whole: whether numbers up to a million are written in full, with digits beyond the significant ones.
+    """
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -26,7 +30,7 @@ def number(value: float | None, digits: int = 3, signed: bool = False) -> str:
     sign = MINUS if value < 0 else "+" if signed else ""
     mantissa, exponent = f"{abs(value):.{digits - 1}e}".split("e")
     scale = int(exponent)
-    if -4 < scale < 6:
+    if -4 < scale < (6 if whole else min(6, digits)):
         # whole numbers are told in full: 123,456 rather than 123,000
         rounded = float(f"{mantissa}e{exponent}") if scale < digits else abs(value)
         return sign + f"{rounded:,.{max(0, digits - 1 - scale)}f}"

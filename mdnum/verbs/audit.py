@@ -8,7 +8,7 @@ values, and its sentences are in audit.toml.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, partial
@@ -25,8 +25,8 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Key, Page, Plot, Section, cell, curves, pairs, points_of, records
-from mdnum.report.words import count, heading, listed, many, number
+from mdnum.report.section import Code, Key, Page, Plot, Section, curves, pairs, points_of, records
+from mdnum.report.words import heading, listed, many
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
 from mdnum.store.files import read_text, remove, subfolder, write_text
@@ -536,7 +536,7 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
         parts = [_plot(result, place) for place in range(len(result.charts))]
         parts += [_marked(rows, title) for title, rows in result.tables.items() if rows]
         sections.append(Section(result.title, parts))
-    sections.append(Section("What was asked about", [pairs(list(_subject(summary, given)))]))
+    sections.append(Section("What was asked about", [pairs(_subject(summary, given))]))
     about = f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}"
     return view.page(f"Audit of {state.name}", about, _keys(summary, verdict, given), sections)
 
@@ -565,31 +565,24 @@ def _plot(result: CheckResult, place: int) -> Plot:
     )  # fmt: skip
 
 
-def _keys(summary: Mapping[str, Any], verdict: Verdict, given: units.Units) -> Iterator[Key]:
-    yield Key("To run", summary["safe_to_run"], "a simulation with it")
-    yield Key("To differentiate", summary["safe_to_differentiate"], "through it")
+def _keys(summary: Mapping[str, Any], verdict: Verdict, given: units.Units) -> list[Key]:
     severe = [one.severity for one in verdict.findings if not one.cause and one.severity != "info"]
-    yield Key("Findings", count(len(severe)), many(severe.count("error"), "error"))
-    numbers = {part["name"]: part["numbers"] for part in summary["parts"]}
-    if (dynamics := numbers.get("dynamics", {})).get("drift") is not None:
-        yield Key("Drift", number(dynamics["drift"], 2, signed=True), dynamics["drift_unit"])
-    if "largest_difference" in (forces := numbers.get("forces", {})):
-        unit = f"from differences, {given.energy}/{given.length}"
-        yield Key("Forces", number(forces["largest_difference"], 1), unit)
-    if "told_apart" in (ways := numbers.get("invariance", {})):
-        differ = f"{count(ways['told_apart'])} of {count(ways['ways'])}"
-        yield Key("Answers differ", differ, "ways to write it down")
+    parts = {part["name"]: part["numbers"] for part in summary["parts"]}
+    ways, forces = parts.get("invariance", {}), parts.get("forces", {})
+    return TEXTS.keys(**{
+        **summary, **vars(given), "severe": len(severe), "errors": severe.count("error"),
+        "dynamics": {"drift": None, **parts.get("dynamics", {})},
+        "ways": ways if "told_apart" in ways else None,
+        "forces": {"largest_difference": None, **forces},
+        "differences": f"{given.energy}/{given.length}" if "largest_difference" in forces else None,
+    })  # fmt: skip
 
 
-def _subject(summary: Mapping[str, Any], given: units.Units) -> Iterator[tuple[str, str]]:
+def _subject(summary: Mapping[str, Any], given: units.Units) -> list[tuple[str, str]]:
     axes = [axis for axis, yes in zip("abc", summary["periodic"], strict=True) if yes]
     periodic = f"periodic along {', '.join(axes)}" if axes else "not periodic"
-    yield "Calculator", summary["calculator"]
-    yield "Structure", f"{summary['formula']}, {count(summary['atoms'])} atoms, {periodic}"
-    if summary.get("structure"):
-        yield "Origin", summary["structure"]
-    yield "kT", f"{number(summary['kT'], 4)} {given.energy}"
-    yield "Took", f"{cell(summary['seconds'])} s"
+    origin = summary.get("structure") or None
+    return TEXTS.rows("subject", **{**summary, **vars(given), "periodic": periodic, "structure": origin})
 
 
 VERBS = {"audit": Verb(_judge, _page, AuditView)}

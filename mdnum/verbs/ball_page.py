@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from mdnum.report.analysis import margins_in_bounds, range_table
-from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
-from mdnum.report.words import count, number
+from mdnum.report.section import Figure, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
+from mdnum.report.words import number
 from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("ball.toml"))
@@ -89,26 +88,14 @@ def page(view: BallView, verdict: Verdict) -> Page:
         Section("Contacts", list(_contacts(view))),
         Section("Stop decisions", list(_stop_decisions(view))),
     ]
-    return view.page(view.name, about, _keys(view), sections)
-
-
-def _keys(view: BallView) -> Iterator[Key]:
-    summary, first = view.summary, view.summary["first_contact"]
-    when = "none begins" if first is None else f"first at step {count(first)}"
-    when = when if summary["flips_entered"] or first is None else "in contact at the start"
-    yield Key("Contacts", count(summary["flips_entered"]), when)
-    total = count(summary["iterations_total"])
-    if view.located:
-        yield Key("Impacts", total, "located inside steps")
-    else:
-        most = f"{count(summary['iterations_max'])} at most in a step"
-        yield Key("Iterations", total, most if view.ended else "nothing is solved")
-    yield Key("Ambiguous", count(summary["ambiguous"]), "decisions within rounding")
-    yield Key("Loss", number(summary["loss"], 6), summary["loss_kind"])
-    error = (summary["exact"] or {}).get("height_error_largest")
-    yield Key("Off closed form", number(error, 2), "there is none" if error is None else "m, at most")
-    if summary["steps_per_second"] is not None:
-        yield Key("Speed", number(summary["steps_per_second"]), "steps per second")
+    first, total = summary["first_contact"], summary["iterations_total"]
+    keys = TEXTS.keys(**{
+        **summary, "impacts": total if view.located else None, "iterations": None if view.located else total,
+        "begun": first if summary["flips_entered"] else None, "held": "" if first is not None else None,
+        "most": summary["iterations_max"] if view.ended else None,
+        "error": view.exact.get("height_error_largest"),
+    })  # fmt: skip
+    return view.page(view.name, about, keys, sections)
 
 
 def _groups(
@@ -260,25 +247,16 @@ def _dots(view: BallView, figure: Any) -> None:
 
 
 def _exact(view: BallView) -> Iterator[Any]:
-    exact = view.summary["exact"]
+    exact = view.exact
     if not exact:
         return
-    labels = {
-        "balls": "balls compared", "height_error": "height off at the end (m)",
-        "height_error_largest": "height off at most (m)",
-        "height_error_before_contact": "height off before the first contact (m)",
-        "first_contact_time": "first contact (s)", "first_contact_step": "first contact of the run, step",
-        "rest_time": "comes to rest (s)",
-    }  # fmt: skip
-    motion = ("motion", TEXTS(f"motion_{exact['model']}"))
-    rows = [(label, number(exact[key], 6) if isinstance(exact[key], float) else exact[key])
-            for key, label in labels.items() if key in exact]  # fmt: skip
+    rows = TEXTS.rows("exact", **{"rest_time": None, **exact, "motion": TEXTS(f"motion_{exact['model']}")})
     off = [
         (f"dloss/d{name} off by {method}", number(error, 2, signed=True))
         for method, errors in (exact.get("gradient_error") or {}).items()
         for name, error in errors.items()
     ]
-    yield pairs([motion, *rows, *off])
+    yield pairs([*rows, *off])
 
 
 def _variants(view: BallView) -> Iterator[Any]:
@@ -323,16 +301,7 @@ def _contacts(view: BallView) -> Iterator[Any]:
     chosen = np.sort(np.argsort(ratio, kind="stable")[:TABLE_ROWS])
     yield TEXTS("contacts", shown=len(chosen), rows=len(ratio))
     near = {name: values[chosen] for name, values in rows.items()}
-    columns = (
-        Column("step", near["step"], "count"),
-        Column("ball", near["ball"], "count", subject=True),
-        flipped(near["entered"]),
-        Column("height", near["height"], unit="m"),
-        Column("margin", near["margin"], unit="m"),
-        Column("velocity", near["velocity"], unit="m/s"),
-        Column("margin", ratio[chosen], "ratio", "÷ bound", digits=2),
-    )
-    yield Browse("contacts", "contacts", "ball 3, step:100..200, entered", columns)
+    yield TEXTS.browse("contacts", near | {"ratio": ratio[chosen]})
 
 
 def _stop_decisions(view: BallView) -> Iterator[Any]:
@@ -342,15 +311,8 @@ def _stop_decisions(view: BallView) -> Iterator[Any]:
         return
     chosen = np.sort(np.argsort(np.abs(rows["margin"].astype(float)), kind="stable")[:TABLE_ROWS])
     near = {name: values[chosen] for name, values in rows.items()}
-    codes = [_REASONS.index(word) for word in near["reason"].astype(str).tolist()]
-    columns = [
-        Column("step", near["step"], "count"),
-        *[Column("ball", near["ball"], "count")] * bool(np.any(rows["ball"] >= 0)),
-        Column("iteration", near["iteration"], "count"),
-        Column("residual", near["residual"], digits=4),
-        Column("margin", near["margin"], unit="tolerance − residual"),
-        Column("decision", near["stopped"], "word", words=("continued", "stopped"), colors=("out", "in")),
-        Column("ended by", codes, "word", words=_REASONS),
-    ]
+    near["code"] = np.array([_REASONS.index(word) for word in near["reason"].astype(str).tolist()])
+    if not np.any(rows["ball"] >= 0):
+        del near["ball"]
     yield TEXTS("stops", shown=len(chosen), rows=len(rows["step"]))
-    yield Browse("stops", "stop decisions", "step:100..200, iteration:5.., stopped, cap", columns)
+    yield TEXTS.browse("stops", near, {"ended by": _REASONS})

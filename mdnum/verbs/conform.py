@@ -20,8 +20,8 @@ from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, Ca
 from mdnum.references.conformance.lists import LIMITS, PairList
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs, table_of
-from mdnum.report.words import count, listed, many, number
+from mdnum.report.section import Code, Figure, Page, Section, Table, pairs, table_of
+from mdnum.report.words import count, listed
 from mdnum.store import COLUMNS, RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
 from mdnum.verbs import frame
@@ -430,29 +430,17 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
 def page(view: View, verdict: Verdict) -> Page:
     """Everything else that is shown."""
     summary = view.summary
-    skipped, silent = _total(summary, "skipped"), summary["silent"]
-    kinds, wrong = many(len(summary["failures"]), "kind"), summary["wrong"] - silent
-    keys = [
-        Key("Right", count(_total(summary, "passed")), f"of {many(summary['asked'], 'case')}"),
-        Key("Wrong", count(wrong), f"{kinds}, shrunk" if wrong else ""),
-        Key("No answer", count(silent), "ends the process, takes too long or raises"),
-        Key("Not asked", count(skipped), "outside of what it claims"),
-    ]
-    if summary["large"]:
-        seconds = f"{number(summary['large']['seconds'], 2)} s"
-        keys.append(Key("Largest", f"{count(summary['large']['atoms'])} atoms", seconds))
+    wrong, kinds = summary["wrong"] - summary["silent"], len(summary["failures"])
+    totals = {name: _total(summary, name) for name in ("passed", "skipped")}
+    values = {**summary, **totals, "wrong": wrong, "kinds": kinds if wrong else None}
     package = f"{summary['package'] or ''} {summary['version'] or ''}".strip()
-    what = [
-        ("List", summary["about"] or summary["system"]),
-        *([("Package", package)] if package else []),
-        ("Kind", "allocated once and updated" if summary["kept"] else "made anew at every question"),
-        ("Random cases", f"drawn by hypothesis, seed {summary['seed']}"),
-        ("Oracle", TEXTS("oracle")),
-        ("Time", f"{number(summary['seconds'], 3)} s"),
-    ]
+    what = TEXTS.rows("what", **{
+        **summary, "list": summary["about"] or summary["system"], "package": package or None,
+        "oracle": TEXTS("oracle"),
+    })  # fmt: skip
     sections = [
         Section("Cases by what they are about", [_figure(summary), *_tables(summary)], terminal=True),
-        Section("Conventions", [TEXTS("conventions"), pairs(list(_conventions(summary)))]),
+        Section("Conventions", [TEXTS("conventions"), pairs(_conventions(summary))]),
         Section("What was run", [pairs(what)]),
     ]
     if summary["failures"]:
@@ -468,6 +456,7 @@ def page(view: View, verdict: Verdict) -> Page:
         parts = [TEXTS("brought_down"), table, *map(Code, titles, scripts)]
         sections.insert(1, Section("Failures, reproduced", parts, terminal=True))
     about = ", ".join(filter(None, [summary["about"] or "A neighbor list", package]))
+    keys = TEXTS.keys(**values)
     return view.page(f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections)
 
 
@@ -514,24 +503,17 @@ def _figure(summary: Mapping[str, Any]) -> Figure:
     return Figure("areas", TEXTS("figure"), TEXTS("figure_alt", areas=alt), draw, 0.9 + 0.27 * len(rows))
 
 
-def _conventions(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _conventions(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What kind of list it is."""
     more = "pairs of its skin" if summary["kept"] else "pairs beyond the cutoff"
-    both = "every pair from both of its atoms" if summary["full"] else "every pair once"
-    yield "Lists", f"{both}, with {more}" if summary["superset"] else both
-    atom = "added to atom j" if summary["shift_sign"] > 0 else "added to atom i"
-    yield "Shifts", atom if summary["shifts"] else "none given: images are counted, and not told apart"
-    yield "Decides in", summary["precision"]
-    counted, not_counted = summary["ties"]["counted"], summary["ties"]["not_counted"]
-    if counted and not_counted:
-        yield "At exactly the cutoff", f"{count(counted)} pairs count, {count(not_counted)} do not"
-    elif counted or not_counted:
-        inside = "counts as inside (r ≤ r_cut)" if counted else "does not count (r < r_cut)"
-        yield "At exactly the cutoff", inside
-    if summary["keeps_order"] is not None:
-        yield "Asked again", "same rows, same order" if summary["keeps_order"] else "other order of rows"
-    if summary["found_out"]:
-        yield "Found out by asking", listed(summary["found_out"])
+    ties = {name: pairs_of or None for name, pairs_of in summary["ties"].items()}
+    inside = "counts as inside (r ≤ r_cut)" if ties["counted"] else "does not count (r < r_cut)"
+    return TEXTS.rows("kind_of_list", **{
+        **summary, **ties, "more": more if summary["superset"] else None,
+        "at_cutoff": inside if any(ties.values()) else None,
+        "atom": ("j" if summary["shift_sign"] > 0 else "i") if summary["shifts"] else None,
+        "found_out": listed(summary["found_out"]) if summary["found_out"] else None,
+    })  # fmt: skip
 
 
 VERBS = {"conform": Verb(judge, page)}

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs, table_of
+from mdnum.report.section import Page, Plot, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
@@ -357,32 +356,18 @@ def page(view: ComparisonView, verdict: Verdict) -> Page:
         Section("Separation", list(_separation(view, table))),
         Section("Pairs that differ", list(_differing(view, table))),
         Section("What two trajectories do not show", [TEXTS(f"cannot_{one}") for one in cannot]),
-        Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]),
+        Section("What was read", [pairs(_input(view, size)), TEXTS("files")]),
     ]
-    return view.page(f"{view.name} and {summary['other']}", f"{size} compared", _keys(view), sections)
-
-
-def _keys(view: ComparisonView) -> Iterator[Key]:
-    summary, one = view.summary, view.summary["rules"][0]
-
-    def first_frame(at: int | None) -> str:
-        return "never" if at is None else count(at)
-
-    first, seed = one["first"], summary["seed"]
-    at_all = "the same bit for bit" if seed is None else f"at all from {view.frame(seed)} on"
-    yield Key("Positions differ", first_frame(summary["beyond"]), f"first frame, beyond resolution; {at_all}")
-    yield Key(
-        "Sets differ",
-        first_frame(None if first is None else first["frame"]),
-        f"first frame ({view.rule(one)})",
-    )
+    one, shift = summary["rules"][0], None if summary["shift"] is None else view.shift
+    first, seed, end = one["first"], summary["seed"], view.length(summary["last"]["furthest"])
     if first is not None:
-        yield Key("Sets differ for certain", first_frame(one["certain"]), "first frame, beyond resolution")
-        yield Key("Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution")
-        yield Key("Separation then", view.length(first["furthest"]), "furthest atom")
-    yield Key("Separation at the end", view.length(summary["last"]["furthest"]), "furthest atom")
-    if summary["shift"] is not None:
-        yield Key("Common shift", view.shift["size"], f"of all atoms at {view.shift['first']}, taken off")
+        certain = "never" if one["certain"] is None else one["certain"]
+        first = {**first, "certain": certain, "length": view.length(first["furthest"])}
+    keys = TEXTS.keys(
+        beyond=summary["beyond"], seed=None if seed is None else view.frame(seed), first=first,
+        rule=view.rule(one), end=end, shift=shift,
+    )  # fmt: skip
+    return view.page(f"{view.name} and {summary['other']}", f"{size} compared", keys, sections)
 
 
 def _rules(view: ComparisonView) -> Table:
@@ -440,31 +425,15 @@ def _differing(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterato
     rows = view.table("differing")
     if not len(rows["i"]):
         return
-    rules, unit = tuple(view.rule(one) for one in view.summary["rules"]), view.unit
-    yield TEXTS("browse")
-    columns = [
-        Column("frame", rows["frame"], "count"),
-        Column("pair", (rows["i"], rows["j"]), "pair"),
-        Column("inside in", rows["inside"] == "B", "word", words=("A only", "B only")),
-        Column("r in A", rows["distance_a"], unit=unit, digits=5),
-        Column("r in B", rows["distance_b"], unit=unit, digits=5),
-        Column("margin in A", rows["margin_a"], unit=unit),
-        Column("margin in B", rows["margin_b"], unit=unit),
-        Column("decided", rows["ambiguous"], "word", words=("yes", "no"), aliases=("", "undecidable")),
-        *[Column("rule", rows["rule"], "word", words=rules)] * (len(rules) > 1),
-    ]
-    yield Browse("pairs", "pairs", "3-17, atom 5, frame:100..200, undecidable", columns)
+    rules = [view.rule(one) for one in view.summary["rules"]]
+    yield TEXTS("browse_pairs")
+    shown = {name: values for name, values in rows.items() if name != "rule" or len(rules) > 1}
+    yield TEXTS.browse("pairs", shown | {"in_b": rows["inside"] == "B"}, {"rule": rules}, unit=view.unit)
 
 
-def _input(view: ComparisonView, size: str) -> Iterator[tuple[str, str]]:
-    summary, unit = view.summary, view.unit
-    for side, prefix in (("A", ""), ("B", "other_")):
-        file, format, kept = (summary[f"{prefix}{name}"] for name in ("file", "format", "resolution"))
-        yield side, f"{file} ({format}); {resolution(kept, unit)}"
-    yield "Size", size
-    if summary["between"]:
-        yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
-    yield "Took", f"{number(summary['seconds'], 2)} s"
+def _input(view: ComparisonView, size: str) -> list[tuple[str, str]]:
+    kept = {name: resolution(view.summary[name], view.unit) for name in ("resolution", "other_resolution")}
+    return TEXTS.rows("input", **{**view.summary, **kept, "size": size, "between": view.between})
 
 
 VERBS = {"flips-compare": Verb(judge, page, ComparisonView)}

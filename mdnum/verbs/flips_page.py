@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column
+from mdnum.report.browse import Browse
 from mdnum.report.finding import Finding, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Section, Series, Table, curves, pairs, table_of
+from mdnum.report.section import Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
@@ -238,30 +238,26 @@ def page(view: FlipsView, verdict: Verdict) -> Page:
         sections += _rule_sections(view, place, one)
     if (browsed := _busiest(view)) is not None:
         sections.append(Section("The busiest pairs", [browsed]))
-    sections.append(Section("What was read", [pairs(list(_input(view, size))), TEXTS("files")]))
+    sections.append(Section("What was read", [pairs(_input(view, size)), TEXTS("files")]))
     about = f"{size}; {summary['format']}, read by {summary['reader']}"
-    return view.page(f"{view.name}: neighbor-set flips", about, _keys(view, summary["rules"][0]), sections)
+    one = summary["rules"][0]
+    keys = TEXTS.keys(**{
+        **one, "inside": average(one["pairs_mean"]), "rule": view.rule(one), "median": view.life(one),
+        "share": one["ambiguous"] / one["flips"] if one["flips"] else None,
+        "rate": view.rate(one["flips_per_frame"]), "mean": view.life(one, "mean_by_rate"),
+    })  # fmt: skip
+    return view.page(f"{view.name}: neighbor-set flips", about, keys, sections)
 
 
-def _keys(view: FlipsView, one: Rule) -> Iterator[Key]:
-    yield Key("Pairs inside", average(one["pairs_mean"]), f"on average, {view.rule(one)}")
-    yield Key("Flips", count(one["flips"]), view.rate(one["flips_per_frame"]))
-    share = percent(one["ambiguous"] / one["flips"]) if one["flips"] else ""
-    yield Key("Undecidable", count(one["ambiguous"]), share)
-    yield Key("Median contact", view.life(one), "of those seen to begin")
-    yield Key("Mean by rate", view.life(one, "mean_by_rate"), "all of them")
-
-
-def _input(view: FlipsView, size: str) -> Iterator[tuple[str, str]]:
+def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
     summary = view.summary
-    frames = f", frames {summary['slice']}" if summary["slice"] else ""
-    yield "File", f"{summary['file']}{frames} ({summary['format']}, read by {summary['reader']})"
-    yield "Size", size
-    yield "Box", view.box(summary["box"]) + (", at the first frame" if summary["frames"] > 1 else "")
-    if summary["between"]:
-        yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
-    yield "Resolution", resolution(summary["resolution"], view.unit)
-    yield "Took", f"{number(sum(summary['seconds'].values()), 2)} s"
+    values = {
+        "frames": summary["slice"] or None, "box": view.box(summary["box"]), "size": size,
+        "first": None if summary["frames"] < 2 else "the first frame", "between": view.between,
+        "resolution": resolution(summary["resolution"], view.unit),
+        "seconds": sum(summary["seconds"].values()),
+    }  # fmt: skip
+    return TEXTS.rows("input", **{**summary, **values})
 
 
 def _rules(view: FlipsView) -> Table:
@@ -358,19 +354,10 @@ def _busiest(view: FlipsView) -> Browse | None:
         return None
     words = np.array([f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)], object)
     ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
-    names = tuple(one["rule"] for one in rules)
-    share = table["inside"] / view.summary["frames"]
-    columns = [
-        Column("", ranks, "count"),
-        *[Column("rule", table["rule"], "word", words=names)] * (len(rules) > 1),
-        Column("pair", (table["i"], table["j"]), "pair"),
-        *[Column("image", table["rank"], "count")] * bool(table["rank"].any()),
-        Column("of", words, "text"),
-        Column("flips", table["flips"], "count"),
-        Column("frames inside", table["inside"], "count"),
-        Column("share of frames", share),
-    ]
-    return Browse("pairs", "pairs", "3-17, atom 5", columns)
+    rows = {**table, "place": ranks, "of": words, "share": table["inside"] / view.summary["frames"]}
+    left = ["rule"] * (len(rules) < 2) + ["rank"] * (not table["rank"].any())
+    shown = {name: values for name, values in rows.items() if name not in left}
+    return TEXTS.browse("busiest", shown, {"rule": [one["rule"] for one in rules]})
 
 
 # ---- figures

@@ -124,6 +124,11 @@ class FlipsView(View):
         """The unit of length."""
         return self.summary["length"]
 
+    @property
+    def between(self) -> str | None:
+        """The two selections between which pairs were examined; None for all pairs."""
+        return " and ".join(f"“{one}”" for one in self.summary["between"] or ()) or None
+
     def time(self, text: str) -> str:
         """A number with the unit of time; steps are counted, units are not."""
         unit = self.summary["time"]

@@ -18,8 +18,8 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
-from mdnum.report.section import Figure, Key, Page, Section, Table, pairs, table_of
-from mdnum.report.words import count, many, number
+from mdnum.report.section import Figure, Page, Section, Table, pairs, table_of
+from mdnum.report.words import count
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
@@ -257,24 +257,20 @@ def fork_benign(
 # -- pages ---------------------------------------------------------------------------------------------
 
 
-def _page(view: View, what: str, about: str, keys: list[Key], sections: list[Section]) -> Page:
-    rows = [*size(view), view.took]
+def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: list[Section]) -> Page:
+    rows, kind = [*size(view), view.took], view.folder.world
     sections = [*sections, Section("What was run", [pairs(rows)])]
-    return view.page(f"{view.name}: {what}", about, keys, sections)
+    keyed = TEXTS.keys(f"keys_{kind}", **{**view.summary, **keys})
+    return view.page(f"{view.name}: {what}", about, keyed, sections)
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
     """The page of all choices side by side."""
     s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
-    held = [row for row in rows if row["must_hold"]]
-    kept = sum(row["first_bit"] is None for row in held)
-    keys = [
-        Key("Choices", count(len(rows)), f"{count(len(left))} more do not apply"),
-        Key("Fork", count(sum(row["fork"] is not None for row in rows)), f"in {many(s['steps'], 'step')}"),
-        Key("Split", count(sum(row["split"] is not None for row in rows)), "beyond the tolerance"),
-        Key("No bit differs", count(sum(row["first_bit"] is None for row in rows)), "the same trajectory"),
-        Key("Must hold", f"{count(kept)} of {count(len(held))}", "held bit for bit"),
-    ]
+    same = [row["first_bit"] is None for row in rows]
+    held = [whole for whole, row in zip(same, rows, strict=True) if row["must_hold"]]
+    dates = {name: sum(row[name] is not None for row in rows) for name in ("fork", "split")}
+    counts = {"choices": len(rows), "left": len(left), "same": sum(same), "kept": sum(held), "of": len(held)}
 
     def holds(row: Mapping[str, Any]) -> str:
         return "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken"
@@ -289,7 +285,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
         lambda canvas: _ranking(rows, s["steps"], canvas), 0.9 + 0.24 * len(rows),
     )  # fmt: skip
     others = table_of(left, {"choice": "choice", "reason": "reason"}, shown=100)
-    return _page(view, "all choices", TEXTS("screen_about"), keys, [
+    return _page(view, "all choices", TEXTS("screen_about"), {**dates, **counts}, [
         Section(RANKING, [TEXTS("ranking"), table, figure], terminal=True),
         Section("Choices that do not apply", [others] * bool(left), terminal=True),
     ])  # fmt: skip
@@ -322,13 +318,6 @@ def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
 def page_compare(view: View, verdict: Verdict) -> Page:
     """The page of two finished runs."""
     s = view.summary
-    keys = [
-        Key(label, "–" if s[name] is None else f"step {count(s[name])}", f"{what}, of {count(s['steps'])}")
-        for name, label, what in (
-            ("first_bit", "First bit", "a stored number differs"),
-            ("fork", "Fork", "a stored decision differs"),
-        )
-    ]
     different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
     decisions = table_of(s["decisions"], {
         "only in": "run", s["channel"] if s["channel"] == "pair" else "ball":
@@ -336,7 +325,7 @@ def page_compare(view: View, verdict: Verdict) -> Page:
         "enters": "entered", "margin": "margin", "bound": "bound", "ambiguous": "ambiguous",
     })  # fmt: skip
     iterations = Table(("in A", "in B"), [s["iterations"]])
-    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", keys, [
+    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", {}, [
         Section("What was different", [different], terminal=True),
         Section("Decisions at the fork", [decisions] * bool(s["decisions"]), terminal=True),
         Section("Iterations at the fork", [iterations] * bool(s["iterations"]), terminal=True),
@@ -346,16 +335,10 @@ def page_compare(view: View, verdict: Verdict) -> Page:
 def page_benign(view: View, verdict: Verdict) -> Page:
     """The page of an ensemble-consistency test."""
     s = view.summary
-    failed, of = s["false_positives"]
-    keys = [
-        Key("Step", count(s["window"]), "of the comparison"),
-        Key("Components", count(s["components"]), f"limit {number(s['limit'], 3)} standard deviations"),
-        Key("Fails on A itself", f"{count(failed)} of {count(of)}", "verdicts on runs that were held out"),
-    ]
     failing = Table(("feature", "standard deviations"), list(s["failing"].items()))
     names = tuple(f"component {k + 1}" for k in range(s["components"]))
     scores = Table(("run", *names), [(k + 1, *row) for k, row in enumerate(s["scores"])])
-    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), keys, [
+    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), {}, [
         Section("What tells B from A", [failing] * bool(s["failing"]), terminal=True),
         Section("Components", [TEXTS("components"), scores]),
     ])  # fmt: skip

@@ -11,8 +11,8 @@ import numpy as np
 from mdnum.plain import plain
 from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Figure, Key, Page, Section, Series, curves, pairs, table_of
-from mdnum.report.words import count, many, number
+from mdnum.report.section import Figure, Page, Section, Series, curves, pairs, table_of
+from mdnum.report.words import count
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import basics, last_step, of_md
@@ -193,18 +193,8 @@ def page_certify(view: View, verdict: Verdict) -> Page:
     rows, ambiguous, steps = s["policies"], s.get("ambiguous") or {}, s["steps"]
     roles = [role for role in ("state", "force", "arithmetic", "decision", "accumulate") if role in rows[0]]
     kept = sum(row["horizon"] is None and row["reason_unavailable"] is None for row in rows)
-    keys = [
-        Key("Keep to it", f"{count(kept)} of {count(len(rows))}", f"for {many(steps, 'step')}"),
-        Key("One more bit", number(s["steps_per_bit"]), "steps gained, by the growth seen"),
-    ]
-    if not ball:
-        closest = f"{unit}², in the exact run, step {count(s['smallest_margin_step'])}"
-        keys += [
-            Key("Closest decision", number(s["smallest_margin"], 2), closest),
-            Key("Exact flips", count(s["flips"]), "in time, all proven"),
-            Key("Carried", f"{count(s['bits'])} bits", f"{count(s['restarts'])} restarts with more"),
-            Key("Exact step", f"{number(s['ms_per_step'], 2)} ms", f"{number(s['seconds'], 2)} s in all"),
-        ]
+    of_a_run = dict.fromkeys(("smallest_margin", "flips", "bits", "ms_per_step"))
+    keys = TEXTS.keys("keys_certify", **{**of_a_run, **s, "kept": kept, "of": len(rows), "unit": unit})
 
     def leaves(row: Mapping[str, Any]) -> str:
         if row["reason_unavailable"]:
@@ -358,15 +348,11 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     s, length = view.summary, view.units.length
     ran = [row for row in s["variants"] if not row["failed"]]
     seeds = [row["first_bit"] for row in ran if row["first_bit"] is not None]
-    failed, furthest = len(s["failed_variants"]), max(row["separation"] for row in ran)
-    keys = [
-        Key("Programs", count(len(ran)), f"{count(failed)} more did not run" if failed else "all ran"),
-        Key("Trajectories", count(len(s["clusters"])), "that differ in a bit"),
-        Key("With the reference", count(len(s["clusters"][0])), f"{s['reference']} included"),
-        Key("First bit", f"step {count(min(seeds))}" if seeds else "–",
-            "differs" if seeds else "none differs"),
-        Key("Separation", number(furthest), f"{length}, at the last step at most"),
-    ]  # fmt: skip
+    keys = TEXTS.keys(
+        "keys_processes", ran=len(ran), failed=len(s["failed_variants"]) or None, clusters=len(s["clusters"]),
+        alike=len(s["clusters"][0]), reference=s["reference"], first_bit=min(seeds, default=None),
+        furthest=max(row["separation"] for row in ran), length=length,
+    )  # fmt: skip
 
     def program(row: Mapping[str, Any]) -> str:
         sums = f"; force sums {row['reduction']}" * bool(row["reduction"])

@@ -11,8 +11,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
-from mdnum.report.words import count, many, number
+from mdnum.report.section import Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_md
@@ -197,18 +196,8 @@ def _map_evidence(s: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[s
 def page_map(view: View, verdict: Verdict) -> Page:
     """The page of a map."""
     s, unit, length = view.summary, view.summary["key_unit"], view.units.length
-    edges, sure, left = s["boundaries"], s["confirmed"], s["unresolved"]
-    keys = [
-        Key("Boundaries", count(len(edges)),
-            f"{count(len(left))} more not searched" if left else "to adjacent floats"),
-        Key("Histories", count(s["histories"]), "distinct, of all decisions"),
-        Key("Largest jump", number(s["jump_largest"]), f"{s['loss_unit']}, of the {s['loss']}"),
-        Key("Final states", number(s["separation_largest"]),
-            f"{length}, separation across a boundary at most"),
-        Key("Confirmed", "–" if sure is None else f"{count(sure)} of {count(len(edges))}",
-            "in a fresh process"),
-        Key("Runs", count(s["evaluations"]), f"{number(s['seconds'], 2)} s in all"),
-    ]  # fmt: skip
+    edges, left = s["boundaries"], s["unresolved"]
+    keys = TEXTS.keys("keys_map", **{**s, "n": len(edges), "left": len(left) or None, "length": length})
     at = [edge["above"] for edge in edges]
     numbered = len(at) > 1 and bool(np.diff(at).min() < _ROOM * (s["high"] - s["low"]))
     figures = list(_map_figures(view, numbered))
@@ -376,15 +365,8 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
     """The page of a forecast."""
     s, length, until = view.summary, view.units.length, view.summary["until"]
     first, near = (next(iter(s[name]), None) for name in ("first", "nearest"))
-    examined = many(s["examined"], "decision")
-    keys = [
-        Key("Displacement", number(s["size"], 2), f"{length}, of the furthest atom"),
-        Key("First flip", f"step {count(first['step'])}" if first else "–", "expected"),
-        Key("Nearest decision", number(near and abs(near["amplitude"]), 2), f"{length} flip it"),
-        Key("In ulps", number(near and near["ulps"], 2), "of the largest start coordinate"),
-        Key("Good until", f"step {count(until)}" if until >= 0 else "–",
-            f"of {count(s['steps'])}; {examined} of listed pairs examined"),
-    ]  # fmt: skip
+    values = {"first": first, "near": near, "needed": near and abs(near["amplitude"]), "length": length}
+    keys = TEXTS.keys("keys_forecast", **{**s, **values, "until": until if until >= 0 else None})
     columns = {
         "step": "step", "pair": lambda one: f"{one['i']}–{one['j']}", f"displacement ({length})": "amplitude",
         "ulps of the start": "ulps", "margin": "margin",

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.patches import Circle
 
-from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Verdict
 from mdnum.report.section import (
     Figure,
-    Key,
     Page,
     Plot,
     Role,
@@ -47,7 +45,7 @@ _ARROW = 0.5
 def page(view: View, verdict: Verdict) -> Page:
     """The page of a pair of runs."""
     s = view.summary
-    return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), _keys(view), [
+    return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), TEXTS.keys(**_numbers(view)), [
         Section("Separation", list(_separation(view))),
         Section(DECISION, [*_decision(view), *_around(view)], terminal=True),
         Section(TWO_BY_TWO, list(_two_by_two(view)), terminal=True),
@@ -61,30 +59,20 @@ def page(view: View, verdict: Verdict) -> Page:
     ])  # fmt: skip
 
 
-def _keys(view: View) -> Iterator[Key]:
-    s, time = view.summary, view.units.time
-    for name, label, what in (
-        ("first_bit", "First bit", "bits differ"),
-        ("fork", "Fork", "a decision differs"),
-        ("split", "Split", "beyond the tolerance"),
-    ):
-        at = s[name]
-        none = f"none in {many(s['steps'], 'step')}"
-        note = none if at is None else f"{what}, {plain(s[f'{name}_time'], 6)} {time}"
-        yield Key(label, "–" if at is None else f"step {count(at)}", note)
-    fits = s["r_squared"]
-    guess = "" if s["predicted_split"] is None else f"; split expected at step {count(s['predicted_split'])}"
-    poor = ", but no single exponential" if fits is not None and fits < FITS else guess
-    yield Key("Growth rate", number(s["growth_rate_time"]), f"per {time}{poor}")
+def _numbers(view: View) -> dict[str, Any]:
+    """What stands above the page."""
+    s, fits = view.summary, view.summary["r_squared"]
     worth = number(s["e_foldings"])
     if s["e_foldings"] is None and s["effect"] == "cause":
         # no split in sight: the share is at least what was followed
         shares = (one for one in s["shares"] if one["what"] == "decisions" and one["reference"] == "A")
         least = next(shares, {}).get("e_foldings")
         worth = f"> {number(least)}" if least else "∞"
-    yield Key("The flips were worth", worth, "e-foldings: growth rate × steps gained")
-    stops = f", {count(s['cross_stops'])} of them numbers of {s['counted']}" if "cross_stops" in s else ""
-    yield Key("Decisions that differ", count(s["cross_flips"]), f"made in one run only{stops}")
+    return {
+        "cross_stops": None, "counted": None, **s, "unit": view.units.time, "worth": worth,
+        "poor": "" if fits is not None and fits < FITS else None,
+        **{name: s[name] and plain(s[name], 6) for name in ("first_bit_time", "fork_time", "split_time")},
+    }  # fmt: skip
 
 
 def _dates(s: Mapping[str, Any], *names: str) -> tuple[tuple[float, str], ...]:
@@ -390,25 +378,11 @@ def _flips(view: View) -> Iterator[Any]:
     table = view.folder.read("cross_flips", rows=TABLE_ROWS)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(table["margin"] / table["bound"])
-    run = Column("run", table["run"].astype(str) == "B", "word", words=("A", "B"))
-    shown = (
-        Column("ball", table["i"], "count", subject=True), run,
-        Column("decision", table["channel"].astype(str) == "stop", "word", words=("contact", "stop")),
-        Column("in A", table["a"], "count"), Column("in B", table["b"], "count"),
-    ) if ball else (
-        Column("pair", (table["i"], table["j"]), "pair"), run, flipped(table["entered"]),
-        Column("the runs now", table["differs"], "word", words=("agree", "differ")),
-    )  # fmt: skip
-    rows = len(table["step"])
-    yield TEXTS("flips_ball" if ball else "flips_md", shown=rows, total=total, counted=s.get("counted"))
-    yield Browse(
-        "flips", "decisions",
-        f"step:100..200, ambiguous, {'ball 3, contact' if ball else '3-17, atom 5, B'}",
-        (
-            Column("step", table["step"], "count"), *shown, Column("margin", table["margin"]),
-            Column("margin", ratio, "ratio", "÷ bound", digits=2),
-        ),
-    )  # fmt: skip
+    table |= {"ratio": ratio, "in_b": table["run"].astype(str) == "B"}
+    table |= {"stop": table["channel"].astype(str) == "stop"} if ball else {}
+    name = "flips_ball" if ball else "flips_md"
+    yield TEXTS(name, shown=len(table["step"]), total=total, counted=s.get("counted"))
+    yield TEXTS.browse(name, table)
 
 
 def size(view: View) -> list[tuple[str, str]]:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.browse import Browse
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import ROLES, Code, Key, Page, Section, Series, Table, curves, pairs, table_of
-from mdnum.report.words import MINUS, count, heading, listed, many, number, percent, power
+from mdnum.report.words import count, heading, listed, many, number, percent
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
@@ -68,14 +68,7 @@ def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: i
     known = digits_of(summary, name)
     if known is None:
         return number(value, min(_UNKNOWN, most) if summary.get("trust") else most)
-    digits = max(min(known, most), 1)
-    if value is None or not math.isfinite(value) or value == 0:
-        return number(value, digits)
-    mantissa, exponent = f"{abs(value):.{digits - 1}e}".split("e")
-    if int(exponent) < digits:
-        return number(value, digits)
-    sign = MINUS if value < 0 else ""
-    return f"{sign}{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(int(exponent))}"
+    return number(value, max(min(known, most), 1), whole=False)
 
 
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, most: int = 6) -> str:
@@ -355,23 +348,13 @@ def _flips(view: View) -> Iterator[Any]:
 def _browse(table: Mapping[str, np.ndarray]) -> Browse:
     """The heaviest flips."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(table["margin"]) / table["bound"]
+        rows = {**table, "ratio": np.abs(table["margin"]) / table["bound"]}
+    rows["rank"] = np.arange(1, len(rows["ratio"]) + 1)
     added = [name for name in table if name.startswith("contribution.")][:_SHOWN]
-    columns = [
-        Column("rank", np.arange(1, len(ratio) + 1), "count"),
-        Column("step", table["step"], "count"),
-        Column("pair", (table["i"], table["j"]), "pair"),
-        flipped(table["entered"]),
-        Column("radial speed", table["radial_speed"]),
-        Column("weight", table["weight"]),
-        *(
-            Column(f"adds to {one.removeprefix('contribution.').partition('.')[2]}", table[one])
-            for one in added
-        ),
-        Column("", table["grazing"], "word", words=("", "grazing")),
-        Column("margin", ratio, "ratio", "÷ bound", digits=2),
-    ]
-    return Browse("flips", "flips", "3-17, atom 5, step:100..200, entered, grazing", columns)
+    names = {
+        f"name_{k}": name.removeprefix("contribution.").partition(".")[2] for k, name in enumerate(added)
+    }
+    return TEXTS.browse("flips", rows | {f"added_{k}": table[name] for k, name in enumerate(added)}, **names)
 
 
 def _spectrum(view: View) -> Iterator[Any]:

@@ -12,11 +12,10 @@ import numpy as np
 from mdnum.errors import FolderError
 from mdnum.ranges import columns
 from mdnum.report import analysis
-from mdnum.report.browse import Browse, Column, flipped
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
-from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, curves, pairs, positive
-from mdnum.report.words import count, many, number, percent, plain
+from mdnum.report.section import Figure, Page, Plot, Section, Series, Table, curves, pairs, positive
+from mdnum.report.words import count, many, number, plain
 from mdnum.store.tables import as_numpy
 from mdnum.verbs.frame import View
 
@@ -176,7 +175,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
         Section("Range of numbers", list(_ranges(run))),
         Section("Agreement with ASE", list(_ase(run))),
     ]
-    return run.page(run.name, ", ".join(about), _keys(run), sections)
+    return run.page(run.name, ", ".join(about), TEXTS.keys(**_numbers(run)), sections)
 
 
 def draw_first(run: RunView) -> None:
@@ -188,33 +187,18 @@ def draw_first(run: RunView) -> None:
             run.pictures[part.name] = drawing.markup(drawing.draw(part), part.name)
 
 
-def _keys(run: RunView) -> Iterator[Key]:
-    summary, atoms = run.summary, run.summary.get("atoms")
-    entered, left = (int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left"))
-    rate = (
-        f", {number(run.flips.total / run.steps / atoms, 2)} per atom and step" if atoms and run.steps else ""
-    )
-    yield Key("Flips", count(entered + left), f"{count(entered)} entered, {count(left)} left{rate}")
-    dangerous = count(run.total("dangerous_builds", "dangerous"))
-    rebuilds = f"in {many(len(run.epochs['epoch']), 'list')}, {dangerous} dangerous"
-    yield Key("Lost pairs", count(int(run.epochs["lost_pairs"].sum())), rebuilds)
-    yield Key(
-        "Ambiguous", count(int(run.series["ambiguous"].sum(dtype=np.int64))), "decisions within rounding"
-    )
-    closes = summary.get("energy_budget_closes")
-    budget = "" if closes is None else "; budget closes" if closes else "; budget is open"
-    yield Key("Budget residual", number(run.residual, 2), run.units.energy + budget)
-    drift, per = summary.get("energy_drift"), f"{run.units.energy}/atom/{run.units.time}"
-    yield Key("Energy drift", number(drift, 2, signed=True), per)
-    steps, moved = run.time_step["per_period"], run.time_step["fluctuation"]
-    share = "" if moved is None else f"; energy noise {percent(moved)} of the kinetic"
-    yield Key("Fastest vibration", number(steps, 3), "steps" + share)
-    error = run.ase.get("energy_rel")
-    compared = "not compared" if error is None else "relative energy difference"
-    compared += " of a sample" if "sampled" in run.ase else ""
-    yield Key("Against ASE", number(error, 2), compared)
-    speed = summary.get("steps_per_second")
-    yield Key("Speed", number(speed), "steps per second" if speed else "too short a run to tell")
+def _numbers(run: RunView) -> dict[str, Any]:
+    """What stands above the page."""
+    summary, atoms, epochs = run.summary, run.summary.get("atoms"), run.epochs
+    made = {name: int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left", "ambiguous")}
+    known = ("energy_drift", "energy_budget_closes", "steps_per_second")
+    return {
+        **vars(run.units), **run.time_step, **made, **{name: summary.get(name) for name in known},
+        "flips": made["entered"] + made["left"], "lists": len(epochs["epoch"]), "residual": run.residual,
+        "rate": run.flips.total / run.steps / atoms if atoms and run.steps else None,
+        "dangerous": run.total("dangerous_builds", "dangerous"), "lost": int(epochs["lost_pairs"].sum()),
+        "error": run.ase.get("energy_rel"), "sample": " of a sample" if "sampled" in run.ase else "",
+    }  # fmt: skip
 
 
 def _what(run: RunView) -> Iterator[tuple[str, str]]:
@@ -402,23 +386,16 @@ def _lists(run: RunView) -> Iterator[Any]:
     whole = epochs["reason"] != "end"
     lengths = epochs["length"][whole] if whole.any() else epochs["length"]
     reasons, counts = np.unique(epochs["reason"].astype(str), return_counts=True)
-    skinned = bool(np.isfinite(skin).all())
-    consumed = f"{percent(float(np.median(skin)))} (median), {percent(float(np.max(skin)))} at most"
-    ended = ", ".join(f"{reason} {count(int(n))}" for reason, n in zip(reasons, counts, strict=True))
-    span = f"{count(int(lengths.min()))} to {count(int(lengths.max()))}"
-    grown = len(np.unique(epochs["capacity"])) - 1
-    used = float(np.max(epochs["occupancy"] / np.maximum(epochs["capacity"], 1)))
-    yield pairs([
-        ("Lists", f"{count(len(skin))} ({ended})"),
-        ("Steps per list", f"{plain(float(np.median(lengths)))} (median), {span}"),
-        ("Skin consumed", consumed if skinned else "there is none: a list serves one step"),
-        ("Dangerous builds", int(epochs["dangerous"].sum())),
-        ("Lost pairs", f"{count(int(epochs['lost_pairs'].sum()))}, by a count at every rebuild"),
-        ("Lost pair-steps", int(epochs["lost_pair_steps"].sum())),
-        ("Pairs listed", f"{plain(float(np.mean(epochs['pairs_listed'])))} (mean)"),
-        ("Capacity", f"{percent(used)} used at most, grown {many(grown, 'time')}"),
-        ("Build", f"{number(float(np.median(epochs['build_ms'])))} ms (median)"),
-    ])  # fmt: skip
+    consumed = {"median": float(np.median(skin)), "most": float(np.max(skin))}
+    totals = {name: int(epochs[name].sum()) for name in ("dangerous", "lost_pairs", "lost_pair_steps")}
+    yield pairs(TEXTS.rows(
+        "lists", **totals, lists=len(skin), consumed=consumed if np.isfinite(skin).all() else None,
+        ended=", ".join(f"{reason} {count(int(n))}" for reason, n in zip(reasons, counts, strict=True)),
+        length=float(np.median(lengths)), shortest=int(lengths.min()), longest=int(lengths.max()),
+        listed=float(np.mean(epochs["pairs_listed"])), grown=len(np.unique(epochs["capacity"])) - 1,
+        used=float(np.max(epochs["occupancy"] / np.maximum(epochs["capacity"], 1))),
+        build=float(np.median(epochs["build_ms"])),
+    ))  # fmt: skip
 
 
 def _nearest(run: RunView) -> Iterator[Any]:
@@ -429,19 +406,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
         return
     compare = str(run.cutoff.get("compare", "r2 <"))
     yield TEXTS("nearest", shown=len(flips["step"]), flips=run.flips.total, compare=compare)
-    yield Browse(
-        "flips", "flips", "atom 17, pair 17-203, step:100..200, entered, ambiguous",
-        (
-            Column("step", flips["step"], "count"),
-            Column("pair", (flips["i"], flips["j"]), "pair"),
-            flipped(flips["entered"]),
-            Column("distance", flips["distance"], "fixed", units.length, digits=6),
-            Column("margin", flips["margin"], unit=compare),
-            Column("radial speed", flips["radial_speed"], unit=f"{units.length}/{units.time}"),
-            Column("energy jump", flips["energy_jump"], unit=units.energy),
-            Column("margin", flips["ratio"], "ratio", "÷ bound", digits=2),
-        ),
-    )  # fmt: skip
+    yield TEXTS.browse("flips", flips, compare=compare, **vars(units))
 
 
 def _ranges(run: RunView) -> Iterator[Any]:

@@ -203,7 +203,7 @@ def test_every_planted_defect_is_found(good):
         "OTHER_TEMPERATURE": changed(good, system={**good.system, "dynamics": {"temperature": 1e4}}),
         "HARD_CUTOFF": good,
     }
-    assert set(planted) | {"CHATTER", "sentences", "plots"} == set(TEXTS.entries)
+    assert set(planted) | {"CHATTER"} == {code for code in TEXTS.entries if code.isupper()}
     for code, view in planted.items():
         assert set(found(view)) == ({code} if code == "FORCE_JUMP" else {code, "HARD_CUTOFF"}), code
         assert page(view, judge(view)).sections, code
