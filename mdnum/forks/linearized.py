@@ -28,17 +28,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from mdnum.errors import InputError
 from mdnum.md.integrators import check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
-from mdnum.numerics.verdicts import Growth
+from mdnum.numerics.verdicts import BLOCKS, TRANSIENT, Growth, growth_rate
 from mdnum.rollout.engine import FAILURES, Engine, Segment
 from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
-#: Share of a run in which the tangent turns to the direction that grows fastest.
-_TRANSIENT = 0.2
-#: Blocks that the error is estimated from.
-_BLOCKS = 8
-#: A rate counts where it is so many times its error.
-_SIGNIFICANT = 4.0
 #: Decisions of a step that are kept: those which the perturbation reaches first.
 KEPT = 3
 #: Time steps by which velocities are multiplied where a length of the tangent is asked for.
@@ -282,32 +276,19 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
         is made by flips alone is not in it.
     """
     last = simulation.steps if steps is None else steps
-    if last < 10 * _BLOCKS:
+    if last < 10 * BLOCKS:
         raise InputError(
-            f"steps = {last} are too few for a growth rate", remedy=f"Give at least {10 * _BLOCKS}"
+            f"steps = {last} are too few for a growth rate", remedy=f"Give at least {10 * BLOCKS}"
         )
     dx = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     dx -= dx.mean(axis=0)
     step = float(simulation.integrator.timestep)
     parts = list(tangents(simulation, last, dx, np.zeros_like(dx), reach=False))
     size, furthest = _joined(parts, "size"), _joined(parts, "furthest")
-    first = int(_TRANSIENT * last)
-    edges = np.linspace(first, len(size) - 1, _BLOCKS + 1).astype(int)
-    slopes = np.diff(size[edges]) / np.diff(edges)
-    rate = float((size[-1] - size[first]) / (len(size) - 1 - first))
-    error = float(slopes.std(ddof=1) / np.sqrt(_BLOCKS))
-    # what grows in proportion to the steps gains log(end / first) over this stretch
-    linear = float(np.log((len(size) - 1) / max(first, 1))) / (len(size) - 1 - first)
-    return Lyapunov(
-        last,
-        step / simulation.units.time_factor,
-        rate,
-        error,
-        size,
-        furthest - float(np.log(np.sqrt((dx**2).sum(axis=1)).max())),
-        first,
-        rate > 2 * linear and rate > _SIGNIFICANT * error,
-    )
+    rate, error, grows = growth_rate(size)
+    furthest = furthest - float(np.log(np.sqrt((dx**2).sum(axis=1)).max()))
+    timestep = step / simulation.units.time_factor
+    return Lyapunov(last, timestep, rate, error, size, furthest, int(TRANSIENT * last), grows)
 
 
 # --- forecasts ----------------------------------------------------------------------------------------

@@ -116,9 +116,9 @@ def stepwise(
 def interpreted(
     program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
 ) -> list[Any]:
-    """The results of a closed program (see `stepwise`)."""
-    jaxpr = program.jaxpr
-    known = dict(zip(jaxpr.constvars, map(enter, program.consts), strict=True))
+    """The results of a program (see `stepwise`), closed or without constants."""
+    jaxpr, constants = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
+    known = dict(zip(jaxpr.constvars, map(enter, constants), strict=True))
     known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
 
     def value(atom: Any) -> Any:

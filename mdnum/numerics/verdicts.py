@@ -158,6 +158,9 @@ def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
 Reason = tuple[str, dict[str, Any]]
 Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
+#: Share of the rows before a growth rate is read off, and blocks that its error comes from; a rate counts where
+#: it is this multiple of its error.
+TRANSIENT, BLOCKS, _SIGNIFICANT = 0.2, 8, 4.0
 #: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
 #: at the start, below saturation at the end.
 _FIT = (1e-12, 0.1)
@@ -205,6 +208,27 @@ class Growth:
         if not (np.isfinite(self.rate) and self.rate > 0 and start > 0):
             return None
         return max(0.0, float(np.log(end / start) / self.rate))
+
+
+def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
+    """Growth of a logarithm per row, its standard error, and whether it is more than linear growth gives.
+
+    From the later part of the rows, in blocks. NaN and no where there are too few rows, or they are not
+    finite.
+    """
+    rows = np.flatnonzero(np.isfinite(log))
+    if not len(rows) or len(log) < 10 * BLOCKS:
+        return float("nan"), float("nan"), False
+    first = max(int(TRANSIENT * (len(log) - 1)), int(rows[0]))
+    if len(log) - first < 4 * BLOCKS or not np.isfinite(log[first:]).all():
+        return float("nan"), float("nan"), False
+    edges = np.linspace(first, len(log) - 1, BLOCKS + 1).astype(int)
+    slopes = np.diff(log[edges]) / np.diff(edges)
+    rate = float((log[-1] - log[first]) / (len(log) - 1 - first))
+    error = float(slopes.std(ddof=1) / np.sqrt(BLOCKS))
+    # what grows in proportion to the steps gains log(end / first) over this stretch
+    linear = float(np.log((len(log) - 1) / max(first, 1))) / (len(log) - 1 - first)
+    return rate, error, bool(rate > 2 * linear and rate > _SIGNIFICANT * error)
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import AdjointCarry, StretchReversal, transposed
@@ -25,6 +25,7 @@ from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md.cell import HostCell
 from mdnum.md.decide import GROUP
+from mdnum.numerics.exact import interpreted
 
 #: Operations that are looked into: what is in their parameters is a program, called once.
 _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
@@ -126,18 +127,7 @@ class _Interpreter:
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
         """The results of a program."""
-        jaxpr, constants = program, ()
-        if isinstance(program, ClosedJaxpr):
-            jaxpr, constants = program.jaxpr, program.consts
-        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
-
-        def value(atom: Any) -> Any:
-            return atom.val if isinstance(atom, Literal) else known[atom]
-
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [value(atom) for atom in equation.invars])
-            known.update(zip(equation.outvars, results, strict=True))
-        return [value(atom) for atom in jaxpr.outvars]
+        return interpreted(program, inputs, self._equation)
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
         name, params = equation.primitive.name, equation.params

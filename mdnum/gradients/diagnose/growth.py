@@ -32,16 +32,14 @@ from mdnum.md.decide import Tables
 from mdnum.md.integrators import KickDrift, check_kick, unsorted
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics import formats
+from mdnum.numerics.verdicts import growth_rate
 from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
 #: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.
 CLOCK_STEPS = 30
-#: Share of the horizons before a growth rate is read off, and blocks that its error comes from.
-TRANSIENT, BLOCKS = 0.2, 8
-#: A rate counts where it is this multiple of its error, and a run is bounded where no speed is this multiple
-#: of the usual one.
-_SIGNIFICANT, _WILD = 4.0, 10.0
+#: A run is bounded where no speed is this multiple of the usual one.
+_WILD = 10.0
 WORDS = ("both bounded", "forward bounded, gradient not", "forward not bounded")
 #: Binary exponents that are told apart; what lies beyond is counted at the ends.
 _LOWEST, _HIGHEST = -200, 200
@@ -137,27 +135,6 @@ class GrowthWatch:
         gain = float(there.max() / there[0]) if len(there) else 1.0
         step = timestep / units.time_factor
         return GradientGrowth(table, clock, step, rate, error, step / rate if rate else np.inf, gain, word)
-
-
-def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Growth of a logarithm per row, its standard error, and whether it is more than linear growth gives.
-
-    From the later part of the rows, in blocks. NaN and no where there are too few rows, or they are not
-    finite.
-    """
-    rows = np.flatnonzero(np.isfinite(log))
-    if not len(rows) or len(log) < 10 * BLOCKS:
-        return float("nan"), float("nan"), False
-    first = max(int(TRANSIENT * (len(log) - 1)), int(rows[0]))
-    if len(log) - first < 4 * BLOCKS or not np.isfinite(log[first:]).all():
-        return float("nan"), float("nan"), False
-    edges: Int[np.ndarray, "edges"] = np.linspace(first, len(log) - 1, BLOCKS + 1).astype(int)
-    slopes = np.diff(log[edges]) / np.diff(edges)
-    rate = float((log[-1] - log[first]) / (len(log) - 1 - first))
-    error = float(slopes.std(ddof=1) / np.sqrt(BLOCKS))
-    # what grows in proportion to the steps gains log(end / first) over this stretch
-    linear = float(np.log((len(log) - 1) / max(first, 1))) / (len(log) - 1 - first)
-    return rate, error, bool(rate > 2 * linear and rate > _SIGNIFICANT * error)
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
