@@ -119,6 +119,17 @@ def in_a_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {words}" if words else type(error).__name__
 
 
+def expect_at_least(least: int, **numbers: int) -> None:
+    """Rejects numbers below the least that makes sense, by their names.
+
+    Raises:
+        InputError: names the first.
+    """
+    for name, number in numbers.items():
+        if number < least:
+            raise InputError(f"{name} = {number}; expected at least {least}")
+
+
 def expect_path(given: object, remedy: str) -> None:
     """Rejects an array or another object where a path is expected, without quoting what it holds.
 

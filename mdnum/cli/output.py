@@ -220,17 +220,8 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
     """An error as one line on stderr, and as the JSON document when one was asked for."""
     say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
-        print_json(
-            {
-                "error": {
-                    "type": type(error).__name__,
-                    "message": error.message,
-                    "where": error.where,
-                    "remedy": error.remedy,
-                    "exit_code": error.exit_code,
-                }
-            }
-        )
+        told = {name: getattr(error, name) for name in ("message", "where", "remedy", "exit_code")}
+        print_json({"error": {"type": type(error).__name__, **told}})
 
 
 def print_lines(lines: Iterable[str]) -> None:

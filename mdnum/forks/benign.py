@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import betaincinv
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.ensemble import (
     Change,
     ensemble,
@@ -136,9 +136,9 @@ def two_of_three(rate: float) -> float:
     return 3 * rate**2 - 2 * rate**3
 
 
-def bounds(count: int, of: int, level: float = 0.95) -> tuple[float, float]:
-    """The exact (Clopper-Pearson) interval of a rate of which `count` of `of` were seen."""
-    tail = (1 - level) / 2
+def bounds(count: int, of: int) -> tuple[float, float]:
+    """The exact (Clopper-Pearson) 95 % interval of a rate of which `count` of `of` were seen."""
+    tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
     return float(low), float(high)
@@ -240,10 +240,8 @@ def calibrate(
     """
     if members < FEWEST:
         raise InputError(f"members = {members} are too few for a limit", remedy=f"Give at least {FEWEST}")
-    least = {"held_out": (held_out, 0), "tries": (tries, 1), "steps": (1 if steps is None else steps, 1)}
-    for name, (value, at_least) in least.items():
-        if value < at_least:
-            raise InputError(f"{name} = {value}; expected at least {at_least}")
+    expect_at_least(0, held_out=held_out)
+    expect_at_least(1, tries=tries, steps=1 if steps is None else steps)
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
         raise InputError("no planted change must fail", remedy="Plant one that must: else nothing is proven")

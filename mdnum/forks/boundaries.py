@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
@@ -234,8 +234,7 @@ def boundaries(
     system = opened(system)
     program = program_of(system, steps)
     last = program.steps if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
+    expect_at_least(1, steps=last)
     line = NumberLine(program, checked(program, key, low, high), last, loss)
     places = _grid(line, low, high, cells)
     note = progress or (lambda done, total, info: None)

@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.md.integrators import check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics.verdicts import BLOCKS, TRANSIENT, Growth, growth_rate
@@ -452,8 +452,7 @@ def forecast(
         InputError: a many-body potential, a direction that is zero or of the wrong shape.
     """
     last = simulation.steps if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
+    expect_at_least(1, steps=last)
     shape = simulation.positions.shape
     if dx is None and dv is None:
         dx = direction(simulation, seed)

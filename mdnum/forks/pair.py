@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Shaped
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.choices import Choice, shipped, twin_or_reason, world_of
 from mdnum.numerics.verdicts import (
     FEWEST,
@@ -128,8 +128,7 @@ def fork(
     counterfactual, back, most = counterfactuals(twin, counterfactual, back, repeats)
     a.check(b)
     asked = a.steps if steps is None else steps
-    if asked < 1:
-        raise InputError(f"steps = {asked}; expected at least 1")
+    expect_at_least(1, steps=asked)
     tolerance = SPLIT * a.scale if split is None else split
     if not 0 < tolerance < np.inf:
         raise InputError(f"split = {tolerance:g}; expected a length above 0")

@@ -154,11 +154,7 @@ def variants(
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {
-            "path": str(in_a_file(system).write(folder / "system")),
-            "steps": steps,
-            "code": is_allowed(),
-        }
+        question = _question(system, steps, folder)
         done, count = 0, Lock()
 
         def ran(k: int) -> tuple[Ran, np.ndarray | None]:
@@ -386,15 +382,9 @@ def digests_elsewhere(
         progress(0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        question = {
-            "path": str(in_a_file(system).write(folder / "system")),
-            "key": key,
-            "steps": steps,
-            "code": is_allowed(),
-        }
-        asked = [value.hex() for value in values]
-        failed = _ask({**question, "values": asked}, folder / "question.json", heard)
-    if failed or len(found) != len(asked):
+        asked = {"key": key, "values": [value.hex() for value in values]}
+        failed = _ask({**_question(system, steps, folder), **asked}, folder / "question.json", heard)
+    if failed or len(found) != len(values):
         raise MdnumError(
             f"the process that was to confirm boundaries failed: {failed or 'no message'}",
             remedy="Run `mdnum doctor`",
@@ -419,6 +409,12 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 # --- asking and answering -----------------------------------------------------------------------------
+
+
+def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
+    """What every process is asked: the system, which is written into a folder, and the last step."""
+    path = in_a_file(system).write(folder / "system")
+    return {"path": str(path), "steps": steps, "code": is_allowed()}
 
 
 def _ask(

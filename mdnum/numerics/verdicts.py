@@ -158,8 +158,8 @@ def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
 Reason = tuple[str, dict[str, Any]]
 Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
-#: Share of the rows before a growth rate is read off, and blocks that its error comes from; a rate counts where
-#: it is this multiple of its error.
+#: Share of the rows before a growth rate is read off, and blocks that its error comes from; a rate counts
+#: where it is this multiple of its error.
 TRANSIENT, BLOCKS, _SIGNIFICANT = 0.2, 8, 4.0
 #: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
 #: at the start, below saturation at the end.

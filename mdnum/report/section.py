@@ -148,15 +148,11 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
         lines: part, curve, label, x and y of each line.
     """
     lines = list(lines)
+    parts, curves, labels = (np.array([line[k] for line in lines], dtype=str) for k in range(3))
     sizes = [len(line[3]) for line in lines]
-    words = zip(*(line[:3] for line in lines), strict=True) if lines else ((), (), ())
-    columns = {
-        name: np.repeat(np.array(column, dtype=str), sizes)
-        for name, column in zip(("part", "curve", "line"), words, strict=True)
-    }
-    for at, name in ((3, "x"), (4, "y")):
-        columns[name] = np.concatenate([np.asarray(line[at], float) for line in lines] or [np.zeros(0)])
-    return columns
+    words = {"part": parts, "curve": curves, "line": labels}
+    x, y = (np.concatenate([np.zeros(0), *(line[k] for line in lines)]) for k in (3, 4))
+    return {name: np.repeat(column, sizes) for name, column in words.items()} | {"x": x, "y": y}
 
 
 @dataclass(frozen=True)

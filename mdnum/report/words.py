@@ -34,8 +34,12 @@ def number(value: float | None, digits: int = 3, signed: bool = False, whole: bo
         # whole numbers are told in full: 123,456 rather than 123,000
         rounded = float(f"{mantissa}e{exponent}") if scale < digits else abs(value)
         return sign + f"{rounded:,.{max(0, digits - 1 - scale)}f}"
+    return sign + _scientific(mantissa, scale)
+
+
+def _scientific(mantissa: str, exponent: int) -> str:
     # no-break spaces: a number is one word
-    return f"{sign}{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(scale)}"
+    return f"{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(exponent)}"
 
 
 def count(value: float | None) -> str:
@@ -68,17 +72,14 @@ def percent(share: float | None) -> str:
 
 def typeset(text: str) -> str:
     """Numbers of programs in words, -1.5e-16 and 2^15, as people write them: −1.5 × 10⁻¹⁶, 2¹⁵."""
-    text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _scientific, text)
+    text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _as_power, text)
     text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
     text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)
     return re.sub(r"(?<![\w.)\]–-])-(?=[\d.∞])", MINUS, text)
 
 
-def _scientific(found: re.Match[str]) -> str:
-    mantissa, exponent = found[1], int(found[2])
-    if mantissa == "1":
-        return power(exponent)
-    return f"{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(exponent)}"
+def _as_power(found: re.Match[str]) -> str:
+    return power(int(found[2])) if found[1] == "1" else _scientific(found[1], int(found[2]))
 
 
 def heading(text: str) -> str:

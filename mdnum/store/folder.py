@@ -71,7 +71,11 @@ def system_tables(file: Path) -> dict[str, Any]:
     Raises:
         FolderError: it is no TOML, or no JSON.
     """
-    text, is_json = read_text(file), file.suffix == ".json"
+    return _parsed(file, read_text(file))
+
+
+def _parsed(file: Path, text: str) -> Any:
+    is_json = file.suffix == ".json"
     try:
         return json.loads(text) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -668,10 +672,7 @@ class RunFolder:
     def _read_json(self, name: str) -> dict[str, Any]:
         self.check(name)
         text = read_text(self.path / name)
-        try:
-            held = json.loads(text) if text else {}
-        except (ValueError, RecursionError) as error:
-            raise FolderError(f"is damaged: not valid JSON ({error})", where=str(self.path / name)) from error
+        held = _parsed(self.path / name, text) if text else {}
         if not isinstance(held, dict):
             raise FolderError("is damaged: holds no JSON object", where=str(self.path / name))
         return held

@@ -12,7 +12,7 @@ import numpy as np
 from mdnum.report.analysis import margins_in_bounds, range_table
 from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
-from mdnum.report.section import Figure, Mark, Page, Plot, Role, Section, Series, Table, pairs, table_of
+from mdnum.report.section import Figure, Page, Plot, Role, Section, Series, Table, pairs, table_of
 from mdnum.report.words import number
 from mdnum.verbs.frame import View
 
@@ -98,12 +98,10 @@ def page(view: BallView, verdict: Verdict) -> Page:
     return view.page(view.name, about, keys, sections)
 
 
-def _groups(
-    x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role], mark: Mark = "points"
-) -> tuple[Series, ...]:
+def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
     """A set of points for each group that has any finite ones."""
     return tuple(
-        Series(label, x[mine], y[mine], mark, role)
+        Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups
         if np.any(mine & np.isfinite(y))
     )

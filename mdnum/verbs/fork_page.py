@@ -398,23 +398,16 @@ def size(view: View) -> list[tuple[str, str]]:
 
 
 def _what(view: View) -> Iterator[Any]:
-    s, kind = view.summary, "split_ball" if "balls" in view.summary else "split_md"
-    rows = [
-        *size(view),
-        ("Choice", f"{s['choice']}: {s['choice_about']}"),
-        ("A and B differ in", s["difference"]),
-    ]
-    if "reproduced" in s:
-        rows.append(("Replay", TEXTS("reproduced" if s["reproduced"] else "not_reproduced")))
-    if s.get("must_hold"):
-        rows.append(("Must hold", TEXTS("must_hold")))
-    rows.append(("Split", TEXTS(kind, tolerance=s["tolerance"], unit=view.units.length)))
-    if s["imposed_until"] is None:
-        rows.append(("Counterfactual", TEXTS("no_counterfactual")))
-    if s["count"] and s["count"]["pairs"] > 1:
-        repeats = s["count"]["pairs"] - 1 + (s.get("count_other") or {"pairs": 0})["pairs"]
-        rows.append(("Chance", TEXTS("chance", repeats=repeats, agreeing=agreeing(view))))
-    yield pairs([*rows, view.took])
+    s = view.summary
+    repeats = (s["count"] or {"pairs": 1})["pairs"] - 1
+    # what does not hold has no value, and its row is left out
+    rows = TEXTS.rows("what", **{
+        "reproduced": None, **s, "agreeing": agreeing(view), "unit": view.units.length,
+        "ball": "" if "balls" in s else None, "must": "" if s.get("must_hold") else None,
+        "free": "" if s["imposed_until"] is None else None,
+        "repeats": repeats + (s.get("count_other") or {"pairs": 0})["pairs"] if repeats else None,
+    })  # fmt: skip
+    yield pairs([*size(view), *rows, view.took])
     changed = s.get("differences") or [(key, *values) for key, values in s["changes"].items()]
     if changed:
         yield differences(changed, "" if s.get("differences") else "What differs in the system file")

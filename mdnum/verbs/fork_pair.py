@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.plain import plain
 from mdnum.verbs import frame
 from mdnum.verbs.fork_verdict import TEXTS
@@ -64,8 +64,7 @@ def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
 
     own = system.spec.integrator.steps if world_of(system) == "ball" else system.steps
     last = steps if steps is not None else own if most is None else min(most, own)
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
+    expect_at_least(1, steps=last)
     return last
 
 
@@ -117,8 +116,7 @@ def check(asked: PairQuestion) -> None:
     """Refuses what cannot be, before a folder is made."""
     from mdnum.forks.pair import repeats_asked
 
-    if asked.steps is not None and asked.steps < 1:
-        raise InputError(f"steps = {asked.steps}; expected at least 1")
+    expect_at_least(1, steps=1 if asked.steps is None else asked.steps)
     if asked.split is not None and not 0 < asked.split < float("inf"):
         raise InputError(f"split = {asked.split:g}; expected a length above 0")
     repeats_asked(asked.repeats, asked.counterfactual)

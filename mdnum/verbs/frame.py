@@ -273,7 +273,7 @@ def answering(
 
 @contextmanager
 def new_folder(
-    kind: str, name: str, out: str | Path | None = None, *, system: Any = None, overwrite: bool = False
+    kind: str, name: str, out: str | Path | None = None, *, system: Any = None
 ) -> Iterator[RunFolder]:
     """An empty folder to be filled, with the system and its provenance; closed if filling it fails.
 
@@ -287,7 +287,7 @@ def new_folder(
     """
     from mdnum.provenance import collect, surroundings
 
-    folder = RunFolder.create(default_folder(name) if out is None else out, world=kind, overwrite=overwrite)
+    folder = RunFolder.create(default_folder(name) if out is None else out, world=kind)
     try:
         if system is not None:
             system.write(folder.path)

@@ -165,7 +165,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
         at = f" at {plain(radius, 6)} {units.length}" if isinstance(radius, int | float) else ""
         about.append(f"{cutoff['kind']} cutoff{at}")
     sections = [
-        Section("What was run", [pairs(list(_what(run)))]),
+        Section("What was run", [pairs(_what(run))]),
         Section("Energy and its budget", list(_energy(run))),
         Section("Flips per step", list(_flips_per_step(run))),
         Section("Margins in units of rounding", list(_margins(run))),
@@ -201,34 +201,23 @@ def _numbers(run: RunView) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _what(run: RunView) -> Iterator[tuple[str, str]]:
+def _what(run: RunView) -> list[tuple[str, str]]:
     """What was run; what the system file leaves out is left out."""
     units, system, time = run.units, run.system, run.series["time"]
-    if system.get("about"):
-        yield "System", str(system["about"])
-    span = f"{many(run.steps, 'step')}, {plain(float(time[-1] - time[0]))} {units.time}"
-    atoms = run.summary.get("atoms")
-    yield "Size", f"{many(atoms, 'atom')}, {span}" if atoms else span
-    lengths = {"radius": units.length, "onset": units.length, "skin": units.length}
-    for key, title in (("potential", "Potential"), ("cutoff", "Cutoff"), ("neighbors", "Neighbor lists")):
-        if table := system.get(key):
-            if code := table.get("code"):
-                table = table | {"code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
-            yield title, in_words(table, lengths)
-    if run.cutoff.get("energy_jump") is not None:
-        energy, force = (number(run.cutoff.get(key)) for key in ("energy_jump", "force_jump"))
-        yield (
-            "At the cutoff",
-            f"energy jump {energy} {units.energy}, force jump {force} {units.energy}/{units.length}",
-        )
-    if dynamics := system.get("dynamics"):
-        # how many steps were made is said above; the file says how many were planned
-        made = {key: value for key, value in dynamics.items() if key != "steps"}
-        yield "Dynamics", in_words(made, {"timestep": units.time, "temperature": units.temperature})
-    mean = float(np.mean(run.series["temperature"]))
-    yield "Temperature", f"{number(mean, 4)} {units.temperature} (mean over the run)"
-    if precision := system.get("precision"):
-        yield "Precision", in_words(precision)
+    lengths, given = dict.fromkeys(("radius", "onset", "skin"), units.length), {}
+    for key in ("potential", "cutoff", "neighbors", "precision"):
+        table = system.get(key) or {}
+        if code := table.get("code"):
+            table = table | {"code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
+        given[key] = in_words(table, lengths) if table else None
+    # how many steps were made is said above; the file says how many were planned
+    made = {key: value for key, value in (system.get("dynamics") or {}).items() if key != "steps"}
+    return TEXTS.rows("what", **{
+        **vars(units), **given, "about": system.get("about") or None, "atoms": run.summary.get("atoms") or None,
+        "steps": run.steps, "span": float(time[-1] - time[0]), "mean": float(np.mean(run.series["temperature"])),
+        **{name: run.cutoff.get(name) for name in ("energy_jump", "force_jump")},
+        "dynamics": in_words(made, vars(units) | {"timestep": units.time}) if made else None,
+    })  # fmt: skip
 
 
 def _energy(run: RunView) -> Iterator[Any]:

@@ -21,7 +21,7 @@ from mdnum.ball.step import (
 )
 from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
 from mdnum.ball.world import World
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.numerics.events import Ledger
 
 
@@ -104,8 +104,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
     Raises:
         InputError: steps below 1, or a world whose steps are not sums and products.
     """
-    if steps < 1:
-        raise InputError(f"steps = {steps}; expected at least 1")
+    expect_at_least(1, steps=steps)
     program = _ExactBall(world, start)
     first = [[float(c) for c in row] for row in (program.y, program.v)]
     y, v, height, contact, counts = zip(*(program.step(index) for index in range(steps)), strict=True)

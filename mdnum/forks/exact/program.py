@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.tape import DecisionTape
 from mdnum.md.cell import complete
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Undecided
@@ -217,8 +217,7 @@ class ExactProgram:
         Raises:
             InputError: a pair sits on its threshold to all bits that were tried.
         """
-        if steps < 0:
-            raise InputError(f"steps = {steps}; expected at least 0")
+        expect_at_least(0, steps=steps)
         bits = math.ceil(_BITS_PER_STEP * steps) + _BITS_LEFT if bits is None else bits
         for restarts in range(_RESTARTS + 1):
             run = _Run(self, steps, bits)
