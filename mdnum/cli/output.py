@@ -373,13 +373,9 @@ def _print_part(table: Table) -> None:
 # -- progress on stderr once work has proved to be long: a bar at a terminal, elsewhere a line now and then
 
 _WORDS = {
-    "start": "starting",
-    "compile": "compiling",
-    "run": "running",
-    "gradient": "differentiating",
-    "check": "checking",
-    "report": "writing the report",
-}
+    "start": "starting", "compile": "compiling", "run": "running", "gradient": "differentiating",
+    "check": "checking", "report": "writing the report",
+}  # fmt: skip
 
 
 @contextmanager

@@ -370,17 +370,9 @@ def benign(
     scores, whole = window.space.scores(rows), np.isfinite(rows).all(axis=1)
     failing = {} if passed or not whole.any() else _failing(found, rows[whole], scores[whole])
     return Benign(
-        passed,
-        window.step,
-        len(window.space.sigma),
-        window.limit,
-        scores,
-        failing,
-        window.table,
-        found.rate,
-        found.rate_bounds,
-        (found.false_positives, found.triples),
-    )
+        passed, window.step, len(window.space.sigma), window.limit, scores, failing, window.table, found.rate,
+        found.rate_bounds, (found.false_positives, found.triples),
+    )  # fmt: skip
 
 
 def _check(twin: Twin) -> None:

@@ -315,18 +315,9 @@ def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:
         intervals.append(Interval(*ends, end - first, gap))
     known = {boundary.below.at for boundary in found}
     return BoundaryMap(
-        line.number,
-        line.steps,
-        values[0],
-        values[-1],
-        tuple(intervals),
-        tuple(found),
+        line.number, line.steps, values[0], values[-1], tuple(intervals), tuple(found),
         tuple((values[k - 1], values[k]) for k in edges if values[k - 1] not in known),
-        len(places) == places[-1] - places[0] + 1,
-        max(interval.gap for interval in intervals),
-        len(line.known),
-        np.array(values),
-        np.array([point.loss for point in points]),
-        np.array([point.energy for point in points]),
-        sum(bool(point.failed) for point in points),
-    )
+        len(places) == places[-1] - places[0] + 1, max(interval.gap for interval in intervals),
+        len(line.known), np.array(values), np.array([point.loss for point in points]),
+        np.array([point.energy for point in points]), sum(bool(point.failed) for point in points),
+    )  # fmt: skip

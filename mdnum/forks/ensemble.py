@@ -31,14 +31,9 @@ _LONGEST, _EVERY = 20_000, 50
 _TIMESTEP, _RADIUS = 1.025, 0.96
 
 _NUMBERS = (
-    "potential energy",
-    "kinetic energy",
-    "pressure",
-    "spread of the atoms' kinetic energies",
-    "skewness of the atoms' kinetic energies",
-    "root mean square force",
-    "fourth moment of the forces",
-)
+    "potential energy", "kinetic energy", "pressure", "spread of the atoms' kinetic energies",
+    "skewness of the atoms' kinetic energies", "root mean square force", "fourth moment of the forces",
+)  # fmt: skip
 
 
 # --- features -------------------------------------------------------------------------------------------
@@ -80,14 +75,9 @@ def measure(
     off = each - each.mean()
     volume = simulation.cell.volume if all(simulation.pbc) else 1.0
     numbers = [
-        potential,
-        kinetic,
-        (2 * kinetic + virial) / (3 * float(volume)),
-        np.sqrt(np.mean(off**2)),
-        np.cbrt(np.mean(off**3)),
-        np.sqrt(square.mean()),
-        np.mean(square**2) ** 0.25,
-    ]
+        potential, kinetic, (2 * kinetic + virial) / (3 * float(volume)), np.sqrt(np.mean(off**2)),
+        np.cbrt(np.mean(off**3)), np.sqrt(square.mean()), np.mean(square**2) ** 0.25,
+    ]  # fmt: skip
     distances = pair_distances(simulation, np.asarray(x, np.float64).T, float(nodes[-1]))
     return np.concatenate([np.asarray(numbers, np.float64), hats(distances, nodes)])
 

@@ -152,15 +152,10 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     first_bit = 0 if starts else found.pop("first_bit")
     flips = sorted(found.pop("decisions", ()), key=lambda flip: abs(flip.margin))
     return FolderFork(
-        world=world,
-        a=first.path,
-        b=second.path,
-        differences=(*programs, *starts, *arithmetic),
+        world=world, a=first.path, b=second.path, differences=(*programs, *starts, *arithmetic),
         causes=(*choices(programs), *["start"] * bool(starts), *["arithmetic"] * bool(arithmetic)),
-        same_structure=not starts,
-        decisions=tuple(flips),
-        **{**found, "first_bit": first_bit},
-    )
+        same_structure=not starts, decisions=tuple(flips), **{**found, "first_bit": first_bit},
+    )  # fmt: skip
 
 
 def choices(programs: list[Difference]) -> list[str]:

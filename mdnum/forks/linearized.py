@@ -117,14 +117,10 @@ def tangents(
             size = np.log(length.astype(np.float64)) + shift - np.log(first)
             furthest = np.log(most.astype(np.float64)) + shift
         yield StepTangents(
-            segment,
-            size,
-            furthest,
-            np.swapaxes(amplitude.astype(np.float64) * np.exp(-shift), 0, 1),
-            np.swapaxes(_labels(segment, slot, amplitude), 0, 1),
-            np.swapaxes(near.astype(np.float64), 0, 1),
+            segment, size, furthest, np.swapaxes(amplitude.astype(np.float64) * np.exp(-shift), 0, 1),
+            np.swapaxes(_labels(segment, slot, amplitude), 0, 1), np.swapaxes(near.astype(np.float64), 0, 1),
             np.array(segment.rows_of("moved")),
-        )
+        )  # fmt: skip
         if segment.closes in FAILURES:
             return
         tangent = tuple(np.asarray(part, np.float64)[:, np.argsort(order)] for part in end)
@@ -465,18 +461,11 @@ def forecast(
     listed = [np.full(len(part.size), table.pairs) for part, table in zip(parts, tables, strict=True)]
     largest = np.abs(np.asarray(simulation.positions)).max()
     return Forecast(
-        simulation,
-        last,
-        dx,
-        dv,
-        _joined(parts, "reach", 1),
-        _joined(parts, "pairs", 1),
-        _joined(parts, "margins", 1),
-        np.exp(_joined(parts, "furthest")),
-        float(np.spacing(np.asarray(largest, simulation.policy.dtype("state")))),
-        np.concatenate(listed),
+        simulation, last, dx, dv, _joined(parts, "reach", 1), _joined(parts, "pairs", 1),
+        _joined(parts, "margins", 1), np.exp(_joined(parts, "furthest")),
+        float(np.spacing(np.asarray(largest, simulation.policy.dtype("state")))), np.concatenate(listed),
         simulation.rule.skin - 2 * _joined(parts, "moved"),
-    )
+    )  # fmt: skip
 
 
 def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]:

@@ -286,26 +286,11 @@ def _judged(
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
     cells = table(series, tolerance)
     return Fork(
-        twin,
-        len(free) - 1,
-        asked,
-        tolerance,
-        dates,
-        decision,
-        series,
-        tuple(flips),
-        total,
-        doubts,
-        rates,
-        splits,
-        cells,
-        shares(cells, rates["B"].rate),
-        judge(dates, free, series.get("B|A"), tolerance, (), most, ended=cause),
-        ((), ()),
-        (),
-        failed,
+        twin, len(free) - 1, asked, tolerance, dates, decision, series, tuple(flips), total, doubts, rates,
+        splits, cells, shares(cells, rates["B"].rate),
+        judge(dates, free, series.get("B|A"), tolerance, (), most, ended=cause), ((), ()), (), failed,
         gathered[-1].runs,
-    )
+    )  # fmt: skip
 
 
 def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:

@@ -82,18 +82,10 @@ def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
         differing = np.unique([key for at, key, _ in rows if at == step])
     first, second = (int(np.isin(differing[0], tape.inside(step))) for tape in (a, b))
     return Decision(
-        channel="pair",
-        step=step,
-        subject=divmod(int(differing[0]), a.atoms),
-        run="A" if first else "B",
-        entered=True,
-        a=first,
-        b=second,
-        margins={},
-        bounds={},
-        separation=float("nan"),
+        channel="pair", step=step, subject=divmod(int(differing[0]), a.atoms), run="A" if first else "B",
+        entered=True, a=first, b=second, margins={}, bounds={}, separation=float("nan"),
         also=len(differing) - 1,
-    )
+    )  # fmt: skip
 
 
 def taped(program: MdProgram, last: int, watch: Callable[[Segment], None]) -> DecisionTape:

@@ -27,21 +27,7 @@ from mdnum.numerics.rounding import (
 jax.config.update("jax_enable_x64", True)
 
 __all__ = [
-    "Hysteresis",
-    "Ledger",
-    "PrecisionPolicy",
-    "Reach",
-    "RolePrecision",
-    "Threshold",
-    "changes_in_time",
-    "check_not_forked",
-    "count_set",
-    "distance_bound",
-    "gamma",
-    "neighbor",
-    "ordinal",
-    "set_bits",
-    "squared_distance_bound",
-    "ulp_distance",
-    "unit_roundoff",
-]
+    "Hysteresis", "Ledger", "PrecisionPolicy", "Reach", "RolePrecision", "Threshold", "changes_in_time",
+    "check_not_forked", "count_set", "distance_bound", "gamma", "neighbor", "ordinal", "set_bits",
+    "squared_distance_bound", "ulp_distance", "unit_roundoff",
+]  # fmt: skip

@@ -52,18 +52,12 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     names = sorted(each.name for each in folder.path.iterdir() if each.suffix in _LINKED)
     path = folder.path / "report.html"
     text = _render(
-        "page.html.j2",
-        page=page,
-        verdict=verdict,
-        findings=_under_causes(verdict.findings),
-        pictures=pictures,
-        notes=notes,
-        anchors=anchors,
-        contents=[("Findings", "findings")] * bool(verdict.findings) + contents,
-        files=names,
+        "page.html.j2", page=page, verdict=verdict, findings=_under_causes(verdict.findings),
+        pictures=pictures, notes=notes, anchors=anchors,
+        contents=[("Findings", "findings")] * bool(verdict.findings) + contents, files=names,
         scripted=any(isinstance(part, Browse) and part.rows for part in parts),
         provenance=list(flat(page.provenance)),
-    )
+    )  # fmt: skip
     # what came from a file may turn or hide text around it; escaped as in JSON, which is in there too
     write_text(path, printable(text, json_escape))
     return path
@@ -101,15 +95,10 @@ def _render(template: str, **content: Any) -> str:
     environment.filters |= {"typeset": typeset, "heading": heading, "cell": cell}
     environment.filters |= {"kind": lambda part: type(part).__name__}
     environment.globals |= {
-        "many": many,
-        "static": STATIC_ROWS,
-        "style": Markup(_text("report.css")),
-        "script": Markup(_text("report.js")),
-        "policy": _policy(),
-        "light": drawing.LIGHT,
-        "dark": drawing.DARK,
-        "font": Markup(drawing.FONT),
-    }
+        "many": many, "static": STATIC_ROWS, "style": Markup(_text("report.css")),
+        "script": Markup(_text("report.js")), "policy": _policy(), "light": drawing.LIGHT,
+        "dark": drawing.DARK, "font": Markup(drawing.FONT),
+    }  # fmt: skip
     return environment.get_template(template).render(**content)
 
 

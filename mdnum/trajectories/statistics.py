@@ -420,15 +420,11 @@ class Statistics(Sums):
 
         risk, none = np.cumsum(self.durations.followed[::-1])[::-1], np.full(len(lags), np.nan)
         return {
-            "frames": lags,
-            "time": lags * interval,
-            "at_risk": risk[np.minimum(lags, len(risk) - 1)],
-            "survival": at(left, left.share, 1.0),
-            "error": at(left, left.error, 0.0),
-            "intermittent": at(loose, loose.share, 1.0),
-            "residence": residence(self.durations, pairs)[lags],
+            "frames": lags, "time": lags * interval, "at_risk": risk[np.minimum(lags, len(risk) - 1)],
+            "survival": at(left, left.share, 1.0), "error": at(left, left.error, 0.0),
+            "intermittent": at(loose, loose.share, 1.0), "residence": residence(self.durations, pairs)[lags],
             "again": np.divide(self.again.both, self.again.once, out=none, where=self.again.once > 0),
-        }
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -96,14 +96,10 @@ class AtomTable:
         elif not all(elements):
             elements = types
         return cls(
-            names=names if known[0] else elements,
-            species=elements,
-            residue_names=column("resnames", ""),
+            names=names if known[0] else elements, species=elements, residue_names=column("resnames", ""),
             residue_ids=np.array(getattr(atoms, "resids", np.zeros(len(atoms))), np.int64),
-            residues=np.array(atoms.resindices, np.int64),
-            named=any(known),
-            guessed=guessed,
-        )
+            residues=np.array(atoms.resindices, np.int64), named=any(known), guessed=guessed,
+        )  # fmt: skip
 
     def universe(self) -> Any:
         """A Universe of these atoms, without coordinates."""

@@ -41,21 +41,14 @@ def steps(run: BallRun) -> dict[str, np.ndarray]:
     ambiguous[1:] += ambiguous_stops(run)
     y = run.y.astype(np.float64) if kept else np.full((rows, 1), np.nan)
     return {
-        "step": np.arange(rows),
-        "time": run.time,
-        "contacts": np.concatenate([[first], inside]),
-        "entered": entered,
-        "left": left,
+        "step": np.arange(rows), "time": run.time, "contacts": np.concatenate([[first], inside]),
+        "entered": entered, "left": left,
         "iterations": np.concatenate([[0], run.iterations.reshape(run.steps, -1).max(axis=1)]),
-        "reason": np.array(["none", *_words(run)]),
-        "residual": np.concatenate([[np.nan], residual]),
-        "stop_margin": np.concatenate([[np.nan], margin]),
-        "min_margin": np.concatenate([[np.nan], nearest]),
-        "ambiguous": ambiguous,
-        "mean_height": y.mean(axis=1),
-        "energy": run.energy.mean(axis=1) if kept else np.full(rows, np.nan),
-        **ranges(run),
-    }
+        "reason": np.array(["none", *_words(run)]), "residual": np.concatenate([[np.nan], residual]),
+        "stop_margin": np.concatenate([[np.nan], margin]), "min_margin": np.concatenate([[np.nan], nearest]),
+        "ambiguous": ambiguous, "mean_height": y.mean(axis=1),
+        "energy": run.energy.mean(axis=1) if kept else np.full(rows, np.nan), **ranges(run),
+    }  # fmt: skip
 
 
 def ranges(run: BallRun) -> dict[str, np.ndarray]:
@@ -75,15 +68,10 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
     flips = run.contacts
     lift = 0.0 if run.world.lift is None else float(run.world.lift)
     return {
-        "step": flips.step,
-        "ball": flips.subject[:, 0],
-        "entered": flips.entered,
-        "height": np.where(flips.entered, 0.0, lift) - flips.margin,
-        "margin": flips.margin,
-        "velocity": flips.extra["velocity"],
-        "bound": flips.bound,
-        "ambiguous": ambiguous_flips(run),
-    }
+        "step": flips.step, "ball": flips.subject[:, 0], "entered": flips.entered,
+        "height": np.where(flips.entered, 0.0, lift) - flips.margin, "margin": flips.margin,
+        "velocity": flips.extra["velocity"], "bound": flips.bound, "ambiguous": ambiguous_flips(run),
+    }  # fmt: skip
 
 
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
@@ -135,14 +123,10 @@ def _histories(run: BallRun, rule: Any, busy: np.ndarray) -> dict[str, np.ndarra
     last = number == run.iterations[rows][:, None]
     reason = np.broadcast_to(run.reason[rows][:, None], history.shape)
     return {
-        "step": np.broadcast_to(rows[:, None] + 1, history.shape)[made],
-        "ball": np.full(int(made.sum()), -1),
-        "iteration": number[made],
-        "residual": history[made].astype(np.float64),
-        "margin": margin[made],
-        "stopped": (last & _stopped(reason))[made],
-        "reason": np.where(last, _names(reason), "")[made],
-    }
+        "step": np.broadcast_to(rows[:, None] + 1, history.shape)[made], "ball": np.full(int(made.sum()), -1),
+        "iteration": number[made], "residual": history[made].astype(np.float64), "margin": margin[made],
+        "stopped": (last & _stopped(reason))[made], "reason": np.where(last, _names(reason), "")[made],
+    }  # fmt: skip
 
 
 def heights(run: BallRun) -> dict[str, np.ndarray]:
@@ -179,29 +163,16 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     broken = None if finite.all() else int(np.argmin(finite)) if run.kept else run.steps
     flips, stops = int(ambiguous_flips(run).sum()), int(ambiguous_stops(run).sum())
     return {
-        "world": "ball",
-        "system": simulation.system.name,
-        "balls": run.balls,
-        "steps": run.steps,
-        "steps_asked": run.steps,
-        "time": run.steps * run.h,
-        "contact_kind": spec.contact.kind,
-        "integrator": spec.integrator.kind,
-        "loss_kind": spec.loss.kind,
-        "flips_entered": entered,
-        "flips_left": len(run.contacts) - entered,
-        "first_contact": int(first.min()) if len(first) else None,
-        "iterations_total": int(np.sum(run.iterations)),
-        "iterations_max": int(np.max(run.iterations)),
+        "world": "ball", "system": simulation.system.name, "balls": run.balls, "steps": run.steps,
+        "steps_asked": run.steps, "time": run.steps * run.h, "contact_kind": spec.contact.kind,
+        "integrator": spec.integrator.kind, "loss_kind": spec.loss.kind, "flips_entered": entered,
+        "flips_left": len(run.contacts) - entered, "first_contact": int(first.min()) if len(first) else None,
+        "iterations_total": int(np.sum(run.iterations)), "iterations_max": int(np.max(run.iterations)),
         "ended": {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)},
-        "ambiguous": flips + stops,
-        "ambiguous_contacts": flips,
-        "ambiguous_stops": stops,
-        "smallest_stop_margin": float(margins.min()) if len(margins) else None,
-        "not_finite": broken,
-        "status": "complete" if broken is None else "failed",
-        "findings": [],
-    }
+        "ambiguous": flips + stops, "ambiguous_contacts": flips, "ambiguous_stops": stops,
+        "smallest_stop_margin": float(margins.min()) if len(margins) else None, "not_finite": broken,
+        "status": "complete" if broken is None else "failed", "findings": [],
+    }  # fmt: skip
 
 
 def compared(
@@ -221,23 +192,15 @@ def compared(
     own, their = (dict(made[0]["gradient"]) if made else {} for made in (gradient, theirs))
     forked, separation = found.fork is not None, found.separation
     return {
-        "name": variant.name,
-        "changes": dict(variant.changes),
-        "seed": found.seed,
-        "fork": found.fork,
-        "channel": found.channel or None,
-        "ball": found.ball if forked and found.ball >= 0 else None,
-        "margin": found.margins[0] if forked else None,
-        "margin_there": found.margins[1] if forked else None,
+        "name": variant.name, "changes": dict(variant.changes), "seed": found.seed, "fork": found.fork,
+        "channel": found.channel or None, "ball": found.ball if forked and found.ball >= 0 else None,
+        "margin": found.margins[0] if forked else None, "margin_there": found.margins[1] if forked else None,
         "separation_end": float(separation[-1]) if len(separation) else None,
-        "iterations_differ": found.iterations_differ,
-        "contacts_differ": found.contacts_differ,
-        "iterations_total": int(np.sum(other.iterations)),
-        "ended": other.ended(),
-        "gradient": their,
+        "iterations_differ": found.iterations_differ, "contacts_differ": found.contacts_differ,
+        "iterations_total": int(np.sum(other.iterations)), "ended": other.ended(), "gradient": their,
         "depends": dict(theirs[0].get("depends", {})) if theirs else {},
         "gradient_change": {name: their[name] - own[name] for name in own if name in their},
-    }
+    }  # fmt: skip
 
 
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:

@@ -125,13 +125,9 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
     """What to know of a trajectory beside ASE's."""
     if not report.ok:
         yield TEXTS.finding(
-            "DYNAMICS_DIFFER",
-            *["sudden"] * (report.sudden is not None),
-            steps=len(report.position) - 1,
-            off=report.position[-1],
-            tolerance=report.tolerance,
-            sudden=report.sudden,
-        )
+            "DYNAMICS_DIFFER", *["sudden"] * (report.sudden is not None), steps=len(report.position) - 1,
+            off=report.position[-1], tolerance=report.tolerance, sudden=report.sudden,
+        )  # fmt: skip
     if not report.is_ase:
         yield TEXTS.finding("NOT_ASE", "dynamics")
 

@@ -52,15 +52,10 @@ def name_of(trajectory: Trajectory) -> str:
 def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None) -> dict[str, Any]:
     """What summary.json says of a file."""
     return {
-        "world": "flips",
-        "question": question,
-        "system": name_of(trajectory),
-        "file": str(trajectory.path),
+        "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
-        "slice": trajectory.slice_words,
-        "between": between,
-        "notes": trajectory.notes,
-    }
+        "slice": trajectory.slice_words, "between": between, "notes": trajectory.notes,
+    }  # fmt: skip
 
 
 def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:

@@ -113,21 +113,12 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
     none, real = np.zeros(0, np.int64), np.zeros(0)
     flips = Ledger("contact", none, none[:, None], real > 0, real, real, real)
     return BallRun(
-        world=world,
-        steps=steps,
-        balls=len(program.y),
-        y=np.array([first[0], *y]),
-        v=np.array([first[1], *v]),
-        height=np.array(height),
-        contact=np.array(contact, bool),
+        world=world, steps=steps, balls=len(program.y), y=np.array([first[0], *y]),
+        v=np.array([first[1], *v]), height=np.array(height), contact=np.array(contact, bool),
         iterations=iterations if program.each else iterations[:, 0],
-        reason=np.zeros(iterations.shape, np.int8),
-        residual=unknown,
-        margin=unknown,
-        before=unknown,
-        history=None,
-        contacts=flips,
-    )
+        reason=np.zeros(iterations.shape, np.int8), residual=unknown, margin=unknown, before=unknown,
+        history=None, contacts=flips,
+    )  # fmt: skip
 
 
 class _ExactBall:
