@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import decimal
 import math
-from dataclasses import dataclass
-from fractions import Fraction
+from decimal import Decimal
 from typing import Any, SupportsFloat
 
 import numpy as np
@@ -24,74 +24,33 @@ from mdnum.ball.world import World
 from mdnum.errors import InputError, expect_at_least
 from mdnum.numerics.events import Ledger
 
+# a float is a decimal of finitely many digits, and so are sums and products of decimals: all are kept
+_RANGE = {"Emin": decimal.MIN_EMIN, "Emax": decimal.MAX_EMAX}
+_EXACT = decimal.Context(decimal.MAX_PREC, traps=[decimal.Inexact, decimal.InvalidOperation], **_RANGE)
+# more digits than a number halfway between two floats has, the last of which says whether anything was cut:
+# the rounding to 53 bits is then the correct one
+_LONG = decimal.Context(800, decimal.ROUND_05UP, **_RANGE)
 
-@dataclass(frozen=True, eq=False)
-class Dyadic:
-    """mantissa * 2**exponent, of any size. Sums, differences and products of these are these again."""
+ZERO, HALF = Decimal(0), Decimal("0.5")
 
-    mantissa: int
-    exponent: int = 0
-
-    @classmethod
-    def of(cls, value: SupportsFloat) -> Dyadic:
-        """A float of at most 64 bits, exactly.
-
-        Raises:
-            ValueError: it is not finite.
-        """
-        value = float(value)
-        if not math.isfinite(value):
-            raise ValueError(f"{value} is no number")
-        numerator, denominator = value.as_integer_ratio()
-        return cls(numerator, 1 - denominator.bit_length())
-
-    def __add__(self, other: Dyadic) -> Dyadic:
-        shift = self.exponent - other.exponent
-        if shift >= 0:
-            return Dyadic((self.mantissa << shift) + other.mantissa, other.exponent)
-        return Dyadic(self.mantissa + (other.mantissa << -shift), self.exponent)
-
-    def __neg__(self) -> Dyadic:
-        return Dyadic(-self.mantissa, self.exponent)
-
-    def __sub__(self, other: Dyadic) -> Dyadic:
-        return self + -other
-
-    def __mul__(self, other: Dyadic) -> Dyadic:
-        return Dyadic(self.mantissa * other.mantissa, self.exponent + other.exponent)
-
-    def __lt__(self, other: Dyadic) -> bool:
-        return (self - other).mantissa < 0
-
-    def __le__(self, other: Dyadic) -> bool:
-        return (self - other).mantissa <= 0
-
-    @property
-    def negative(self) -> bool:
-        """Whether it is below zero."""
-        return self.mantissa < 0
-
-    @property
-    def zero(self) -> bool:
-        """Whether it is zero."""
-        return self.mantissa == 0
-
-    def fraction(self) -> Fraction:
-        """The same number."""
-        return Fraction(self.mantissa) * Fraction(2) ** self.exponent
-
-    def __float__(self) -> float:
-        size = abs(self.mantissa)
-        cut = max(0, size.bit_length() - 64)
-        # the last of 64 bits says whether anything was cut: the rounding to 53 is then the correct one
-        kept = size >> cut | bool(size & ((1 << cut) - 1))
-        return math.ldexp(-kept if self.negative else kept, self.exponent + cut)
+Balls = list[Decimal]
 
 
-ZERO = Dyadic(0)
-HALF = Dyadic(1, -1)
+def exactly(value: SupportsFloat) -> Decimal:
+    """A float of at most 64 bits.
 
-Balls = list[Dyadic]
+    Raises:
+        ValueError: it is not finite.
+    """
+    value = float(value)
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number")
+    return Decimal(value)
+
+
+def nearest(value: Decimal) -> float:
+    """The float nearest to a number; zero has no sign."""
+    return float(_LONG.plus(value)) + 0.0
 
 
 def ball_history(world: World, start: BallState, steps: int) -> BallRun:
@@ -105,9 +64,10 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
         InputError: steps below 1, or a world whose steps are not sums and products.
     """
     expect_at_least(1, steps=steps)
-    program = _ExactBall(world, start)
-    first = [[float(c) for c in row] for row in (program.y, program.v)]
-    y, v, height, contact, counts = zip(*(program.step(index) for index in range(steps)), strict=True)
+    with decimal.localcontext(_EXACT):
+        program = _ExactBall(world, start)
+        first = [[nearest(c) for c in row] for row in (program.y, program.v)]
+        y, v, height, contact, counts = zip(*(program.step(index) for index in range(steps)), strict=True)
     iterations = np.array(counts, np.int64)
     unknown = np.full(iterations.shape, np.nan)
     none, real = np.zeros(0, np.int64), np.zeros(0)
@@ -136,11 +96,11 @@ class _ExactBall:
                 "not smooth",
             )
         self.world, self.contact_model, self.scheme = world, contact, scheme
-        self.value = {name: Dyadic.of(world.value(name)) for name in world.parameters}
+        self.value = {name: exactly(world.value(name)) for name in world.parameters}
         self.h = self.value["h"]
         self.half = HALF * self.h
-        self.y = [Dyadic.of(c) for c in np.asarray(start.y)]
-        self.v = [Dyadic.of(c) for c in np.asarray(start.v)]
+        self.y = [exactly(c) for c in np.asarray(start.y)]
+        self.v = [exactly(c) for c in np.asarray(start.v)]
         self.each = isinstance(contact, Projection) and isinstance(_ExactRule(world).rule, PerInstance)
         self.touching = self._judge(self.y, [False] * len(self.y))
         self.carried = self._pull(self.y, self.v, self._free(0), self.touching)
@@ -150,13 +110,13 @@ class _ExactBall:
         if control is None:
             return [-gravity] * len(self.y)
         row = np.asarray(control)[min(step, len(control) - 1)]
-        return [Dyadic.of(c) - gravity for c in np.broadcast_to(row, len(self.y))]
+        return [exactly(c) - gravity for c in np.broadcast_to(row, len(self.y))]
 
     def _judge(self, heights: Balls, before: list[bool]) -> list[bool]:
         lift = self.value.get("lift")
         if lift is None:
-            return [y.negative for y in heights]
-        return [y <= lift if was else y.negative for y, was in zip(heights, before, strict=True)]
+            return [y < 0 for y in heights]
+        return [y <= lift if was else y < 0 for y, was in zip(heights, before, strict=True)]
 
     def _pull(self, ys: Balls, vs: Balls, free: Balls, touching: list[bool]) -> Balls:
         if not isinstance(self.contact_model, Penalty):
@@ -188,7 +148,7 @@ class _ExactBall:
             self.touching = self._judge(heights, self.touching)
             reset = self._project if isinstance(self.contact_model, Projection) else self._bounce
             self.y, self.v, counts = reset(ys, vs)
-        plain = ([float(c) for c in row] for row in (self.y, self.v, heights))
+        plain = ([nearest(c) for c in row] for row in (self.y, self.v, heights))
         return *plain, list(self.touching), counts
 
     def _push(self, free: Balls) -> Balls:
@@ -208,7 +168,7 @@ class _ExactBall:
         e, rest = self.value["restitution"], self.value["rest_speed"]
         for ball, touches in enumerate(self.touching):
             if touches:
-                rebound = -(e * vs[ball]) if vs[ball].negative else ZERO
+                rebound = -(e * vs[ball]) if vs[ball] < 0 else ZERO
                 ys[ball], vs[ball] = ZERO, ZERO if rebound <= rest else rebound
         return ys, vs, [0] * len(ys)
 
@@ -217,7 +177,7 @@ class _ExactBall:
         gain, touching = self.value["alpha"] * self.value["k"], self.touching
 
         def depths() -> Balls:
-            return [-y if t and y.negative else ZERO for y, t in zip(ys, touching, strict=True)]
+            return [-y if t and y < 0 else ZERO for y, t in zip(ys, touching, strict=True)]
 
         rule = _ExactRule(self.world)
         residual = first = rule.measure(depths())
@@ -237,8 +197,8 @@ class _ExactBall:
         e = self.value["restitution"]
         for ball, touches in enumerate(touching):
             if touches:
-                ys[ball] = ZERO if ys[ball].negative else ys[ball]
-                vs[ball] = -(e * vs[ball]) if vs[ball].negative else ZERO
+                ys[ball] = ZERO if ys[ball] < 0 else ys[ball]
+                vs[ball] = -(e * vs[ball]) if vs[ball] < 0 else ZERO
         return ys, vs, counts if len(counts) == len(ys) else counts * len(ys)
 
 
@@ -269,23 +229,21 @@ class _ExactRule:
             largest = depth if largest < depth else largest
         return [largest]
 
-    def stops(self, residual: Dyadic, first: Dyadic, iteration: int) -> bool:
+    def stops(self, residual: Decimal, first: Decimal, iteration: int) -> bool:
         """Whether it is below its threshold."""
         if self.enter is not None and iteration == 0:
             return residual < self.enter
         if self.tol is None:
             return iteration >= self.max_iter
         if isinstance(self.rule, Relative):
-            return residual < (
-                Dyadic.of(float(np.finfo(np.float32).tiny)) if first.zero else self.tol * first
-            )
+            return residual < (exactly(float(np.finfo(np.float32).tiny)) if first == 0 else self.tol * first)
         return residual < self.tol
 
 
-def _held(world: World, value: Any) -> Dyadic:
+def _held(world: World, value: Any) -> Decimal:
     """A threshold as the decision's dtype holds it."""
-    return Dyadic.of(float(np.asarray(value).astype(world.policy.dtype("decision"))))
+    return exactly(float(np.asarray(value).astype(world.policy.dtype("decision"))))
 
 
-def _plus(values: Balls, factor: Dyadic, rates: Balls) -> Balls:
+def _plus(values: Balls, factor: Decimal, rates: Balls) -> Balls:
     return [value + factor * rate for value, rate in zip(values, rates, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
 from fractions import Fraction
 
 import numpy as np
@@ -26,7 +27,8 @@ from mdnum.ball import (
 )
 from mdnum.ball.rollout import cross_decisions
 from mdnum.errors import InputError
-from mdnum.forks.exact.ball import Dyadic, ball_history
+from mdnum.forks.exact import ball as exact
+from mdnum.forks.exact.ball import ball_history
 
 SCHEMES = {
     "explicit-euler": ExplicitEuler,
@@ -34,6 +36,8 @@ SCHEMES = {
     "velocity-verlet": BallVerlet,
 }
 H, G, START = 0.01, 9.81, 0.71
+#: Shares of a number that are far below the last digit of a float, and none.
+TINY = (Decimal(0), Decimal("1e-900"), Decimal("-1e-900"))
 
 
 @given(
@@ -42,17 +46,22 @@ H, G, START = 0.01, 9.81, 0.71
     st.floats(-1e6, 1e6).filter(lambda x: x == 0 or abs(x) > 1e-100),
 )
 def test_exact_numbers(a, b, c):
-    x, y, z = (Dyadic.of(value) for value in (a, b, c))
+    x, y, z = (exact.exactly(value) for value in (a, b, c))
     p, q, r = (Fraction(value) for value in (a, b, c))
-    assert (x * y - z + -x).fraction() == p * q - r - p
-    assert (x < y) == (p < q) and (x <= y) == (p <= q) and (x * y < z) == (p * q < r)
-    assert float(x) == a and float(x * y) == pytest.approx(a * b, rel=2.0**-52)
-    assert x.negative == (a < 0) and x.zero == (a == 0)
+    with localcontext(exact._EXACT):
+        assert Fraction(x * y - z + -x) == p * q - r - p
+        assert (x < y) == (p < q) and (x <= y) == (p <= q) and (x * y < z) == (p * q < r)
+        assert exact.nearest(x) == a and exact.nearest(x * y) == float(p * q)
+        # halfway between two floats, and a little beyond
+        middle = (x + exact.exactly(np.nextafter(a, np.inf))) * exact.HALF
+        assert [exact.nearest(middle + y * step) for step in TINY] == [
+            float(Fraction(middle) + q * Fraction(step)) for step in TINY
+        ]
 
 
 def test_a_number_that_is_none():
     with pytest.raises(ValueError, match="no number"):
-        Dyadic.of(float("nan"))
+        exact.exactly(float("nan"))
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
