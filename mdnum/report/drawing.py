@@ -21,25 +21,21 @@ from matplotlib.ticker import FuncFormatter, NullLocator, ScalarFormatter
 from mdnum.report.section import Figure, Plot, Region, Series
 from mdnum.report.words import MINUS, many, power, typeset
 
+# by role, in a light and in a dark page
+_THEMES = {
+    "ink": ("#1c2430", "#e4e7ec"), "muted": ("#66707e", "#98a2b0"), "grid": ("#e3e6ea", "#2b323c"),
+    "first": ("#2563a8", "#74a9e8"), "second": ("#ad5712", "#e79a58"), "third": ("#2c7a63", "#63bda1"),
+    "bad": ("#b3261e", "#f07b72"), "paper": ("#ffffff", "#14181e"),
+}  # fmt: skip
+LIGHT, DARK = ({role: colors[k] for role, colors in _THEMES.items()} for k in range(2))
 # colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
-COLORS = {
-    role: f"#0102{index:02x}"
-    for index, role in enumerate(("ink", "muted", "grid", "first", "second", "third", "bad", "paper"), 1)
-}
+COLORS = {role: f"#0102{index:02x}" for index, role in enumerate(_THEMES, 1)}
 INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, _ = COLORS.values()
 
 #: gid of text that stands on lines: it gets a rim in the color of the paper.
 HALO = "halo"
 _RIM = "paint-order: stroke; stroke: var(--paper); stroke-width: 3px; stroke-linejoin: round;"
 
-LIGHT = {
-    "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#ad5712",
-    "third": "#2c7a63", "bad": "#b3261e", "paper": "#ffffff",
-}  # fmt: skip
-DARK = {
-    "ink": "#e4e7ec", "muted": "#98a2b0", "grid": "#2b323c", "first": "#74a9e8", "second": "#e79a58",
-    "third": "#63bda1", "bad": "#f07b72", "paper": "#14181e",
-}  # fmt: skip
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Liberation Sans", "Helvetica Neue", Arial, sans-serif'
 #: Inches; the page scales it.
 WIDTH = 7.2

@@ -25,7 +25,7 @@ from mdnum.errors import InputError, expect_at_least
 from mdnum.numerics.events import Ledger
 
 # a float is a decimal of finitely many digits, and so are sums and products of decimals: all are kept
-_RANGE = {"Emin": decimal.MIN_EMIN, "Emax": decimal.MAX_EMAX}
+_RANGE: dict[str, Any] = {"Emin": decimal.MIN_EMIN, "Emax": decimal.MAX_EMAX}
 _EXACT = decimal.Context(decimal.MAX_PREC, traps=[decimal.Inexact, decimal.InvalidOperation], **_RANGE)
 # more digits than a number halfway between two floats has, the last of which says whether anything was cut:
 # the rounding to 53 bits is then the correct one

@@ -115,13 +115,11 @@ def agreement(
     """
     full = parameters.resolve(problem.simulation, names)
     known = dict(known or {})
-    asked = list(METHODS) if methods is None else methods
-    chosen = [by_name(one) if isinstance(one, str) else one for one in asked]
     opinions = [
         Opinion(one.name, one.description, known[one.name])
         if one.name in known
         else _asked(one, problem, full, progress)
-        for one in chosen
+        for one in _methods(methods)
     ]
     given = [one.found for one in opinions if one.found is not None]
     if not given:
@@ -280,9 +278,7 @@ def diagnose(
     if unknown:
         raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(PARTS)}")
     searched = parameters.resolve(problem.simulation, edges_of) if edges_of else ()
-    chosen = [
-        by_name(one) if isinstance(one, str) else one for one in (METHODS if methods is None else methods)
-    ]
+    chosen = _methods(methods)
     plain, why = _first(chosen, Symmetric), ""
     base: EventAware | Symmetric | None = None
     for one in filter(None, (_first(chosen, EventAware), plain)):
@@ -355,6 +351,11 @@ def diagnose(
     whole = tape.value if tape is not None else values[0] if values else problem.value()
     notes = {} if base is None else known[base.name].notes
     return GradientDiagnosis(problem.steps, full, whole, edges=around, notes=notes, failed=failed, **found)
+
+
+def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
+    """Methods by name or as they are; all of them where nothing was said."""
+    return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 
 def _first(methods: Sequence[Method], kind: type) -> Any:
