@@ -210,6 +210,15 @@ def print_document(document: Mapping[str, Any], text: str, as_json: bool) -> int
     return EXIT_FINE
 
 
+def print_lists(lists: Mapping[str, Any], as_json: bool, *tables: tuple[str, Sequence[str], Any]) -> int:
+    """Lists as JSON, or as tables of a title, columns and rows; returns the exit code of one that is fine."""
+    if as_json:
+        return print_json(lists)
+    for table in tables:
+        print_table(*table)
+    return EXIT_FINE
+
+
 def say(text: str, *, err: bool = False) -> None:
     """A line for a person, in which nothing that came from a file reaches the terminal raw."""
     # typer's own echo writes UTF-8 to a stream that is ascii

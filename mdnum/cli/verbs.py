@@ -107,14 +107,13 @@ def _balls(as_json: bool) -> int:
     balls = [systems.load(name, world="ball") for name in systems.names("ball")]
     rows = [{"name": one.name, "balls": one.balls, "about": one.spec.about} for one in balls]
     scripts = [{"name": name, "about": demos.about(name)} for name in demos.names()]
-    if as_json:
-        return output.print_json({"systems": rows, "demos": scripts})
     lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
-    output.print_table("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines)
-    output.say("")
-    title = "demonstrations: `mdnum ball --demo NAME`, or all"
-    output.print_table(title, ("name", "about"), [(row["name"], row["about"]) for row in scripts])
-    return output.EXIT_FINE
+    title = "\ndemonstrations: `mdnum ball --demo NAME`, or all"
+    return output.print_lists(
+        {"systems": rows, "demos": scripts}, as_json,
+        ("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines),
+        (title, ("name", "about"), [(row["name"], row["about"]) for row in scripts]),
+    )  # fmt: skip
 
 
 @app.command()
@@ -223,10 +222,9 @@ def conform(
             "--out": how["out"],
         }  # fmt: skip
         output.refuse_beside_resume(given, "examination")
-    words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
     return mdnum.conform(
         pairs, cases=cases, seed=seed, large=not no_large, full=full, precision=precision,
-        superset=superset or None, limits=words, time=time, resume=resume, **how,
+        superset=superset or None, limits=limits or (), time=time, resume=resume, **how,
     )  # fmt: skip
 
 
@@ -300,11 +298,8 @@ def list_systems(as_json: bool = JSON_OPTION) -> int:
 
     loaded = [(name, systems.load(name)) for name in systems.names()]
     rows = [{"name": name, **_size(one), "about": one.spec.about} for name, one in loaded]
-    if as_json:
-        return output.print_json({"systems": rows})
     lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
-    output.print_table("", ("name", "size", "about"), lines)
-    return output.EXIT_FINE
+    return output.print_lists({"systems": rows}, as_json, ("", ("name", "size", "about"), lines))
 
 
 @systems.command()

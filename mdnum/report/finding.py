@@ -46,7 +46,7 @@ import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -56,7 +56,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mdnum.plain import plain
 from mdnum.report import words
 from mdnum.report.browse import Browse, Column
-from mdnum.report.section import Key, Plot, Series
+from mdnum.report.section import Key, Plot, Series, cell
 
 if TYPE_CHECKING:
     from mdnum.store import RunFolder
@@ -97,13 +97,7 @@ class _Fields(string.Formatter):
             return words.number(value, int(format_spec), signed=format_spec.startswith("+"))
         if format_spec:
             raise ValueError(f"{format_spec!r} is no format of a sentence's field")
-        if isinstance(value, bool):
-            return "yes" if value else "no"
-        if isinstance(value, int):
-            return words.count(value)
-        if value is None or isinstance(value, float):
-            return words.number(value)
-        return words.typeset(str(value))
+        return cell(value)
 
     def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:
         try:
@@ -208,7 +202,7 @@ class Texts:
         told, columns = self.entries["browse"][name], []
         for column in told["columns"]:
             of, look = column["of"], {"words": choices.get(column["name"], ()), **column}
-            if all(end in rows for end in ([of] if isinstance(of, str) else of)):
+            if all(rows.get(end) is not None for end in ([of] if isinstance(of, str) else of)):
                 texts = {key: fill(look[key], values) for key in ("name", "unit") if key in look}
                 held = rows[of] if isinstance(of, str) else [rows[end] for end in of]
                 columns.append(Column(**{**look, **texts, "of": held}))
@@ -304,9 +298,7 @@ def conclude(
 
 def restore(kept: Mapping[str, Any]) -> Finding:
     """A finding that was written into summary.json."""
-    severity = kept.get("severity")
-    texts = {
-        name: str(kept.get(name) or "") for name in ("code", "title", "text", "remedy", "section", "cause")
-    }
-    finding = Finding(severity="info", values=dict(kept.get("values") or {}), **texts)
-    return replace(finding, severity=severity) if severity in _ORDER else finding
+    severity: Any = kept.get("severity") if kept.get("severity") in _ORDER else "info"
+    named = ("code", "title", "text", "remedy", "section", "cause")
+    texts = {name: str(kept.get(name) or "") for name in named}
+    return Finding(severity=severity, values=dict(kept.get("values") or {}), **texts)

@@ -264,14 +264,13 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
     if checks is None:
         return base.in_order(list(CHECKS))
-    texts = (checks,) if isinstance(checks, str) else checks
-    names = [name.strip() for text in texts for name in text.split(",") if name.strip()]
+    names = frame.words(checks)
     for name in names:
         if name not in CHECKS:
             raise unknown("check", name, CHECKS)
     if not names:
         raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
-    return base.in_order(list(dict.fromkeys(names)))
+    return base.in_order(list(names))
 
 
 def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:

@@ -308,9 +308,8 @@ def _stop_decisions(view: BallView) -> Iterator[Any]:
     if not len(rows["step"]):
         return
     chosen = np.sort(np.argsort(np.abs(rows["margin"].astype(float)), kind="stable")[:TABLE_ROWS])
-    near = {name: values[chosen] for name, values in rows.items()}
+    near: dict[str, Any] = {name: values[chosen] for name, values in rows.items()}
     near["code"] = np.array([_REASONS.index(word) for word in near["reason"].astype(str).tolist()])
-    if not np.any(rows["ball"] >= 0):
-        del near["ball"]
+    near["ball"] = near["ball"] if np.any(rows["ball"] >= 0) else None
     yield TEXTS("stops", shown=len(chosen), rows=len(rows["step"]))
     yield TEXTS.browse("stops", near, {"ended by": _REASONS})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -93,7 +93,7 @@ def conform(
     full: bool | None = None,
     precision: str | None = None,
     superset: bool | None = None,
-    limits: tuple[str, ...] = (),
+    limits: str | Sequence[str] = (),
     time: float | None = None,
     out: str | Path | None = None,
     resume: str | Path | None = None,
@@ -150,7 +150,8 @@ def conform(
             state = answers.restored(folder, Examination)
             pairs = pairs or state.word
         options = state.options if state is not None else Options(
-            CASES if cases is None else cases, seed, large, full, precision, superset, limits  # type: ignore
+            CASES if cases is None else cases, seed, large, full, precision, superset,  # type: ignore
+            frame.words(limits),
         )  # fmt: skip
         if not pairs:
             raise InputError("no list is given", remedy="Give a name, package.module:function or a function")

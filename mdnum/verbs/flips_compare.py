@@ -427,8 +427,8 @@ def _differing(view: ComparisonView, table: Mapping[str, np.ndarray]) -> Iterato
         return
     rules = [view.rule(one) for one in view.summary["rules"]]
     yield TEXTS("browse_pairs")
-    shown = {name: values for name, values in rows.items() if name != "rule" or len(rules) > 1}
-    yield TEXTS.browse("pairs", shown | {"in_b": rows["inside"] == "B"}, {"rule": rules}, unit=view.unit)
+    more = {"in_b": rows["inside"] == "B", "rule": rows["rule"] if len(rules) > 1 else None}
+    yield TEXTS.browse("pairs", {**rows, **more}, {"rule": rules}, unit=view.unit)
 
 
 def _input(view: ComparisonView, size: str) -> list[tuple[str, str]]:

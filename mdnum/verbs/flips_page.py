@@ -355,9 +355,9 @@ def _busiest(view: FlipsView) -> Browse | None:
     words = np.array([f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)], object)
     ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
     rows = {**table, "place": ranks, "of": words, "share": table["inside"] / view.summary["frames"]}
-    left = ["rule"] * (len(rules) < 2) + ["rank"] * (not table["rank"].any())
-    shown = {name: values for name, values in rows.items() if name not in left}
-    return TEXTS.browse("busiest", shown, {"rule": [one["rule"] for one in rules]})
+    rows |= {"rank": table["rank"] if table["rank"].any() else None}
+    rows |= {"rule": table["rule"] if len(rules) > 1 else None}
+    return TEXTS.browse("busiest", rows, {"rule": [one["rule"] for one in rules]})
 
 
 # ---- figures
@@ -376,12 +376,8 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
     frames, moving = rows("frames"), view.summary["frames"] > 1
     label, x = view.axis(frames)
     if moving:
-        yield plot(
-            "Pairs and flips",
-            "pairs",
-            [Series("pairs inside", x, frames["pairs"].astype(float))],
-            along=label,
-        )
+        inside = Series("pairs inside", x, frames["pairs"].astype(float))
+        yield plot("Pairs and flips", "pairs", [inside], along=label)
     if one["flips"]:
         columns = [x[1:], *(frames[name][1:].astype(float) for name in ("entered", "left", "ambiguous"))]
         width = -(-len(columns[0]) // _DENSE)

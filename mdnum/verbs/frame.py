@@ -16,7 +16,7 @@ import importlib
 import inspect
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -363,6 +363,12 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
             folder.append(name, columns)
     folder.finalize()
     folder.write_summary(plain(summary))
+
+
+def words(texts: Sequence[str] | str) -> tuple[str, ...]:
+    """Words that were given one by one, or with commas between them."""
+    texts = (texts,) if isinstance(texts, str) else texts
+    return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 
 
 def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:

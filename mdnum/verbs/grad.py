@@ -18,7 +18,7 @@ from mdnum.report.words import listed, percent
 from mdnum.store.files import write_bytes
 from mdnum.verbs import frame, grad_page
 from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step
-from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, View, words
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
 if TYPE_CHECKING:
@@ -127,12 +127,6 @@ def grad(
         answer.tables = {name: table for name, table in tables.items() if len(next(iter(table.values())))}
         _keep_arrays(answer)
     return answer.outcome
-
-
-def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Words that were given one by one, or with commas between them."""
-    texts = (texts,) if isinstance(texts, str) else texts
-    return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 
 
 # -- molecular dynamics ------------------------------------------------------------------------------
