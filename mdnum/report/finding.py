@@ -48,7 +48,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -177,12 +176,13 @@ class Texts:
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
         """The numbers above a page, from a table of values and notes; without those that show None."""
-        found = []
+        keys = []
         for label, texts in self.entries[table].items():
-            ways = [texts] if isinstance(texts[0], str) else texts
-            shown = (way for way in ways if all(_known(text, values) for text in (label, *way)))
-            found += [Key(*(fill(text, values) for text in (label, *way))) for way in islice(shown, 1)]
-        return found
+            for value, note in [texts] if isinstance(texts[0], str) else texts:
+                if all(_known(text, values) for text in (label, value, note)):
+                    keys.append(Key(fill(label, values), fill(value, values), fill(note, values)))
+                    break
+        return keys
 
     def browse(
         self,
@@ -199,14 +199,14 @@ class Texts:
             choices: words of columns of words, by column, where the text file does not have them.
             values: for fields in names and units of columns.
         """
-        told, columns = self.entries["browse"][name], []
-        for column in told["columns"]:
-            of, look = column["of"], {"words": choices.get(column["name"], ()), **column}
+        entry, columns = self.entries["browse"][name], []
+        for column in entry["columns"]:
+            of, options = column["of"], {"words": choices.get(column["name"], ()), **column}
             if all(rows.get(end) is not None for end in ([of] if isinstance(of, str) else of)):
-                texts = {key: fill(look[key], values) for key in ("name", "unit") if key in look}
-                held = rows[of] if isinstance(of, str) else [rows[end] for end in of]
-                columns.append(Column(**{**look, **texts, "of": held}))
-        return Browse(told.get("name", name), told["noun"], told["placeholder"], columns)
+                texts = {key: fill(options[key], values) for key in ("name", "unit") if key in options}
+                data = rows[of] if isinstance(of, str) else [rows[end] for end in of]
+                columns.append(Column(**{**options, **texts, "of": data}))
+        return Browse(entry.get("name", name), entry["noun"], entry["placeholder"], columns)
 
 
 def _plain(value: Any) -> Any:
