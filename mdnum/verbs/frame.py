@@ -316,16 +316,15 @@ def finish(
         FolderError: it holds no answer, is damaged or cannot be written.
     """
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
-    verb = verb_of(folder)
+    verb = importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
     say(progress, "report" if report else "check")
     with folder.explained():
         summary = folder.summary if view is None else view.summary
         if not summary and not verb.unfinished:
             raise FolderError(
                 f"holds no answer: `mdnum {folder.verb}` was stopped before it had one",
-                remedy=folder.again,
-                where=str(folder.path),
-            )
+                remedy=folder.again, where=str(folder.path),
+            )  # fmt: skip
         view = verb.view(folder, summary) if view is None else view
         verdict = verb.judge(view)
         judged = verdict.store(folder, summary)
@@ -335,11 +334,6 @@ def finish(
 
             write(folder, page, verdict)
     return Outcome(folder.path, judged, verdict, page, result)
-
-
-def verb_of(folder: RunFolder) -> Verb:
-    """What judges and shows a folder."""
-    return importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
