@@ -36,7 +36,7 @@ Status = Literal["ok", "info", "unsafe"]
 #: By test: its name, what was seen by status ("seen" where it is always the same) and what to do if unsafe.
 _WORDS: dict[str, Any] = beside(__file__)
 PACKAGES, PEERS = _WORDS["packages"]["needed"], _WORDS["packages"]["peers"]
-DIGEST_CODE, IMPORTS_CODE = (_WORDS[test]["code"] for test in ("second_process", "imports"))
+DIGEST_CODE, IMPORTS_CODE = _WORDS["digest_code"], _WORDS["imports_code"]
 _COUNT = 20_011  # beyond 16,384 elements XLA splits work between threads, by other code paths
 _FUNCTION_ULPS = 16
 _SIGMA, _EPSILON, _R_CUT, _SKIN = 3.405, 0.0103235, 8.5125, 0.4  # of argon (Å, eV, Å, Å)
