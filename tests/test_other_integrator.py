@@ -292,7 +292,7 @@ def test_a_linear_drift_of_its_own_is_differentiated_by_all():
         assert others == pytest.approx([first] * 3, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["kick", "finish", "begin", "init"])
+@pytest.mark.parametrize("name", ["kick", "finish", "begin", "init", "deform"])
 @pytest.mark.parametrize("base", [KickDrift, VelocityVerlet])
 def test_a_kick_that_derivatives_would_not_see_is_refused_when_its_class_is_made(base, name):
     with pytest.raises(TypeError, match=f"Planted has its own {name}"):

@@ -188,7 +188,8 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
         for step, i, j, margin, bound in zip(*vars(recorder.doubtful(segment)).values(), strict=True):
             x = segment.unsorted("x", int(step) - segment.first)
             kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
-            exact, inside = exact_margin(decider, simulation.cell, x[i], x[j], kind)
+            cell = segment.cell_of(int(step) - segment.first)
+            exact, inside = exact_margin(decider, cell, x[i], x[j], kind)
             decided = bool(decider.inside(-margin, 0.0))
             where = int(step), int(i), int(j), decided
             found.append(

@@ -44,6 +44,7 @@ def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]
 
     From the closest pairs of a start to as far as pairs are counted.
     """
+    simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
     reach = min(half, _REACH * simulation.r_cut)
     distances = pair_distances(simulation, np.asarray(start.state.x, np.float64).T, reach)
@@ -66,7 +67,7 @@ def measure(
     potential, kinetic, virial = (
         float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
     )
-    x = segment.state.x_before
+    x, simulation = segment.state.x_before, simulation.in_row(segment.cell_of(segment.rows - 1))
     tables = simulation.tables(segment.table)
     force = np.asarray(_forces(simulation.force, x[:, segment.table.order], tables), np.float64)
     square = (force**2).sum(axis=0)
@@ -177,7 +178,7 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
     for step, *segments in zip(steps, *pair, strict=False):
         a, b = (np.asarray(segment.state.x, np.float64) for segment in segments)
-        d = simulation.cell.minimum_image(*(a - b))
+        d = simulation.in_row(segments[0].state.cells[0]).cell.minimum_image(*(a - b))
         if float(np.sqrt(sum(np.asarray(c) ** 2 for c in d)).max()) > separation:
             return step
     return None

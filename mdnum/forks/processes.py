@@ -147,7 +147,9 @@ def variants(
         MdnumError: none of them ran.
     """
     from mdnum.md.cell import Cell, displacement
+    from mdnum.md.integrators import check_one_box
 
+    check_one_box(system.integrator, "variants in processes of their own")
     if not system.pairwise:
         raise InputError("variants of a many-body potential are not supported", where=system.name)
     if steps < 1 or not which:

@@ -52,12 +52,12 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
-    a, b = program_a.simulation, program_b.simulation
     i, j = fork.decision.subject
     # to the same last step as the first time, so that no program is compiled again
-    x_a, x_b = (program.positions_at(fork.decision.step, fork.asked) for program in (program_a, program_b))
-    if x_a is None or x_b is None:
+    states = [program.state_at(fork.decision.step, fork.asked) for program in (program_a, program_b)]
+    if states[0] is None or states[1] is None:
         return None
+    (a, x_a), (b, x_b) = states
     cell = HostCell(a.cell)
     across = np.stack(cell.displacement(x_a[[i]], x_a[[j]]), axis=-1)[0]
     from_i = np.stack(cell.displacement(np.broadcast_to(x_a[i], x_a.shape), x_a), axis=-1)
@@ -276,9 +276,9 @@ class _Search:
         self.fork, self.horizon, self.allowed, self.progress = fork, horizon, allowed, progress
         self.made = 0
         self.known: dict[frozenset[int], bool] = {frozenset(): False}
-        self._cell = HostCell(fork.twin.a.simulation.cell)
         self._every = max(1, horizon // _SAMPLES)
-        self._positions: dict[int, np.ndarray] = {}
+        # by step, with the box
+        self._positions: dict[int, tuple[HostCell, np.ndarray]] = {}
         self._tape = taped(fork.twin.a, horizon, self._keep)
 
     def spent(self) -> bool:
@@ -289,7 +289,8 @@ class _Search:
         """A's positions now and then."""
         for row in range(segment.rows):
             if (segment.first + row) % self._every == 0:
-                self._positions[segment.first + row] = segment.unsorted("x", row).astype(np.float64)
+                x = segment.unsorted("x", row).astype(np.float64)
+                self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
         """Whether B stays with A when these pairs are pinned; False once no more runs are allowed."""
@@ -312,7 +313,8 @@ class _Search:
                 step = segment.first + row
                 if step in self._positions:
                     here = segment.unsorted("x", row).astype(np.float64)
-                    d = self._cell.displacement(self._positions[step], here)
+                    cell, x = self._positions[step]
+                    d = cell.displacement(x, here)
                     if not float(np.max(sum(c * c for c in d))) <= tolerance**2:
                         return False
             reached = segment.last

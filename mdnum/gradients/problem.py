@@ -18,7 +18,7 @@ from mdnum.errors import InputError, NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
-from mdnum.md.integrators import without_kick
+from mdnum.md.integrators import check_one_box, without_kick
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
 from mdnum.systems.simulation import Simulation
@@ -57,6 +57,7 @@ class Problem:
             raise InputError(f"steps = {self.steps}; expected at least 1")
         # a state that the integrator has no steps for is refused before anything is run
         assert self.simulation.propagator is not None
+        check_one_box(self.simulation.integrator, "gradients")
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
                 f"the loss {self.loss.name} looks at no step up to {self.steps}",

@@ -7,6 +7,7 @@ bits as separate rounding, and numpy reproduces what jit computed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -120,6 +121,42 @@ class Cell(eqx.Module):
         lattice = (self.matrix, self.inverse, self.pbc, self.orthorhombic)
         return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
+    def deformation(self, now: Cell):
+        """How this box became another, shape (3, 3): lattice vectors, as rows, are those here times it.
+
+        Directions along free axes stay as they are. Exactly the identity where the vectors are the same.
+        """
+        return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
+
+    def deformed(self, by) -> Cell:
+        """The box whose lattice vectors, as rows, are those of this one times a deformation (inside jit).
+
+        Args:
+            by: shape (3, 3), float64. A box along x, y and z must stay so, or have orthorhombic = False.
+        """
+        matrix, flags = self.matrix @ by, np.array(self.pbc)
+        rows = jnp.where(flags[:, None], matrix, 0.0)
+        # of the products of rows: a free axis, which has none, keeps an inverse of 0
+        square = rows @ rows.T + np.diag(np.where(flags, 0.0, 1.0))
+        crossed = jnp.cross(square[np.array([1, 2, 0])], square[np.array([2, 0, 1])])
+        return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
+
+    def spent(self, x, reference: Cell, home, r_list):
+        """The largest displacement relative to the box, and half of the list's strain loss (inside jit).
+
+        A list holds every pair inside while this is at most half its skin.
+
+        Args:
+            x, home: positions now, in this box, and at the build of the list, in that of reference; length,
+                shape (3, atoms). Both boxes in float64.
+            r_list: radius of the list, length.
+
+        Returns:
+            length, float64.
+        """
+        moved = x - transformed(home, reference.deformation(self))
+        return self.astype(x.dtype).farthest(moved) + 0.5 * strain_loss(reference, self, r_list)
+
     def farthest(self, moved):
         """The largest length of displacements reduced to their nearest images, float64 (inside jit)."""
         d = self.minimum_image(*moved)
@@ -159,7 +196,7 @@ def nearest_image(lattice, x, y, z):
     """`Cell.minimum_image` of one displacement in compiled loops over pairs, with the same bits.
 
     Args:
-        lattice: `HostCell.numbers`, in the dtype of the displacement.
+        lattice: as `box_of` has it, in the dtype of the displacement.
     """
     a, m, pbc, orthorhombic = lattice
     if not (pbc[0] or pbc[1] or pbc[2]):
@@ -179,20 +216,31 @@ def nearest_image(lattice, x, y, z):
     return x, y, z
 
 
-class HostCell:
-    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls.
+def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
+    """Boxes as compiled loops over rows take them: one for all rows, or one for each (see `box_of`)."""
+    numbers = np.array([(cell.matrix, cell.inverse) for cell in cells], dtype)
+    return numbers, cells[0].pbc, all(cell.orthorhombic for cell in cells)
 
-    Attributes:
-        lattice: lattice vectors, their inverse (lengths and inverse lengths, in the dtype), periodicity and
-            whether the vectors lie along x, y and z.
-        numbers: the same without arrays, whose users a compiled loop would count again and again.
+
+@njit(inline="always")
+def box_of(boxes, row):
+    """The box of a row, of boxes that were `stacked`: lattice vectors, their inverse, periodicity and whether
+    the vectors lie along x, y and z; without arrays, whose users a compiled loop would count again and again.
     """
+    numbers, pbc, orthorhombic = boxes
+    a, m = numbers[row % len(numbers), 0], numbers[row % len(numbers), 1]
+    matrix = (a[0, 0], a[0, 1], a[0, 2]), (a[1, 0], a[1, 1], a[1, 2]), (a[2, 0], a[2, 1], a[2, 2])
+    inverse = (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
+    return matrix, inverse, pbc, orthorhombic
+
+
+class HostCell:
+    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls."""
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
         matrix, inverse = np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype)
-        self.lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
-        self.numbers = (tuple(map(tuple, matrix)), tuple(map(tuple, inverse)), *self.lattice[2:])
+        self._lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
 
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
@@ -200,9 +248,9 @@ class HostCell:
         """Components of the nearest image of end - start, with the bits that the force loop computes."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
-        if not any(self.lattice[2]):
+        if not any(self._lattice[2]):
             return x, y, z
-        return _subtract(self.lattice, x, y, z, _images(self.lattice, x, y, z, np.rint))
+        return _subtract(self._lattice, x, y, z, _images(self._lattice, x, y, z, np.rint))
 
 
 def wrap_positions(
@@ -232,19 +280,24 @@ def displacement(
     return HostCell(cell, dtype).displacement(start, end)
 
 
-def strain_loss(reference: Cell, now: Cell, r_list: float) -> float:
+def transformed(x, by):
+    """Components of positions, which as rows are multiplied by a deformation (inside jit)."""
+    by = by.astype(x.dtype)
+    return jnp.stack([by[0, k] * x[0] + by[1, k] * x[1] + by[2, k] * x[2] for k in range(3)])
+
+
+def strain_loss(reference: Cell, now: Cell, r_list):
     """How much shorter a listed distance can have become by deforming the box alone, length.
 
     A pair just outside the list moves with the box; the deformation F takes a vector of length r_list to
     at least sigma_min(F) * r_list. Added to twice the largest displacement relative to the box it must stay
-    within the skin.
+    within the skin. On the host and inside jit.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """
-    flags = np.array(reference.pbc)
-    a, b = complete(np.asarray(reference.matrix), flags), complete(np.asarray(now.matrix), flags)
-    smallest = np.linalg.svd(np.linalg.solve(a, b), compute_uv=False)[-1]
-    return float(r_list * max(0.0, 1.0 - smallest))
+    deformation = reference.deformation(now)
+    module = deformation.__array_namespace__()
+    return r_list * module.maximum(0.0, 1.0 - module.linalg.svd(deformation, compute_uv=False)[-1])
 
 
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, Real
 
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.errors import InputError
-from mdnum.md.cell import Cell
+from mdnum.md.cell import Cell, transformed
 from mdnum.registry import Registry
 from mdnum.units import Units
 
@@ -175,6 +175,30 @@ class Integrator(eqx.Module):
             order: sorted atom k is atom order[k]; noise belongs to the atom, not to its place.
         """
 
+    def deform(
+        self, cell: Cell, v: Vector, extra: Any, masses: Masses, virial: Number, step: Step
+    ) -> tuple[Float[Array, "3 3"], Vector, Any]:
+        """How the box deforms on the way to the next force evaluation, after `begin`; by default not at all.
+
+        Lattice vectors and positions, as rows, are multiplied by what it returns: an integrator that has
+        positions move relative to the box adds that in `begin`.
+
+        Args:
+            cell: the box of the step, float64.
+            v, extra: sorted velocities and the extra state, as `begin` left them.
+            virial: sum over pairs of r_ij · F_ij at the step, energy.
+            step: the step that has just been evaluated.
+
+        Returns:
+            the deformation, shape (3, 3), float64; velocities and extra state.
+        """
+        return jnp.eye(3), v, extra
+
+    @property
+    def moves_cell(self) -> bool:
+        """Whether it has its own `deform`; if not, the box is a constant and no row records it."""
+        return type(self).deform is not Integrator.deform
+
     def kinetic(self, v: Vector, masses: Masses) -> Number:
         """Kinetic energy."""
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
@@ -197,6 +221,7 @@ class StepEnd(NamedTuple):
     ahead: Any
     images: Vector  # lattice vectors that wrapping has just taken off
     heat: Number  # energy taken up on the way
+    cell: Cell  # box of the next step
 
 
 def one_step(
@@ -209,11 +234,12 @@ def one_step(
     v: Vector,
     extra: Any,
     force: Vector,
+    virial: Number,
 ) -> StepEnd:
     """One step of molecular dynamics, from its forces to the positions of the next.
 
     Args:
-        cell: in the dtype of x. masses: float64. force: at x.
+        cell: the box, float64. masses: float64. force, virial: at x.
         x, v, extra: wrapped positions, and what `begin` left; at step 0 the start.
     """
     dtype = x.dtype
@@ -223,8 +249,11 @@ def one_step(
     second_half = jnp.where(step == 0, jnp.zeros((), dtype), half)
     v, extra = integrator.finish(v, extra, acceleration, masses, second_half)
     after, kicked, ahead, heat = integrator.begin(x, v, extra, acceleration, masses, step, order)
-    wrapped, n = cell.wrap(*after)
-    return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat)
+    if integrator.moves_cell:
+        by, kicked, ahead = integrator.deform(cell, kicked, ahead, masses, virial, step)
+        cell, after = cell.deformed(by), transformed(after, by)
+    wrapped, n = cell.astype(dtype).wrap(*after)
+    return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat, cell)
 
 
 class KickDrift(Integrator):
@@ -235,12 +264,12 @@ class KickDrift(Integrator):
         True
 
     Raises:
-        TypeError: a subclass has another kick, half step or extra state, which those would not see.
+        TypeError: a subclass has another kick, half step, extra state or box, which those would not see.
     """
 
     def __init_subclass__(cls, **options: Any):
         super().__init_subclass__(**options)
-        own = ("kick", "init", "finish", "begin")
+        own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(f"{cls.__name__} has its own {other[0]}: make it an Integrator, not a KickDrift")
 
@@ -279,6 +308,12 @@ def check_kick(integrator: Integrator) -> None:
     """Refuse an integrator that a linearization would not see, with an `InputError`."""
     if why := without_kick(integrator):
         raise InputError(f"the run cannot be linearized here: {why}", where="dynamics.kind")
+
+
+def check_one_box(integrator: Integrator, what: str) -> None:
+    """Refuse an integrator that moves the box for what has one box alone, with an `InputError`."""
+    if integrator.moves_cell:
+        raise InputError(f"{what} need one box, and {integrator.name} moves it", where="dynamics.kind")
 
 
 def _is_linear(integrator: KickDrift) -> bool:

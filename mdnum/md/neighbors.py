@@ -228,14 +228,8 @@ class VerletList:
         Args:
             positions, cell: now; reference, reference_cell: at the build. Wrapped positions, length.
         """
-        moved = displacement(cell, _carried(reference, reference_cell, cell), positions)
+        carried = np.asarray(reference) @ reference_cell.deformation(cell)
+        moved = displacement(cell, carried, positions)
         largest = float(np.sqrt(np.max(sum(c * c for c in moved), initial=0.0)))
         loss = strain_loss(reference_cell, cell, self.r_cut + self.rule.skin)
-        return (2 * largest + loss) / self.rule.skin if self.rule.skin > 0 else np.inf
-
-
-def _carried(positions, old: Cell, new: Cell):
-    """Where positions would be if they had only moved with the box."""
-    if np.array_equal(old.matrix, new.matrix):
-        return positions
-    return np.asarray(positions) @ np.asarray(old.inverse) @ np.asarray(new.matrix)
+        return float(2 * largest + loss) / self.rule.skin if self.rule.skin > 0 else np.inf

@@ -58,7 +58,7 @@ class PairForce(eqx.Module):
     """Forces and decisions of a cut pair potential."""
 
     model: CutPotential  # the potential with its cutoff
-    cell: Cell  # the box
+    cell: Cell  # the box; that of a row in a rollout
     zero: Int[Array, ""]  # an integer zero that XLA must not know (see precision.exact)
     # of the pair decision, by pair type, in the dtype and space that it compares in
     thresholds: Real[Array, "types"]
@@ -421,6 +421,6 @@ class PairDynamics(eqx.Module):
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
         """One step, with the forces of the pairs that are decided to be inside."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
-        cell, order = self.force.cell.astype(state.x.dtype), self.tables.order
-        end = one_step(self.integrator, cell, self.masses, order, *state, made.force)
+        order, cell = self.tables.order, self.force.cell
+        end = one_step(self.integrator, cell, self.masses, order, *state, made.force, made.virial)
         return MdState(state.step + 1, end.x, end.kicked, end.ahead)

@@ -322,7 +322,7 @@ def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, fl
         potential = segment.rows_of("potential")
         for row in range(segment.rows):
             x = np.asarray(segment.unsorted("x", row), np.float64)
-            x = unwrapped(simulation.cell.matrix, x, segment.unsorted("images", row))
+            x = unwrapped(segment.cell_of(row).matrix, x, segment.unsorted("images", row))
             yield x, np.asarray(segment.unsorted("v", row), np.float64), float(potential[row])
 
 

@@ -64,7 +64,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
     x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
         back.x, back.v, back.extra, masses, step, order
     )
-    wrapped, n = program.cell.wrap(*x)
+    wrapped, n = program.force.cell.wrap(*x)  # type: ignore[attr-defined]
     images = back.images + jnp.stack(n).astype(jnp.int32)
     return Back(step, jnp.stack(wrapped), v, images, extra)
 
@@ -103,7 +103,8 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
         earlier = _before(program, masses, order, here._replace(v=v))
         start = here._replace(step=here.step - 1, v=v)
         earlier = jax.tree.map(lambda a, b: jnp.where(here.step == 0, a, b), start, earlier)
-        return earlier, row + 1, program.cell.farthest(earlier.x - home) > program.half_skin, record
+        largest = program.force.cell.farthest(earlier.x - home)  # type: ignore[attr-defined]
+        return earlier, row + 1, largest > program.half_skin, record
 
     def go_on(carry):
         here, row, due, _ = carry

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mdnum.compiled import njit
-from mdnum.md.cell import Cell
+from mdnum.md.cell import Cell, box_of, nearest_image, stacked
 from mdnum.md.ledger import Columns
 from mdnum.md.neighbors import PairTable
 
@@ -221,25 +221,12 @@ def in_user_order(
 
 
 @njit
-def _largest(a, b, matrix, inverse, pbc, orthorhombic, out):
-    periodic = pbc[0] or pbc[1] or pbc[2]
+def _largest(a, b, boxes, out):
     for row in range(out.shape[0]):
-        most = 0.0
+        most, box = 0.0, box_of(boxes, row)
         for k in range(a.shape[2]):
             x, y, z = b[row, 0, k] - a[row, 0, k], b[row, 1, k] - a[row, 1, k], b[row, 2, k] - a[row, 2, k]
-            if periodic and orthorhombic:
-                x -= np.rint(x * inverse[0, 0]) * matrix[0, 0]
-                y -= np.rint(y * inverse[1, 1]) * matrix[1, 1]
-                z -= np.rint(z * inverse[2, 2]) * matrix[2, 2]
-            elif periodic:
-                u = np.rint(x * inverse[0, 0] + y * inverse[1, 0] + z * inverse[2, 0])
-                v = np.rint(x * inverse[0, 1] + y * inverse[1, 1] + z * inverse[2, 1])
-                w = np.rint(x * inverse[0, 2] + y * inverse[1, 2] + z * inverse[2, 2])
-                for axis, n in enumerate((u, v, w)):
-                    if pbc[axis]:
-                        x -= n * matrix[axis, 0]
-                        y -= n * matrix[axis, 1]
-                        z -= n * matrix[axis, 2]
+            x, y, z = nearest_image(box, x, y, z)
             square = x * x + y * y + z * z
             # what is not a number stays the largest
             if not square <= most:
@@ -250,12 +237,10 @@ def _largest(a, b, matrix, inverse, pbc, orthorhombic, out):
 
 
 @njit
-def _overridden(
-    own, told, index, order, x, species, r_cut, matrix, inverse, pbc, orthorhombic, count, furthest
-):
+def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthest):
     atoms = order.shape[0]
-    ends, distance = np.empty((2, 1, 3, 1)), np.empty(1)
     for row in range(count.shape[0]):
+        at, box = x[row], box_of(boxes, row)
         for word in range(own.shape[1]):
             any_bit = np.uint8(0)
             for column in range(atoms):
@@ -271,37 +256,34 @@ def _overridden(
                     # a pair is listed from both ends
                     if other >= atoms or order[column] >= order[other]:
                         continue
-                    for axis in range(3):
-                        ends[0, 0, axis, 0] = x[row, axis, column]
-                        ends[1, 0, axis, 0] = x[row, axis, other]
-                    _largest(ends[0], ends[1], matrix, inverse, pbc, orthorhombic, distance)
-                    off = abs(distance[0] - r_cut[species[order[column]], species[order[other]]])
+                    # in double precision, whatever the state
+                    dx = np.float64(at[0, other]) - np.float64(at[0, column])
+                    dy = np.float64(at[1, other]) - np.float64(at[1, column])
+                    dz = np.float64(at[2, other]) - np.float64(at[2, column])
+                    dx, dy, dz = nearest_image(box, dx, dy, dz)
+                    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+                    off = abs(distance - r_cut[species[order[column]], species[order[other]]])
                     count[row] += 1
                     if furthest[row] == furthest[row] and not off <= furthest[row]:
                         furthest[row] = off
 
 
 class Apart:
-    """Distances between the same atoms of two runs in one box, and of pairs on which they differ.
+    """Distances between the same atoms of two runs, and of pairs on which they differ.
 
     Args:
-        cell: the box; distances are those of nearest images.
+        cells: the box, or one for each row; distances are those of nearest images.
     """
 
-    def __init__(self, cell: Cell):
-        self._lattice = (
-            np.asarray(cell.matrix, np.float64),
-            np.asarray(cell.inverse, np.float64),
-            np.array(cell.pbc, bool),
-            cell.orthorhombic,
-        )
+    def __init__(self, *cells: Cell):
+        self._boxes = stacked(cells)
 
     def __call__(
         self, a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
     ) -> Float[np.ndarray, "rows"]:
         """At each row; NaN where a position is not a number."""
         out = np.empty(len(a))
-        _largest(a, b, *self._lattice, out)
+        _largest(a, b, self._boxes, out)
         return out
 
     def overridden(
@@ -323,7 +305,7 @@ class Apart:
             r_cut: cutoff by species, length.
         """
         count, furthest = np.zeros(len(own), np.int64), np.zeros(len(own))
-        _overridden(own, told, table.index, table.order, x, species, r_cut, *self._lattice, count, furthest)
+        _overridden(own, told, table.index, table.order, x, species, r_cut, self._boxes, count, furthest)
         return count, furthest
 
 

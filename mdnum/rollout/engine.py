@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import jax
@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from mdnum.md.cell import wrap_positions
+from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.decide import Changes, Tables, zeros
-from mdnum.md.neighbors import PairTable, VerletList
+from mdnum.md.neighbors import PairTable, VerletList, check_radius
 from mdnum.numerics import check_not_forked
 from mdnum.rollout.epoch import (
     EpochOutcome,
@@ -63,9 +63,11 @@ class Segment:
     # last row is not finite), "runaway" (what follows it is wild)
     closes: str | None
     due: bool  # the list must not be used for the step after the last row
-    moved: float  # largest displacement since the list was built, at that step, length
+    # largest displacement since the list was built (see `Cell.spent`), at that step, length
+    moved: float
     state: EpochState  # where the rollout goes on
     home: Float[Array, "3 atoms"]  # wrapped positions at which the list was built, shape (3, atoms)
+    cell: Cell  # the box of every row, on the host, unless each has its own
     start: EpochState  # where the rollout stood before
     # inside, leap: of `EpochOutcome`: decisions of `before` that are yes, and the longest way of an atom from
     # there to the first row, length
@@ -84,6 +86,15 @@ class Segment:
         """The filled rows of a column of the record; where it has none, the steps are made once more."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The box of each row, on the host, where the integrator moves it; else none."""
+        return self.record.boxes(self.rows, self.cell.pbc)
+
+    def cell_of(self, row: int) -> Cell:
+        """The box at a row, on the host."""
+        return self.cells[row] if self.cells else self.cell
 
     @property
     def last_positions(self) -> Float[Array | np.ndarray, "3 atoms"]:
@@ -121,17 +132,22 @@ class Start:
         """Plain arrays for a checkpoint."""
         parts = self.state._asdict()
         parts |= {f"extra_{k}": leaf for k, leaf in enumerate(jax.tree.leaves(parts.pop("extra")))}
+        # boxes with their inverses, as the loop had them: no others have their bits
+        parts["cells"] = np.stack(jax.tree.leaves(parts["cells"]))
         arrays = {f"state_{name}": np.asarray(value) for name, value in parts.items()}
         numbers = {"built": self.built, "epoch": self.epoch, "slots": self.slots}
         return arrays | {"reference": self.reference} | {k: np.asarray(v) for k, v in numbers.items()}
 
     @classmethod
     def from_arrays(cls, arrays, simulation: Simulation) -> Start:
-        """The inverse of `to_arrays`, bit for bit."""
-        places = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-1])
-        leaves, structure = jax.tree.flatten(first_state(simulation).state.extra)
+        """The inverse of `to_arrays`, bit for bit; one without a box has that of the simulation."""
+        places: Any = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-2])
+        first = first_state(simulation).state
+        leaves, structure = jax.tree.flatten(first.extra)
         extra = [jnp.asarray(arrays[f"state_extra_{k}"]) for k in range(len(leaves))]
-        state = EpochState(*places)._replace(extra=jax.tree.unflatten(structure, extra))
+        numbers, boxes = jax.tree.flatten(first.cells)
+        cells: Any = jax.tree.unflatten(boxes, list(jnp.asarray(arrays.get("state_cells", numbers))))
+        state = EpochState(*places)._replace(extra=jax.tree.unflatten(structure, extra), cells=cells)
         return cls(
             state,
             jnp.asarray(arrays["reference"].T, state.x.dtype),
@@ -152,7 +168,10 @@ def first_state(simulation: Simulation) -> Start:
     # numpy's arrays: jnp would compile a program for each
     state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0))))
     extra = simulation.propagator.init(state.x, state.v, jax.device_put(simulation.masses))
-    state = state._replace(extra=jax.device_put(jax.tree.map(np.asarray, extra)))
+    moves, cell = simulation.integrator.moves_cell, simulation.cell.astype(np.float64)
+    # one that moves need not stay along x, y and z
+    cells = (replace(cell, orthorhombic=False),) * 3 if moves else (cell,)
+    state = state._replace(extra=jax.device_put(jax.tree.map(np.asarray, extra)), cells=cells)
     return Start(state, state.x)
 
 
@@ -201,11 +220,14 @@ class Engine:
         self.verlet: VerletList = simulation.verlet_list()
         self.verlet.slots = self.start.slots
         rule = simulation.rule
-        masses, half_skin = jax.device_put((simulation.masses, np.float64(rule.skin / 2)))
+        numbers = simulation.masses, np.float64(rule.skin / 2), np.float64(simulation.r_cut + rule.skin)
+        masses, half_skin, r_list = jax.device_put(numbers)
         self.program = EpochProgram(
-            simulation.force, simulation.propagator, simulation.cell.astype(np.float64), masses, half_skin,
+            simulation.force, simulation.propagator, masses, half_skin, r_list,
             rule.every, rule.delay, rule.check, record, self.rows,
         )  # fmt: skip
+        self._moves = self.program.integrator.moves_cell
+        self._cell = jax.tree.map(np.asarray, self.start.state.cells[0])
         # a liquid has one change for ten atoms a step; where there are more, room is doubled
         self._room_for_changes(0 if self.rows else max(64, simulation.atoms // 4))
         self._records: list[EpochRecord | None] = [None, None]
@@ -234,7 +256,7 @@ class Engine:
         if held is not None and held.bits.shape[:2] == (rows, words) and had == changes:
             return held
         dtype = self.simulation.policy.dtype("state")
-        return empty_record(rows, words, self.simulation.atoms, dtype, self.record, changes)
+        return empty_record(rows, words, self.simulation.atoms, dtype, self.record, changes, self._moves)
 
     def give(self, turn: int, record: EpochRecord) -> None:
         """Return a record that nobody reads any more."""
@@ -275,7 +297,11 @@ class Engine:
 
     def _listed(self, start: Start) -> tuple[PairTable, Tables]:
         """The list of a start, searched for, and as the loop reads it."""
-        table = self.verlet.build(start.home.T, self.simulation.cell)
+        cell = self._cell
+        if self._moves:
+            cell = jax.tree.map(np.asarray, start.state.cells[-1])
+            check_radius(cell, self.simulation.r_cut, self.simulation.rule.skin)
+        table = self.verlet.build(start.home.T, cell)
         return table, self.simulation.tables(table)
 
     def _advance(self, listed: tuple[PairTable, Tables], start: Start, held, turn: int):
@@ -321,8 +347,8 @@ class Engine:
         closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
         segment = Segment(
             first, rows, record, changes, before, table, start.epoch, start.built, first == start.built,
-            closes, bool(rebuild), float(outcome.moved), outcome.state, start.home, start.state,
-            outcome.inside, outcome.leap, outcome.held,
+            closes, bool(rebuild), float(outcome.moved), outcome.state, start.home, self._cell,
+            start.state, outcome.inside, outcome.leap, outcome.held,
             cache(partial(self._with_rows, replace(start, slots=table.slots), first + rows - 1)),
         )  # fmt: skip
         return segment, last
@@ -364,7 +390,9 @@ def resume_point(segment: Segment) -> Start:
 
 
 def unwrapped(
-    cell_matrix: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
+    cell_matrix: Float[np.ndarray | Array, "3 3"],
+    x: Float[np.ndarray, "atoms 3"],
+    images: Int[np.ndarray, "atoms 3"],
 ):
     """Positions as if the box had no faces: wrapped positions plus the lattice vectors taken off."""
     return x + images @ np.asarray(cell_matrix)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -83,11 +83,11 @@ class Pins:
 class EpochProgram(eqx.Module):
     """Everything about a rollout that stays the same from epoch to epoch."""
 
-    force: eqx.Module  # PairForce or ManyBodyForce: forces and decisions over a list
+    force: eqx.Module  # PairForce or ManyBodyForce: forces and decisions over a list, in the box of a row
     integrator: Integrator  # between force evaluations
-    cell: Cell  # the box, float64
     masses: Float[Array, "atoms"]  # shape (atoms,), in the user's order
     half_skin: Float[Array, ""]  # half the skin, length
+    r_list: Float[Array, ""]  # radius of the list, length
     # every, delay: when the list may be rebuilt (RebuildRule)
     every: int = eqx.field(static=True)
     delay: int = eqx.field(static=True)
@@ -109,6 +109,8 @@ class EpochState(NamedTuple):
     x_before: Float[Array, "3 atoms"]  # positions of the step before, shape (3, atoms)
     heat: Float[Array, ""]  # energy taken up from the thermostat so far
     extra: Any = ()  # of the integrator, as `Integrator.init` makes it
+    # the box, float64; where the integrator moves it, also those of the step before and of the list's build
+    cells: tuple[Cell, ...] = ()
 
 
 class EpochRecord(NamedTuple):
@@ -124,11 +126,16 @@ class EpochRecord(NamedTuple):
     kinetic: Float[Array, "rows"]
     virial: Float[Array, "rows"]
     heat: Float[Array, "rows"]
-    # nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,)
+    # nearest: smallest |margin|; moved: `Cell.spent` since the list was built; of shape (rows,)
     nearest: Float[Array, "rows"]
     moved: Float[Array, "rows"]
     inside: Float[Array, "rows"]  # how many decisions are yes, without rows; shape (rows,)
+    cell: Float[Array, "rows vectors 3"]  # lattice vectors, shape (rows, 3, 3), or (rows, 0, 3) of one box
     changes: Changes | None = None  # of decisions from row to row, instead of rows
+
+    def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
+        """The boxes of the first rows, on the host; none where there is one for all."""
+        return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows] if one.size)
 
 
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved", "inside")
@@ -143,23 +150,25 @@ class EpochOutcome(NamedTuple):
     # a lattice vector in one step, so that forces there would mean nothing and decisions would no longer be
     # exact
     flags: Int[Array, "4"]
-    # largest displacement since the list was built, at the step that comes next, length
+    # largest displacement since the list was built (see `Cell.spent`), at the step that comes next, length
     moved: Float[Array, ""]
     # decisions of the list at the step before, for the count check and the first flips of a new list; where
     # they were not asked for, those that were held. None without recording.
     before: UInt8[Array, "words atoms"] | None
     inside: Int[Array, ""]  # how many of those are yes
-    leap: Float[Array, ""]  # how far an atom came at most from the step before to the first row, length
+    # how far an atom came at most from the step before to the first row, as `moved`, length
+    leap: Float[Array, ""]
     held: UInt8[Array, "words atoms"] | None = None  # decisions at the last row, None with rows
 
 
 def empty_record(
-    rows: int, words: int, atoms: int, dtype, record: bool, changes: int | None = None
+    rows: int, words: int, atoms: int, dtype, record: bool, changes: int | None = None, cells: bool = False
 ) -> EpochRecord:
     """Room for the rows of an epoch; without recording only the per-step numbers have room.
 
     Args:
         changes: room for so many instead of for decisions and positions.
+        cells: whether rows have their own box.
     """
     record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
@@ -169,6 +178,7 @@ def empty_record(
         images=zeros(shape, np.int32),
         bits=zeros((rows, words, atoms if record else 0), np.uint8),
         **{name: zeros(rows, np.float64) for name in _NUMBERS},
+        cell=zeros((rows, 3 * cells, 3), np.float64),
         changes=None if changes is None else Changes.empty(changes, dtype),
     )
 
@@ -254,26 +264,33 @@ def run_epoch(
     x, v, images = state.x[:, order], state.v[:, order], state.images[:, order]
     home = reference[:, order]
     masses, integrator = program.masses[order], program.integrator
-    cell = program.cell.astype(dtype)
+    moves, one_box = integrator.moves_cell, state.cells[0].astype(dtype)
+    force_in: Any = partial(replace, program.force)  # type: ignore[arg-type]
+
+    def spent(cell, x, reference_cell, reference):
+        if moves:
+            return cell.spent(x, reference_cell, reference, program.r_list)
+        return one_box.farthest(x - reference)
 
     before, inside = None, jnp.zeros((), jnp.int64)
     if program.record:
         words = tables.index.shape[0]
         before = lax.cond(
             look_back,
-            lambda x: program.force.decide(x, tables).bits,  # type: ignore[attr-defined]
+            lambda x: force_in(cell=state.cells[moves]).decide(x, tables).bits,
             lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8) if held is None else held,
             state.x_before[:, order],
         )
         inside = inside_of(before)
 
     def body(carry):
-        step, x, v, images, _, heat, extra, row, _, _, _, largest, record, earlier = carry
+        step, x, v, images, _, heat, extra, cells, row, _, _, _, largest, record, earlier = carry
+        cell, home_cell = (cells or state.cells)[0], state.cells[-1]
         given = {} if told is None else {"given": told[row]}
         if pinned is not None:
             given["where"] = pinned[row]
-        made: Forces = program.force(x, tables, decisions=program.record, **given)  # type: ignore[operator]
-        end = one_step(integrator, cell, masses, order, step, x, v, extra, made.force)
+        made: Forces = force_in(cell=cell)(x, tables, decisions=program.record, **given)
+        end = one_step(integrator, cell, masses, order, step, x, v, extra, made.force, made.virial)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
         kinetic = integrator.kinetic(end.v, masses)
         values = {
@@ -283,6 +300,8 @@ def run_epoch(
             "heat": heat - integrator.conserved(end.extra, masses),
             "moved": largest,
         }
+        if moves:
+            values["cell"] = cell.matrix
         if program.record:
             d = made.decisions
             assert d is not None
@@ -298,16 +317,18 @@ def run_epoch(
         runaway = jnp.max(jnp.abs(end.images)) > 1
         images = images + end.images.astype(jnp.int32)
         step = step + 1
-        largest = cell.farthest(end.x - home)
+        largest = spent(end.cell, end.x, home_cell, home)
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
         ended = due, finite, runaway, largest
-        at = step, end.x, end.kicked, images, x, heat + end.heat, end.ahead
+        if moves:
+            cells = end.cell, cell, jax.tree.map(partial(jnp.where, due), end.cell, home_cell)
+        at = step, end.x, end.kicked, images, x, heat + end.heat, end.ahead, cells
         return *at, row + 1, *ended, record, earlier
 
     def go_on(carry):
-        step, _, _, _, _, _, _, row, due, finite, runaway, _, record, _ = carry
+        step, _, _, _, _, _, _, _, row, due, finite, runaway, _, record, _ = carry
         more = (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
         if record.changes is not None:
             more &= record.changes.count[0] + program.most <= len(record.changes.pairs)
@@ -317,14 +338,18 @@ def run_epoch(
 
     extra, no, yes = by_atom(lambda a: a[..., order], state.extra), jnp.zeros((), bool), jnp.ones((), bool)
     begun = state.step, x, v, images, state.x_before[:, order], state.heat, extra
+    # a box that does not move is no part of what the loop carries
+    begun += (state.cells if moves else (),)
     empty = record if record.changes is None else record._replace(changes=record.changes.emptied())
-    row, largest = jnp.zeros((), jnp.int64), cell.farthest(x - home)
+    row, largest = jnp.zeros((), jnp.int64), spent(state.cells[0], x, state.cells[-1], home)
     carry = (*begun, row, no, yes, no, largest, empty, None if program.rows else before)
     done = lax.while_loop(go_on, body, carry)
-    step, x, v, images, x_before, heat, extra, rows, due, finite, runaway, largest, record, earlier = done
+    end, (rows, due, finite, runaway, largest, record, earlier) = EpochState(*done[:8]), done[8:]
 
-    x, v, images, x_before = (unsorted(part, order) for part in (x, v, images, x_before))
-    end = EpochState(step, x, v, images, x_before, heat, by_atom(lambda a: unsorted(a, order), extra))
+    placed = {name: unsorted(getattr(end, name), order) for name in ("x", "v", "images", "x_before")}
+    extra = by_atom(lambda a: unsorted(a, order), end.extra)
+    end = end._replace(**placed, extra=extra, cells=end.cells or state.cells)
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    leap = cell.farthest(state.x - state.x_before)
+    # seen from the positions now, at which a new list is built
+    leap = spent(state.cells[moves], state.x_before, state.cells[0], state.x)
     return EpochOutcome(end, flags, largest, before, inside, leap, earlier), record

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
@@ -10,7 +12,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from mdnum.bits import digit_order
 from mdnum.compiled import njit
 from mdnum.errors import MdnumError
-from mdnum.md.cell import HostCell, displacement, nearest_image
+from mdnum.md.cell import Cell, box_of, displacement, nearest_image, stacked
 from mdnum.md.decide import Changes, note
 from mdnum.md.ledger import Columns, FlipTable
 from mdnum.md.neighbors import PairTable
@@ -66,14 +68,14 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
-def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice, narrow, first, factor):
+def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, first, factor):
     """Columns of a ledger from `Changes`, sorted, and whether a margin contradicts its decision.
 
     Args:
         labels: of sorted atoms. species: by label. kinds: pair type of two species.
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
         rule: whether distances are compared, not their squares; and whether a margin of 0 is inside.
-        lattice, narrow: `HostCell.numbers` in float64, and in float32 where decisions are made in that.
+        boxes, narrow: `stacked` in float64, and in float32 where decisions are made in that.
         first: step of the first row. factor: from velocities to those of the ledger.
 
     Returns:
@@ -99,13 +101,15 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, lattice
         row, now = pairs[q, 0], pairs[q, 3] != 0
         k = kinds[species[i[q]], species[j[q]]] if len(kinds) > 1 else np.int64(0)
         x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
-        dx, dy, dz = nearest_image(lattice, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
+        box = box_of(boxes, row)
+        dx, dy, dz = nearest_image(box, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
         r2 = dx * dx + dy * dy + dz * dz
         distance = np.sqrt(r2)
         quantity = distance if root else r2
         if narrow is not None:
+            near = box_of(narrow, row)
             sx, sy, sz = nearest_image(
-                narrow, small(x1) - small(x0), small(y1) - small(y0), small(z1) - small(z0)
+                near, small(x1) - small(x0), small(y1) - small(y0), small(z1) - small(z0)
             )
             short = sx * sx + sy * sy + sz * sz
             quantity = wide(np.sqrt(short) if root else short)
@@ -163,8 +167,7 @@ class PairRecorder:
         self._held_segment: tuple[PairTable, UInt8[Array | np.ndarray, "words atoms"], int] | None = None
         self.missed = 0
         decider = simulation.decider
-        self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
-        self._narrow = None if decider.dtype == "float64" else self._decision_cell.numbers
+        self._one_box = self._stacked([simulation.cell])
         self._rule = decider.space == "r", decider.compare.endswith("<=")
         types = len(simulation.symbols) if simulation.pair_types > 1 else 1
         self._kinds = pair_type(np.arange(types)[:, None], np.arange(types), types)
@@ -190,12 +193,19 @@ class PairRecorder:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
+    def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
+        """Boxes in double precision, and in the dtype of decisions where that is another."""
+        dtype = self.simulation.decider.dtype
+        return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
+
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
         """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
         decider = self.simulation.decider
-        if not decider.grows:
-            return np.repeat([decider.bounds], segment.rows, axis=0)
-        return decider.bounds_at(segment.rows_of("x"))
+        x = segment.rows_of("x") if decider.grows else np.empty((segment.rows, 3, 0))
+        if not segment.cells:
+            return decider.bounds_at(x)
+        each = [self.simulation.in_row(cell).decider for cell in segment.cells]
+        return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
@@ -204,7 +214,7 @@ class PairRecorder:
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
         """The pairs that `ambiguous` counts, in the order of their steps."""
         parts = [AmbiguousPairs.none()]
-        bounds, table = self.bounds(segment), segment.table
+        bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
         close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max(axis=1))
         if len(close):
@@ -216,7 +226,7 @@ class PairRecorder:
         for row in close:
             x = segment.rows_of("x")[row]
             kind = self.simulation.type_of(i, j)
-            d = self._decision_cell.displacement(x[:, first].T, x[:, second].T)
+            d = displacement(segment.cell_of(int(row)), x[:, first].T, x[:, second].T, dtype)
             margin = self.simulation.decider.host_margin(d, kind)
             bound = bounds[row][kind]
             at = np.flatnonzero(np.abs(margin) <= bound)
@@ -264,7 +274,7 @@ class PairRecorder:
             self._held_keys = None
         step, (i, j), entered, numbers, contradicted = _columns(
             pairs, ends, table.order, self._species, self._kinds, self._by_type, self.bounds(segment),
-            self._rule, self._cell.numbers, self._narrow, segment.first,
+            self._rule, *(self._stacked(segment.cells) if segment.cells else self._one_box), segment.first,
             # user units of time: the ledger is for people
             self.simulation.units.time_factor,
         )  # fmt: skip

@@ -8,6 +8,7 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -167,14 +168,18 @@ class Counterfactual:
 
 
 def _in_frame(rows: Rows, frame: ReferenceFrame) -> Rows:
-    return Rows(rows.first, frame.positions(rows.x), frame.vectors(rows.v), rows.energy, rows.failed)
+    return replace(rows, x=frame.positions(rows.x), v=frame.vectors(rows.v), nearest=None)
 
 
 def apart(cell: Apart, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Largest distance between the same atoms of two runs at each step; NaN where the second has ended."""
+    """Largest distance between the same atoms of two runs at each step; NaN where the second has ended.
+
+    Nearest images are those of the first run's boxes.
+    """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
         count = min(len(a), len(b))
+        cell = Apart(*a.cells[:count]) if a.cells[:count] else cell
         out[:count] = cell(a.x[:count], b.x[:count])
     return out
 

@@ -162,10 +162,10 @@ class MdProgram:
             inside = entered == (run == "A")
         else:
             # no flip came before it: the margin is that of A's start
-            x = np.asarray(self.start.state.x).T
+            x, here = np.asarray(self.start.state.x).T, self.simulation.in_row(self.start.state.cells[0])
             run, entered = "start", flip.entered
-            margin = pair_margin(self.simulation, x, flip.i, flip.j)
-            bound, inside = pair_bound(self.simulation, x, flip.i, flip.j), margin > 0
+            margin = pair_margin(here, x, flip.i, flip.j)
+            bound, inside = pair_bound(here, x, flip.i, flip.j), margin > 0
         owner = "A" if run == "start" else run
         return Decision(
             channel="pair",
@@ -200,7 +200,7 @@ class MdProgram:
         assert segment is not None
         row = segment.rows - 1
         x, images, v = (segment.unsorted(name, row) for name in ("x", "images", "v"))
-        x = unwrapped(np.asarray(self.simulation.cell.matrix), x, images)
+        x = unwrapped(np.asarray(segment.cell_of(row).matrix), x, images)
         every = np.concatenate(marks)
         failed = segment.closes if segment.closes in FAILURES else ""
         # a run that failed has no last step for a loss to be of
@@ -216,16 +216,10 @@ class MdProgram:
         sides = [one._pairs_at(steps, step) for one in (self, other)]
         keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
         pairs = [divmod(int(key), self.size) for key in keys]
-        margins = [
-            [pair_margin(one.simulation, x, i, j) for one, (_, x) in zip((self, other), sides, strict=True)]
-            for i, j in pairs
-        ]
+        margins = [[pair_margin(here, x, i, j) for _, here, x in sides] for i, j in pairs]
         place = min(range(len(pairs)), key=lambda k: max(abs(margin) for margin in margins[k]))
-        inside = [bool(np.isin(keys[place], held)) for held, _ in sides]
-        bounds = [
-            pair_bound(one.simulation, x, *pairs[place])
-            for one, (_, x) in zip((self, other), sides, strict=True)
-        ]
+        inside = [bool(np.isin(keys[place], held)) for held, _, _ in sides]
+        bounds = [pair_bound(here, x, *pairs[place]) for _, here, x in sides]
         return Differing(
             Decision(
                 channel="pair",
@@ -242,21 +236,26 @@ class MdProgram:
             )
         )
 
-    def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], np.ndarray]:
-        """Keys of the pairs inside at a step, and the positions; by the program that makes all the steps."""
+    def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
+        """Keys of the pairs inside at a step, the simulation in its box then, and the positions; by the
+        program that makes all the steps."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
-                return decided_pairs(self.simulation, segment, row), segment.unsorted("x", row)
+                here = self.simulation.in_row(segment.cell_of(row))
+                return decided_pairs(self.simulation, segment, row), here, segment.unsorted("x", row)
         raise IndexError(f"the run has no step {step}")
 
-    def positions_at(self, step: int, last: int) -> Float[np.ndarray, "atoms 3"] | None:
-        """Wrapped positions at a step of a run to a last step, in the frame; None where it ended before."""
+    def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
+        """The simulation in its box at a step of a run to a last step, and wrapped positions, in the frame;
+        None where it ended before."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows, _ = track.until(track.ready)
             if rows is not None and rows.first + len(rows) > step:
-                return np.ascontiguousarray(rows.x[step - rows.first].T)
+                row = step - rows.first
+                cell = rows.cells[row] if rows.cells else self.simulation.cell
+                return self.simulation.in_row(cell), np.ascontiguousarray(rows.x[row].T)
         return None
 
 

@@ -211,8 +211,8 @@ class Rollout:
             self._examine(segment, segment.rows - 1, v)
 
     def _examine(self, segment: Segment, row: int, v: Any) -> None:
-        step, x = segment.first + row, segment.unsorted("x", row)
-        numbers = self.done.budget.check(step, x, float(segment.rows_of("potential")[row]))
+        step, x, cell = segment.first + row, segment.unsorted("x", row), segment.cell_of(row)
+        numbers = self.done.budget.check(step, x, float(segment.rows_of("potential")[row]), cell)
         flat = {name: np.reshape(one, (1, -1)) for name, one in {"x": x, "v": v, **numbers}.items()}
         self.folder.append("ranges", {"step": np.array([step]), **ranges.columns(flat)})
 
@@ -225,8 +225,10 @@ class Rollout:
             self.folder.append_frame(self._frame(segment, row, tables))
 
     def _frame(self, segment: Segment, row: int, tables: Any) -> Atoms:
-        step, simulation = segment.first + row, self.simulation
+        step, simulation = segment.first + row, self.simulation.in_row(segment.cell_of(row))
         atoms: Atoms = simulation.structure.copy()
+        if simulation is not self.simulation:
+            atoms.set_cell(simulation.cell.matrix)
         atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
         atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
         # ASE's trajectories drop arrays that they do not know
@@ -297,7 +299,9 @@ class Rollout:
             kept, what = step - 1, f"the energy or a velocity stopped being a finite number at step {step}"
             last = blown.unsorted("x", blown.rows - 1).astype(np.float64)
             positions = last if np.all(np.isfinite(last)) else positions
-        message = what + closest_pair(self.simulation, positions)
+        sound = np.all(np.isfinite(blown.rows_of("cell")))
+        cell = blown.cell_of(blown.rows - 1) if sound else blown.start.cells[-1]
+        message = what + closest_pair(self.simulation.in_row(cell), positions)
         self.folder.checkpoint(self._to_dict(resume_point(blown)), force=True)
         self.folder.finalize()
         summary["error"] = message

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.md.cell import displacement, wrap_positions
+from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.ledger import FlipTable
 from mdnum.numerics import unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
@@ -219,7 +219,8 @@ def series_columns(
     entered = np.bincount(row[ledger.entered], minlength=count)
     left = np.bincount(row[~ledger.entered], minlength=count)
     total = potential + kinetic
-    pressure = (2 * kinetic + segment.rows_of("virial")) / (3 * simulation.cell.volume)
+    volume = np.array([cell.volume for cell in segment.cells or (segment.cell,)])
+    pressure = (2 * kinetic + segment.rows_of("virial")) / (3 * volume)
     return {
         "step": step,
         "time": step * simulation.timestep,
@@ -236,6 +237,7 @@ def series_columns(
         "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
         "conserved": total - segment.rows_of("heat"),
+        **({"volume": volume} if segment.cells else {}),
     }
 
 
@@ -267,15 +269,18 @@ class EnergyBudget:
         jumps = bool(np.any(self.simulation.jumps()[0] != 0))
         return self.simulation.continuous if jumps else self.simulation
 
-    def check(self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float) -> dict:
+    def check(
+        self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float, cell: Cell | None = None
+    ) -> dict:
         """Close the budget at one step; returns the numbers behind the energy there (`Simulation.numbers`).
 
         Args:
             step: the step.
             positions: wrapped positions at it, shape (atoms, 3).
             potential: potential energy that the run computed there.
+            cell: the box there; needed where the integrator moves it.
         """
-        energy, numbers = self._reference.numbers(positions)
+        energy, numbers = self._reference.in_row(cell).numbers(positions)
         difference = potential - energy
         # a reference that is the system itself has the jumps, too
         jumps = 0.0 if self._reference is self.simulation else self.jumps
@@ -405,7 +410,7 @@ class ListHealth:
             positions = segment.unsorted("x", row).astype(np.float64)
             if not np.all(np.isfinite(positions)):
                 continue
-            true = true_pairs(self.simulation, positions)
+            true = true_pairs(self.simulation.in_row(segment.cell_of(row)), positions)
             missing = np.setdiff1d(true, decided_pairs(self.simulation, segment, row), assume_unique=True)
             if not len(missing):
                 continue

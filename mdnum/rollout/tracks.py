@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import InputError
+from mdnum.md.cell import Cell
 from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
@@ -35,6 +36,7 @@ class Rows:
     # smallest |margin| of any listed pair, in the quantity's space, shape (rows,); None for a run whose
     # decisions are not its own
     nearest: Float[np.ndarray, "rows"] | None = None
+    cells: tuple[Cell, ...] = ()  # the box of each row; none where all have that of the simulation
 
     def __len__(self) -> int:
         return len(self.x)
@@ -42,9 +44,10 @@ class Rows:
     def cut(self, count: int) -> tuple[Rows, Rows]:
         """The first rows, and the rest."""
         near, rest = (None, None) if self.nearest is None else np.split(self.nearest, [count])
+        x, v, energy, cells = self.x, self.v, self.energy, self.cells
         return (
-            Rows(self.first, self.x[:count], self.v[:count], self.energy[:count], "", near),
-            Rows(self.first + count, self.x[count:], self.v[count:], self.energy[count:], self.failed, rest),
+            Rows(self.first, x[:count], v[:count], energy[:count], "", near, cells[:count]),
+            Rows(self.first + count, x[count:], v[count:], energy[count:], self.failed, rest, cells[count:]),
         )
 
 
@@ -60,6 +63,7 @@ def joined(parts: list[Rows]) -> Rows:
         np.concatenate([part.energy for part in parts]),
         parts[-1].failed,
         np.concatenate(nearest) if len(nearest) == len(parts) else None,
+        tuple(cell for part in parts for cell in part.cells),
     )
 
 
@@ -158,7 +162,8 @@ def rows_of(segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)
-    return Rows(segment.first, frame.positions(x), frame.vectors(v), energy, failed, nearest)
+    x, v = frame.positions(x), frame.vectors(v)
+    return Rows(segment.first, x, v, energy, failed, nearest, segment.cells)
 
 
 # --- A run with its own arithmetic and another run's decisions: the counterfactual --------------------
@@ -249,7 +254,8 @@ class Handed:
             told = _mapped(told, place)
         held, self._record = self._record, None
         if held is None or held.bits.shape != told.shape:
-            held = empty_record(told.shape[0], told.shape[1], simulation.atoms, dtype, True)
+            moves = simulation.integrator.moves_cell
+            held = empty_record(told.shape[0], told.shape[1], simulation.atoms, dtype, True, cells=moves)
         leaves, structure = self._flat
         numbers = jnp.asarray(built, jnp.int64), jnp.asarray(segment.last, jnp.int64), jnp.asarray(False)
         home = jnp.asarray(home, dtype)
@@ -263,11 +269,14 @@ class Handed:
         x, v = (np.asarray(getattr(record, name))[:count] for name in "xv")
         energy = (np.asarray(record.potential) + np.asarray(record.kinetic))[:count]
         own, theirs = (np.asarray(bits)[:count] for bits in (record.bits, told))
-        note = Overridden(*self._apart.overridden(own, theirs, table, x, simulation.species, self._r_cut))
+        cells = record.boxes(count, simulation.pbc)
+        distances = Apart(*cells) if cells else self._apart
+        note = Overridden(*distances.overridden(own, theirs, table, x, simulation.species, self._r_cut))
         # copies: the record is filled anew by the next stretch
         x, v = (in_user_order(part, table.order) for part in (x, v))
         self._record = record
-        return Rows(first, self.frame.positions(x), self.frame.vectors(v), energy, self.failed), note
+        x, v = self.frame.positions(x), self.frame.vectors(v)
+        return Rows(first, x, v, energy, self.failed, cells=cells), note
 
     def _program(self, *, shared: bool) -> tuple[tuple[Array, ...], Any]:
         program = self._engine.program
@@ -281,8 +290,8 @@ class Handed:
         """This run's own list, and where the leader's decision of each of its slots stands."""
         simulation = self.simulation
         if self._own is None:
-            home = self.state.x
-            self._own = simulation.verlet_list().build(home.T, simulation.cell), home, int(self.state.step)
+            home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
+            self._own = simulation.verlet_list().build(home.T, cell), home, int(self.state.step)
             self._led = None
         table, home, built = self._own
         if self._led is not segment.table:

@@ -60,7 +60,8 @@ class Simulation:
         structure: atoms as they were given; positions and velocities of step 0 are those below.
         units: of everything that a person reads or writes.
         symbols: chemical symbols present, sorted.
-        cell: the box.
+        cell: the box of step 0. The box of a row of a run is its `Segment.cell_of`, the same unless the
+            integrator moves it.
         positions: shape (atoms, 3), length, as the structure has them (not wrapped).
         velocities: shape (atoms, 3), length per internal time.
         masses: shape (atoms,).
@@ -276,6 +277,10 @@ class Simulation:
         """The same system in floats of these roles, by default float64 throughout."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, lattice=None)
+
+    def in_row(self, cell: Cell | None) -> Simulation:
+        """The same system in the box of a row; where the integrator leaves the box as it is, itself."""
+        return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""

@@ -222,6 +222,16 @@ def test_the_skin_that_is_consumed_counts_motion_and_strain():
     assert verlet.consumed(reference * 1.05, larger, reference, cell) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("free", [0, 1, 2])
+def test_a_strained_box_leaves_positions_along_a_free_axis(free):
+    flags, edges = np.arange(3) != free, np.where(np.arange(3) == free, 0.0, 20.0)
+    verlet, strained = VerletList(BUILDERS["host"], RebuildRule(0.5), 3.0), np.where(flags, 0.99, 1.0)
+    before, after = (Cell.create(edges * by, flags) for by in (np.ones(3), strained))
+    reference = np.array([[1.0, 2.0, 3.0], [9.0, 15.0, 17.0]])
+    consumed = verlet.consumed(reference * strained, after, reference, before)
+    assert consumed == pytest.approx(3.5 * 0.01 / 0.5)
+
+
 @pytest.mark.parametrize(
     "rule, first, safe",
     [

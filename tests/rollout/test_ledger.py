@@ -258,7 +258,7 @@ def rows_and_end(simulation, last, record):
         for name, values in numbers.items():
             values.append(np.array(segment.rows_of(name)))
         closed.append((segment.last, segment.closes))
-    state = {name: np.asarray(value) for name, value in segment.state._asdict().items()}
+    state = {str(k): np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(segment.state))}
     return {name: np.concatenate(values) for name, values in numbers.items()}, state, closed
 
 

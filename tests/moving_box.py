@@ -1,0 +1,73 @@
+"""Integrators that move the box, as another package would bring them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mdnum.md.integrators import Integrator, quantity
+
+
+class Drifting(Integrator):
+    """Velocity Verlet."""
+
+    name = "drifting"
+
+    def finish(self, v, extra, acceleration, masses, time):
+        return v + time * acceleration, extra
+
+    def begin(self, x, v, extra, acceleration, masses, step, order):
+        v = v + (0.5 * self.timestep).astype(v.dtype) * acceleration
+        return x + self.timestep.astype(x.dtype) * v, v, extra, jnp.zeros(())
+
+
+class Strained(Drifting):
+    """A box that is strained by a schedule, and all positions with it."""
+
+    name = "strained"
+    stretch: Float[Array, ""] = quantity("rate")  # of every lattice vector along itself
+    shear: Float[Array, ""] = quantity("rate")  # of x into y, and half as much of y into -z, of z into x
+
+    def deform(self, cell, v, extra, masses, virial, step):
+        turned = jnp.zeros((3, 3)).at[0, 1].set(1.0).at[1, 2].set(-0.5).at[2, 0].set(0.5)
+        # all of it turns round after 50 steps
+        way = jnp.where(step % 100 < 50, 1.0, -1.0) * self.timestep
+        return jnp.eye(3) + way * (self.stretch * jnp.eye(3) + self.shear * turned), v, extra
+
+
+class Forgetful(Strained):
+    """The same; of its own class, so that it is compiled on its own."""
+
+    name = "forgetful"
+
+
+class Flat(Drifting):
+    """Strained in the plane alone, so that a box without a lattice vector along z has no part of it."""
+
+    name = "flat"
+    stretch: Float[Array, ""] = quantity("rate")
+    shear: Float[Array, ""] = quantity("rate")
+
+    def deform(self, cell, v, extra, masses, virial, step):
+        plane = jnp.diag(jnp.array([1.0, 1.0, 0.0])) * self.stretch
+        return jnp.eye(3) + self.timestep * plane.at[0, 1].set(self.shear), v, extra
+
+
+class Pressed(Drifting):
+    """A box that follows the pressure, with velocities scaled the other way and what it did in its state."""
+
+    name = "pressed"
+    pressure: Any = eqx.field(default=None)  # energy/length³
+    stiffness: Any = eqx.field(default=None)  # how fast it follows, length³/energy/time
+
+    def init(self, x, v, masses):
+        return jnp.zeros(())
+
+    def deform(self, cell, v, extra, masses, virial, step):
+        volume = jnp.abs(jnp.linalg.det(cell.matrix))
+        pressure = (2 * self.kinetic(v, masses) + virial) / (3 * volume)
+        growth = self.timestep * self.stiffness * (pressure - self.pressure)
+        return (1 + growth) * jnp.eye(3), v / (1 + growth).astype(v.dtype), extra + growth
