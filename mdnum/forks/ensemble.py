@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.forks.reordered import ReorderedSimulation
 from mdnum.md.cell import displacement
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
+from mdnum.md.potentials import Channels
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.simulation import Simulation
@@ -218,8 +220,11 @@ def planted(a: Simulation) -> tuple[Change, ...]:
 
 def shorter(a: Simulation, factor: float) -> Simulation:
     """The same simulation with all its cutoff radii, and where a switch sets in, scaled."""
-    model = eqx.tree_at(
-        lambda one: (one.r_cut, one.r_onset), a.model, (a.model.r_cut * factor, a.model.r_onset * factor)
-    )
+
+    def ends(model):
+        parts = model.parts if isinstance(model, Channels) else (model,)
+        return jax.tree.leaves([(part.r_cut, part.r_onset) for part in parts])
+
+    model = eqx.tree_at(ends, a.model, [leaf * factor for leaf in ends(a.model)])
     radii = tuple(factor * r for r in a.decider.r_cut)
     return replace(a, model=model, decider=replace(a.decider, r_cut=radii))

@@ -52,7 +52,9 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
-    i, j = fork.decision.subject
+    first, j = fork.decision.subject
+    # without the channel of the decision
+    i = first % program_a.simulation.atoms
     # to the same last step as the first time, so that no program is compiled again
     states = [program.state_at(fork.decision.step, fork.asked) for program in (program_a, program_b)]
     if states[0] is None or states[1] is None:
@@ -73,11 +75,11 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
     chosen = order[distance[order] <= REACH * a.r_cut]
     chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
     moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
-    margins = pair_margin(a, x_a, i, j), pair_margin(b, x_b, i, j, labels=a)
+    margins = pair_margin(a, x_a, first, j), pair_margin(b, x_b, first, j, labels=a)
     frame = program_b.frame or ReferenceFrame.same(b.atoms)
-    kind = int(a.type_of(np.array([i]), np.array([j]))[0])
+    kind = int(a.type_of(np.array([first]), np.array([j]))[0])
     own = frame.inverse.positions(x_b.T[None])
-    bounds = pair_bound(a, x_a, i, j), float(b.decider.bounds_at(own)[0, kind])
+    bounds = pair_bound(a, x_a, first, j), float(b.decider.bounds_at(own)[0, kind])
     return Neighborhood(chosen, from_middle[chosen], moved, margins, bounds)
 
 
@@ -129,9 +131,11 @@ def pinned(
         first = spell[0] if first is None else first
         last = (spell[1] or fork.steps) - 1 if last is None else last
     window = 0 if first is None else first, last_step if last is None else last
+    keys = []
     for pair in pairs:
-        _check_pair(pair, a.size)
-    keys = [min(pair) * a.size + max(pair) for pair in pairs]
+        channel, i = divmod(pair[0], a.size)
+        _check_pair((i, pair[1]), a.size)
+        keys.append((channel * a.size + min(i, pair[1])) * a.size + max(i, pair[1]))
     imposed = taped(a, last_step, lambda segment: None).pins(keys, *window)
     leader = Track(a.simulation, last_step, a.begin, flips=False)
     follower = Track(b.simulation, last_step, b.begin, flips=False, pins=imposed)

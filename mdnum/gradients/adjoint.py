@@ -12,7 +12,9 @@ of the energy. No tape is kept.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
+from functools import partial, reduce
+from operator import add
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,8 +32,8 @@ from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md import kernel
 from mdnum.md.decide import Tables, halves_of, unpacked
 from mdnum.md.integrators import KickDrift, check_kick, unsorted
-from mdnum.md.pairforce import ManyBodyForce, PairForce
-from mdnum.md.potentials import CutPotential, of_type
+from mdnum.md.pairforce import ChannelForce, ManyBodyForce, PairForce, factors
+from mdnum.md.potentials import Channels, of_type
 from mdnum.rollout.epoch import over_rows
 
 #: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
@@ -68,6 +70,14 @@ def pull_back(
 
     Error: a rounding error for each pair, in the dtype of the force; sums slot by slot.
     """
+    if isinstance(force, ChannelForce):
+        each = zip(force.parts, force.split(bits), strict=True)
+        made = [
+            pull_back(part, x, tables, own, onto_force, onto_energy, onto_virial, wanted)
+            for part, own in each
+        ]
+        on_x, model, scale, whole = zip(*made, strict=True)
+        return ForceCotangents(reduce(add, on_x), Channels(model), reduce(add, scale), reduce(add, whole))
     of = _of_pairs if isinstance(force, PairForce) else _of_energy
     return of(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted)
 
@@ -75,7 +85,9 @@ def pull_back(
 def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted) -> ForceCotangents:
     dtype = force.policy.dtype("force")
     cell = force.cell.astype(dtype)
-    columns = jnp.concatenate([x.astype(dtype), onto_force.astype(dtype)])
+    columns = jnp.concatenate(
+        [x.astype(dtype), onto_force.astype(dtype), *(w[None] for w in force.weights(tables))]
+    )
     energy, virial = onto_energy.astype(dtype), onto_virial.astype(dtype)
     model, cut = force.model, force.model.cutoff
     at, back_to_model = jax.vjp(lambda model: model.at_cutoff(), model)
@@ -87,7 +99,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
-    def onto_parameters(r2, along, inside, types, *, of_all: bool):
+    def onto_parameters(r2, along, inside, types, weights, *, of_all: bool):
         """The cotangents of each slot's own parameters and end; `of_all`, of the shared ones in all slots."""
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -95,7 +107,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         def ended(slots, shared):
             potential, end = slots
             u, s = eqx.combine(potential, shared).evaluate(r2)
-            return cut.cut(r2, u, s, end)
+            return cut.cut(r2, u, s, end, *weights)
 
         onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
         if of_all:
@@ -104,8 +116,11 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
     def terms(d, dw, inside, types) -> list[Array]:
         """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted."""
+        weights = factors(model, dw[3:])
         r2, along = distances(d, dw, inside)
-        (_, slope), (_, bend) = jax.jvp(lambda q: model.evaluate(q, types, at), (r2,), (jnp.ones_like(r2),))
+        (_, slope), (_, bend) = jax.jvp(
+            lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
+        )
         slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
         # derivative by r² of what this slot adds to energy and virial
         shared = energy * (0.5 * slope) - virial * (bend * r2 + slope)
@@ -116,7 +131,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         if SCALE in wanted:
             made += [2 * r2 * (shared - bend * along)]
         if MODEL in wanted:
-            leaves = jax.tree.leaves(onto_parameters(r2, along, inside, types, of_all=False))
+            leaves = jax.tree.leaves(onto_parameters(r2, along, inside, types, weights, of_all=False))
             made += [
                 leaf if types is None else jnp.where(types == kind, leaf, 0)
                 for leaf in leaves
@@ -138,21 +153,21 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
             def block(total, d, inside, types):
                 r2, along = distances(d[:3], d[3:], inside)
-                added = onto_parameters(r2, along, inside, types, of_all=True)
+                added = onto_parameters(r2, along, inside, types, factors(model, d[6:]), of_all=True)
                 return jax.tree.map(jnp.add, total, added)
 
             start = jax.tree.map(jnp.zeros_like, shared)
             onto_shared = _over_groups(block, start, columns, cell, tables, bits)
         (onto_model,) = back_to_model(onto_at)
         direct = jax.tree.map(jnp.add, onto_model.potential, eqx.combine(onto_own, onto_shared))
-        onto_model = CutPotential(direct, cut, onto_model.r_cut, onto_model.r_onset)
+        onto_model = replace(onto_model, potential=direct)
     return ForceCotangents(on_x, onto_model, scale, made)
 
 
 def _differences(cell, own, other):
-    """Of two vectors of two atoms, the first a position."""
-    d = [b - a for a, b in zip(own, other, strict=True)]
-    return [*cell.minimum_image(*d[:3]), *d[3:]]
+    """Of two vectors of two atoms, the first a position; then products of their weights, if there are any."""
+    d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
+    return [*cell.minimum_image(*d[:3]), *d[3:], *(a * b for a, b in zip(own[6:], other[6:], strict=True))]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
@@ -167,9 +182,9 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
     if made is not None:
         return made.sums
     index, types = tables.groups()
-    d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * 3
+    d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * len(columns)
     inside = jax.ShapeDtypeStruct(index.shape[1:], np.bool_)
-    first = jax.eval_shape(terms, d, d, inside, None if types is None else types[0])
+    first = jax.eval_shape(terms, d[:3], d[3:], inside, None if types is None else types[0])
     start = (jnp.zeros_like(columns[0]),) * len(first)
     return _over_groups(
         lambda sums, d, inside, types: _added(sums, terms(d[:3], d[3:], inside, types)),
@@ -312,7 +327,7 @@ class StretchReversal:
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
         model, integrator = jax.tree.map(jnp.zeros_like, (quantities(force), numbers))
         scale, zero = jnp.zeros((), force.policy.dtype("force")), jnp.zeros((), jnp.float64)
-        r_cut = jnp.zeros(simulation.pair_types, jnp.float64)
+        r_cut = jnp.zeros(len(simulation.decider.r_cut), jnp.float64)
         self.met: Crossings | None = None
         self.carry = AdjointCarry(
             nothing, nothing, model, integrator, scale, (nothing, nothing), r_cut, (zero, zero)

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
-from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, pairs_only
+from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, one_term
 from mdnum.gradients.recorded import tape_of
 from mdnum.gradients.tape import KEPT, RunTape, frame_of, listed
 from mdnum.md.cell import displacement
@@ -268,7 +268,7 @@ class BoundaryTerm(Method):
     )
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = pairs_only(problem.simulation)
+        why = one_term(problem.simulation)
         if why is not None:
             return why
         if not problem.loss.of_single_frames:
@@ -342,7 +342,7 @@ class Reweighting(Method):
     description = "the derivative of the canonical average, by how the weights of the visited states change"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = pairs_only(problem.simulation)
+        why = one_term(problem.simulation)
         if why is not None:
             return why
         if not isinstance(problem.simulation.integrator, Langevin):

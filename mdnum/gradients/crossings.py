@@ -240,7 +240,9 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
     row = (ledger.step - stretch.first).astype(np.int64)
     low, high = ledger.i, ledger.j
-    i, j = stretch.table.place[low], stretch.table.place[high]
+    i, j = stretch.table.place[low % simulation.atoms], stretch.table.place[high]
+    if simulation.channels > 1:
+        ledger = replace(ledger, i=low % simulation.atoms)
     cell, x, ahead = HostCell(simulation.cell), stretch.x.reshape(-1), stretch.x_before.reshape(-1)
     atoms = stretch.x.shape[2]
 

@@ -102,10 +102,6 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
     """Where a parameter is in what a rollout is made of, and how that moves with it (None: it is it)."""
-    if name == "cutoff.radius":
-        # the onset of one that does not switch goes with it, and the times of the flips do
-        onset = [] if simulation.cutoff.switches else [(lambda of: of.model.r_onset, None)]
-        return [(lambda of: of.model.r_cut, None), *onset, (lambda of: of.r_cut, None)]
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -115,7 +111,10 @@ def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any
         return [(lambda of: of.x, simulation.positions.T), (lambda of: of.matrix, simulation.cell.matrix)]
     table, _, key = name.partition(".")
     if table != "dynamics":
-        return [(lambda of: leaf_of(of.model, name) if simulation.pairwise else of.model[key], None)]
+        # the onset of one that does not switch goes with the radius
+        alone = name == "cutoff.radius" and not simulation.cutoff.switches and "" in simulation.model.terms
+        onset: list[Any] = [(lambda of: of.model.r_onset, None)] if alone else []
+        return [(lambda of: leaf_of(of.model, name) if simulation.pairwise else of.model[key], None), *onset]
     found: list[tuple[Callable[[Any], Any], Any]] = []
     if key == "temperature" and simulation.draw.drawn:
         found.append((lambda of: of.v, v / (2 * float(value(simulation, name)))))
@@ -134,6 +133,11 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
     for where, along in _places(simulation, entry.whole):
         leaf = np.asarray(where(parts), np.float64)
         total = total + (leaf if along is None else np.sum(leaf * along))
+    if entry.whole.endswith("cutoff.radius"):
+        # and the times of the flips
+        parts_of, types = getattr(simulation.model, "parts", [simulation.model]), simulation.pair_types
+        channel = next(c for c, part in enumerate(parts_of) if entry.whole in parameters.pair_leaves(part))
+        total = total + np.asarray(parts.r_cut)[channel * types : (channel + 1) * types]
     if entry.whole.startswith("initial."):
         return np.array(total.T[entry.index] / entry.factor)
     return np.array(np.reshape(total, np.shape(value(simulation, entry.whole)))[entry.index])
@@ -149,6 +153,8 @@ def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> D
         leaf = where(still)
         made = jnp.asarray(turned if along is None else along, leaf.dtype).reshape(leaf.shape)
         still = eqx.tree_at(where, still, made)
+    if entry.whole.endswith("cutoff.radius"):
+        still = still._replace(r_cut=still.model.r_cut.astype(jnp.float64))
     return still
 
 
@@ -191,7 +197,7 @@ def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Dir
         jax.tree.map(jnp.zeros_like, quantities(simulation.force)),
         jax.tree.map(jnp.zeros_like, eqx.filter(simulation.integrator, eqx.is_inexact_array)),
         jnp.zeros((3, 3), jnp.float64),
-        jnp.zeros(simulation.pair_types, jnp.float64),
+        jnp.zeros(len(simulation.decider.r_cut), jnp.float64),
     )
     each = [moved(simulation, still, column) for column in columns]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)

@@ -220,7 +220,7 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
                 notes[name] = "without what the flips add: the force jumps at the cutoff; event-aware adds it"
             continue
         why = "in this run: no step on the way to the loss depends on it, or what does cancels"
-        if name == "cutoff.radius" and missing:
+        if name.endswith("cutoff.radius") and missing:
             why = (
                 "because it only decides which pairs interact, and decisions are not differentiated; "
                 "event-aware adds what they do"
@@ -234,6 +234,13 @@ def pairs_only(simulation: Simulation) -> str | None:
     if not isinstance(simulation.force, PairForce):
         return "it is for pair potentials"
     return without_kick(simulation.integrator) or rounded(simulation)
+
+
+def one_term(simulation: Simulation) -> str | None:
+    """Why what knows a single pair potential does not apply; None where it does."""
+    if simulation.pairwise and "" not in simulation.model.terms:
+        return f"it is for one pair potential, and {simulation.potential.name} are several terms"
+    return pairs_only(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:

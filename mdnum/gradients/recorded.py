@@ -24,6 +24,7 @@ from mdnum.gradients.problem import (
     Progress,
     in_phase,
     independent,
+    one_term,
     pairs_only,
 )
 from mdnum.gradients.tangents import by_column, tangents
@@ -260,7 +261,7 @@ class Surrogate(Method):
     description = "the derivative of another program, whose cutoff switches smoothly"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = pairs_only(problem.simulation)
+        why = one_term(problem.simulation)
         if why is not None:
             return why
         if problem.simulation.cutoff.switches:
@@ -315,5 +316,6 @@ def radial_speed(simulation: Simulation) -> float:
 
 def wanted(names: Sequence[str]) -> frozenset[str]:
     """What the reverse pass has to work out for these parameters."""
-    parts = {"potential": {MODEL}, "cutoff": {MODEL}, "dynamics": {FORCE}, "box": {SCALE, FORCE}}
+    parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
+    parts |= {"dynamics": {FORCE}, "box": {SCALE, FORCE}}
     return frozenset(part for name in names for part in parts.get(name.partition(".")[0], ()))

@@ -332,12 +332,8 @@ def fingerprint(order, *parts) -> bytes:
 
 def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The pairs of a list, each once: first and second atom in the list's order, and pair type."""
-    slots, first = np.nonzero(table.index < len(table.order))
-    second = table.index[slots, first]
-    once = table.order[first] < table.order[second]
-    first, second = first[once], second[once]
-    kind = simulation.type_of(table.order[first], table.order[second])
-    return first, second, np.asarray(kind, np.int64)
+    first, second, i, j = table.listed(simulation.channels)
+    return first, second, np.asarray(simulation.type_of(i, j), np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:

@@ -161,11 +161,11 @@ def chunk(
         at = step, end.x, end.kicked, images, end.ahead
         return (*at, total, used_up(end.x, step), finite, rows + 1), row
 
-    words, atoms = tables.index.shape[0], order.shape[0]
+    nothing = jax.eval_shape(force.decide, between.x, tables).bits
 
     def skip(carry, see):
-        nothing = jnp.zeros((3, atoms), dtype)
-        return carry, (nothing, nothing, jnp.zeros((words, atoms), jnp.uint8))
+        still = jnp.zeros_like(between.x)
+        return carry, (still, still, jnp.zeros(nothing.shape, nothing.dtype))
 
     def one(carry, see):
         *_, due, finite, rows = carry
@@ -275,7 +275,7 @@ class ChunkedProgram:
         x = np.asarray(inputs.x + start.x, np.float64)
         v = np.asarray(inputs.v + start.v, np.float64)
         stretched = float(np.sum(np.asarray(start.x, np.float64) * np.asarray(self.inputs.x)))
-        scale, none = float(inputs.scale) + stretched, np.zeros(self.simulation.pair_types)
+        scale, none = float(inputs.scale) + stretched, np.zeros(len(self.simulation.decider.r_cut))
         return Cotangents(inputs.model, inputs.numbers, x, v, scale, none)
 
     def _arguments(self, at: Snapshot, rows: int | None) -> tuple[Any, ...]:

@@ -66,6 +66,10 @@ class Cutoff(ABC):
         """Radial force (positive: repulsive) that a pair brings when it enters, energy per length."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
+    def jumps(self, at: AtCutoff):
+        """Energy and force jump of each of the terms that end so: of one, but where several are added."""
+        return [(self.energy_jump(at), self.force_jump(at))]
+
     def _limits(self, at: AtCutoff):
         return self.cut(at.r_cut * at.r_cut, at.energy, at.slope / (at.r_cut + at.r_cut), at)
 

@@ -282,7 +282,8 @@ def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
 class Changes(NamedTuple):
     """Decisions that changed, step after step, each seen from the atom that is sorted first."""
 
-    pairs: Int[Array, "room 4"]  # row, sorted atoms and whether inside now, shape (room, 4)
+    # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
+    pairs: Int[Array, "room 4"]
     ends: Float[Array, "room 12"]  # positions of both atoms, then velocities, shape (room, 12)
     # of changes seen so, and seen from both ends; more of them than room are not noted. Then of the decisions
     # of the last row that are yes; shape (3,).
@@ -329,6 +330,8 @@ class Changes(NamedTuple):
         if foreign.known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
         changed, index = before ^ bits, tables.index.astype(jnp.int32)
+        per = len(index)
+        index = jnp.tile(index, (len(bits) // per, 1, 1))
         slot, atom = jnp.arange(8, dtype=jnp.uint8)[None, :, None], jnp.arange(x.shape[1], dtype=jnp.int32)
         each = ((changed[:, None] >> slot) & jnp.uint8(1) == 1) & (atom < index)
         # counted, not added up from the changes: it is what they are held against
@@ -338,6 +341,7 @@ class Changes(NamedTuple):
         word, k, first = jnp.unravel_index(at, each.shape)
         second = index[word, k, first]
         now = (bits[word, first] >> k.astype(jnp.uint8)) & jnp.uint8(1)
+        now = now.astype(jnp.int32) + 2 * (word // per).astype(jnp.int32)
         rows = jnp.full(most, row.astype(jnp.int32))
         pairs = jnp.stack([column.astype(jnp.int32) for column in (rows, first, second, now)], axis=1)
         ends = jnp.concatenate([x[:, first], x[:, second], v[:, first], v[:, second]]).T
@@ -384,14 +388,14 @@ def _note(frame):
     count_at, _, _ = buffer(results, 2)
     before_at, words, atoms = buffer(results, 3)
     bits_at, _, _ = buffer(operands, 4)
-    index_at, _, _ = buffer(operands, 5)
+    index_at, listed, _ = buffer(operands, 5)
     x_at, _, _ = buffer(operands, 6)
     v_at, _, _ = buffer(operands, 7)
     row_at, _, _ = buffer(operands, 8)
     note(
         carray(pointer(before_at), (words, atoms), np.uint8),
         carray(pointer(bits_at), (words, atoms), np.uint8),
-        carray(pointer(index_at), (8 * words, atoms), np.int32),
+        carray(pointer(index_at), (8 * listed, atoms), np.int32),
         carray(pointer(x_at), (3, atoms), np.float64),
         carray(pointer(v_at), (3, atoms), np.float64),
         peek(row_at, 0),
@@ -424,7 +428,8 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
     most = 64 * (_TOGETHER + 1)
     firsts, slots, values = np.empty(most, np.int32), np.empty(most, np.int64), np.empty(most, np.int32)
     inside, begun, found = 0, count[0], count[0]
-    word, begin = 0, 0
+    # the word of the list, where its bytes begin, and what its channel adds to a decision
+    word, begin, channel = 0, 0, 0
     for start in range(0, whole + 1, _TOGETHER):
         # the words with a change, and the bytes behind the last word
         n, end = 0, min(start + _TOGETHER, whole)
@@ -449,8 +454,10 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
                 place = places[k] + (bit >> 3)
                 while place >= begin + atoms:
                     word, begin = word + 1, begin + atoms
+                    if 8 * word == len(index):
+                        word, channel = 0, channel + 2
                 firsts[m], slots[m] = place - begin, (8 * word + (bit & 7)) * atoms + place - begin
-                values[m] = (bytes_now[place] >> (bit & 7)) & 1
+                values[m] = ((bytes_now[place] >> (bit & 7)) & 1) + channel
                 m += 1
         count[1] += m
         for k in range(m):

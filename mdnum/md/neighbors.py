@@ -85,11 +85,26 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table."""
+        """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table.
+
+        Where a pair has several decisions, one channel behind the other, i has the number of atoms added for
+        each channel before.
+        """
         slots, columns = set_bits(bits)
+        channel, slots = np.divmod(slots, self.slots)
         i, j = self.order[columns], self.order[self.index[slots, columns]]
         keep = i < j
-        return i[keep], j[keep]
+        return (i + channel * len(self.order))[keep], j[keep]
+
+    def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
+        """Sorted places of both atoms of every pair, once for each channel, and labels as of `decided`."""
+        slots, first = np.nonzero(self.index < len(self.order))
+        second = self.index[slots, first]
+        i, j = self.order[first], self.order[second]
+        once = i < j
+        each = (np.tile(part[once], channels) for part in (first, second, i, j))
+        first, second, i, j = each
+        return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
         """Neighbors in the user's labels, one row per atom, padded with the number of atoms."""

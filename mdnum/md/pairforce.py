@@ -10,7 +10,8 @@ array takes twice the time at 4,000 atoms and ten times at 32,000.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import partial, reduce
+from operator import add, mul
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real, UInt8
 
+from mdnum.errors import InputError
 from mdnum.md import foreign, kernel
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
@@ -34,7 +36,7 @@ from mdnum.md.decide import (
     unpacked,
 )
 from mdnum.md.integrators import Integrator, one_step
-from mdnum.md.potentials import CutPotential, of_type
+from mdnum.md.potentials import Channels, CutPotential, of_type
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.exact import fence, rounded, zero_bits
 from mdnum.numerics.reductions import Reduction, Sequential
@@ -67,7 +69,7 @@ class PairForce(eqx.Module):
     reduction: Reduction = eqx.field(static=True, default=Sequential())  # order of the sum over neighbors
 
     @classmethod
-    def create(cls, model: CutPotential, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
+    def create(cls, model: Any, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
         """Parameters and box in the dtypes of the policy."""
         return cls(
             model.astype(policy.dtype("force")),
@@ -160,15 +162,19 @@ class PairForce(eqx.Module):
         law, exactly = self.law, self._in_force_dtype
         at = law.at_cutoff()
 
-        def terms(d, r2, inside, types):
+        def terms(d, r2, inside, types, *weights):
             # the argument is masked, not only the result: a padded slot may be at distance zero
             r2 = exactly(jnp.where(inside, r2, jnp.ones((), r2.dtype)))
-            energy, slope = law.evaluate(r2, types, at)
+            energy, slope = law.evaluate(r2, types, at, *weights)
             energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
             pull = slope + slope
             return tuple(map(exactly, (*(pull * exactly(c) for c in d), energy, pull * r2)))
 
         return terms
+
+    def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
+        """The weights of the terms that have some, in the order of the tables."""
+        return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
         self,
@@ -184,7 +190,7 @@ class PairForce(eqx.Module):
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
         cell = self.cell.astype(geometry)
-        components = tuple(positions.astype(geometry))
+        components, weights = tuple(positions.astype(geometry)), self.weights(tables)
 
         def block(carry, listed):
             totals, nearest = carry
@@ -201,7 +207,8 @@ class PairForce(eqx.Module):
                 r2 = quantity
             else:
                 r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-            terms = [term.astype(accumulate) for term in terms_of(d, r2, inside, types)]
+            others = factors(self.model, (w * w.at[j].get(mode="promise_in_bounds") for w in weights))
+            terms = [term.astype(accumulate) for term in terms_of(d, r2, inside, types, *others)]
             summed = [
                 self.reduction.within(total, list(term)) for total, term in zip(totals, terms, strict=True)
             ]
@@ -219,7 +226,7 @@ class PairForce(eqx.Module):
         judge = self.judge(positions)
         geometry, law = self.policy.geometry, self.law
         cell = self.cell.astype(geometry)
-        components = tuple(positions.astype(geometry))
+        components, weights = tuple(positions.astype(geometry)), self.weights(tables)
         at = law.at_cutoff()
 
         def block(totals, listed):
@@ -227,13 +234,73 @@ class PairForce(eqx.Module):
             _, _, inside, _ = judge.group(j, types)
             d = displacements(components, cell, j)
             r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), geometry))
-            slope = law.evaluate(self._in_force_dtype(r2), types, at)[1]
+            others = factors(self.model, (w * w.at[j].get(mode="promise_in_bounds") for w in weights))
+            slope = law.evaluate(self._in_force_dtype(r2), types, at, *others)[1]
             slope = jnp.where(inside, slope, 0).astype(geometry)
             sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in VOIGT]
             return tuple(total + q for total, q in zip(totals, sums, strict=True)), None
 
         totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
         return symmetric(-jnp.sum(total, dtype=jnp.float64) for total in totals)
+
+
+class ChannelForce(PairForce):
+    """Forces of terms with different radii: one pair force after the other over the same list.
+
+    Their decisions lie one behind the other along the words.
+    """
+
+    model: Channels  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @property
+    def parts(self) -> list[PairForce]:
+        """The pair force of each channel."""
+        thresholds = self.thresholds.reshape(len(self.model.parts), -1)
+        rest = self.cell, self.zero
+        return [
+            PairForce(model, *rest, own, self.decider, self.policy, self.reduction)
+            for model, own in zip(self.model.parts, thresholds, strict=True)
+        ]
+
+    def split(self, bits: UInt8[Array, "words atoms"] | None) -> Sequence[Any]:
+        """Decisions by channel."""
+        parts = len(self.model.parts)
+        return [None] * parts if bits is None else jnp.split(bits, parts)
+
+    def decide(self, positions, tables):
+        return _joined([part.decide(positions, tables) for part in self.parts])
+
+    def __call__(self, positions, tables, *, decisions, given=None, where=None):
+        made = [
+            part(positions, tables, decisions=decisions, given=told, where=pinned)
+            for part, told, pinned in zip(self.parts, self.split(given), self.split(where), strict=True)
+        ]
+        force, energy, virial = (reduce(add, rows) for rows in zip(*(one[:3] for one in made), strict=True))
+        return Forces(force, energy, virial, _joined([one.decisions for one in made]) if decisions else None)
+
+    def virial_tensor(self, positions, tables):
+        return reduce(add, (part.virial_tensor(positions, tables) for part in self.parts))
+
+    def judge(self, positions):
+        raise InputError(
+            "terms with different radii have a decision each, and here one is expected",
+            remedy="Give all terms the same radius",
+        )
+
+
+def _joined(parts: Sequence[Any]) -> Decisions:
+    bits, nearest = zip(*parts, strict=True)
+    return Decisions(jnp.concatenate(bits), reduce(jnp.minimum, nearest))
+
+
+def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
+    """What multiplies each term's energy, as `CutPotential.evaluate` takes it; nothing without weights.
+
+    Args:
+        products: of the weights of both atoms, of the terms that have some.
+    """
+    each = iter(products)
+    return [tuple(None if one is None else next(each) for one in model.weights)] if model.weights else []
 
 
 def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
@@ -251,16 +318,19 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
     terms_of = force._terms()
 
     def pair(own, other, types, *bits):
-        d, r2, inside, margin = force._geometry(own, other, types)
+        d, r2, inside, margin = force._geometry(own[:3], other[:3], types)
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
-        *force_terms, energy, virial = terms_of(d, r2, inside, types)
+        others = factors(force.model, map(mul, own[3:], other[3:]))
+        *force_terms, energy, virial = terms_of(d, r2, inside, types, *others)
         # a slot of padding is nowhere, and no number times nothing is no number
         terms = (*(jnp.where(inside, term, 0) for term in force_terms), energy, virial)
         return (*terms, margin) if decisions else terms
 
     flags = [one for one in (given, where) if one is not None]
     columns, margins = positions.astype(np.float64), force._inside if decisions else None
+    if rows := force.weights(tables):
+        columns = jnp.concatenate([columns, jnp.stack(rows)])
     made = kernel.over_pairs(pair, columns, tables, flags=flags, margins=margins)
     return None if made is None else _forces(tuple(made.sums), made.decisions)
 

@@ -7,6 +7,8 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import fields, replace
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -14,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
+from scipy.linalg import block_diag
 
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.errors import InputError
@@ -243,14 +246,83 @@ for _potential in (LennardJones, Morse, SoftSphere):
     POTENTIALS.add(_potential.name, _potential)
 
 
+class SumPotential(PairPotential):
+    """The potentials of terms that share a decision; energies and slopes are tuples, one for each term."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    parts: tuple[PairPotential, ...]
+
+    name = property(lambda self: " + ".join(self.names))  # type: ignore[assignment]
+
+    def evaluate(self, r2):
+        made = [part.evaluate(r2) for part in self.parts]
+        return tuple(energy for energy, _ in made), tuple(slope for _, slope in made)
+
+    def split(self):
+        each = zip(*(part.split() for part in self.parts), strict=True)
+        own, shared = (replace(self, parts=tuple(parts)) for parts in each)
+        return own, shared
+
+
+class Together(Cutoff):
+    """Terms that share a decision, each with its own end; onsets, energies and slopes are tuples."""
+
+    def __init__(self, ends: tuple[Cutoff, ...]):
+        self.ends = ends
+
+    name = property(lambda self: " + ".join(end.name for end in self.ends))  # type: ignore[assignment]
+    smoothness = property(lambda self: min(end.smoothness for end in self.ends))  # type: ignore[assignment]
+    switches = property(lambda self: any(end.switches for end in self.ends))  # type: ignore[assignment]
+
+    def _each(self, at: AtCutoff):
+        rest = zip(at.r_onset, at.energy, at.slope, strict=True)
+        return zip(self.ends, (AtCutoff(at.r_cut, *own) for own in rest), strict=True)
+
+    def cut(self, r2, u, w, at, weights=None):
+        """As of every cutoff, summed; weights: a factor for each term, None for 1."""
+        rows = zip(self._each(at), u, w, strict=True)
+        made: list[Any] = [end.cut(r2, energy, slope, own) for (end, own), energy, slope in rows]
+        for k, weight in enumerate(weights or ()):
+            made[k] = made[k] if weight is None else tuple(weight * part for part in made[k])
+        return tuple(reduce(add, parts) for parts in zip(*made, strict=True))
+
+    def jumps(self, at):
+        return [jump for end, own in self._each(at) for jump in end.jumps(own)]
+
+
 class CutPotential(eqx.Module):
-    """A pair potential with its cutoff: what the force loop evaluates."""
+    """A pair potential with its cutoff, or terms that share a decision: what the force loop evaluates."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
     r_cut: Float[Array, "types"]  # cutoff per pair type, length, shape (types,)
-    # onset of switching per pair type (equal to r_cut where there is none), shape (types,)
-    r_onset: Float[Array, "types"]
+    # onset of switching per pair type (equal to r_cut where there is none), shape (types,); of several terms
+    # a tuple
+    r_onset: Any
+    # of several terms: factors of the atoms, whose product multiplies a pair's energy, shape (atoms,) in the
+    # user's order, or None for 1
+    weights: tuple[Any, ...] = ()
+
+    @classmethod
+    def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential:
+        """The sum of terms that have the same radii, by name."""
+        parts = list(terms.values())
+        rows = [(one.potential, one.cutoff, one.r_onset, (*one.weights, None)[0]) for one in parts]
+        bare, ends, onsets, weights = zip(*rows, strict=True)
+        weights = weights if any(one.weights for one in parts) else ()
+        return cls(SumPotential(tuple(terms), bare), Together(ends), parts[0].r_cut, onsets, weights)
+
+    @property
+    def terms(self) -> dict[str, CutPotential]:
+        """Its terms by name, each with its weights; of a plain potential itself, without a name."""
+        if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
+            return {"": self}
+        weights = self.weights or (None,) * len(self.r_onset)
+        parts = (self.potential.parts, self.cutoff.ends, self.r_onset, weights)
+        return {
+            name: CutPotential(part, end, self.r_cut, onset, () if weight is None else (weight,))
+            for name, part, end, onset, weight in zip(self.potential.names, *parts, strict=True)
+        }
 
     @property
     def pair_types(self) -> int:
@@ -260,29 +332,98 @@ class CutPotential(eqx.Module):
     def at_cutoff(self) -> AtCutoff:
         """The bare potential at r_cut, per pair type."""
         energy, w = self.potential.evaluate(self.r_cut * self.r_cut)
-        return AtCutoff(self.r_cut, self.r_onset, energy, 2 * self.r_cut * w)
+        return AtCutoff(self.r_cut, self.r_onset, energy, jax.tree.map(lambda w: 2 * self.r_cut * w, w))
 
-    def evaluate(self, r2, types, at: AtCutoff):
+    def evaluate(self, r2, types, at: AtCutoff, *weights):
         """Energy and denergy/d(r²) of pairs inside the cutoff.
 
         Args:
             r2: squared distances.
             types: pair type of each pair, or None where there is only one.
             at: `at_cutoff()`, made once outside the loop.
+            weights: of terms that have some, one tuple of the factors of each pair.
         """
         u, w = self.potential.of(types).evaluate(r2)
-        here = AtCutoff(*(of_type(leaf, types) for leaf in at))
-        return self.cutoff.cut(r2, u, w, here)
+        here = jax.tree.map(lambda leaf: of_type(leaf, types), at)
+        return self.cutoff.cut(r2, u, w, here, *weights)
 
-    def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
-        """Energy jump and radial force jump of a pair that enters, per pair type."""
+    def jumps(self) -> Float[np.ndarray, "2 terms types"]:
+        """Energy jump and radial force jump of a pair of weights 1 that enters, per term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
-        at = jax.tree.map(np.asarray, self).at_cutoff()
-        return np.asarray(self.cutoff.energy_jump(at)), np.asarray(self.cutoff.force_jump(at))
+        made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
+        return np.array(made).swapaxes(0, 1)
 
     def astype(self, dtype) -> CutPotential:
         """Parameters as jax arrays of the given dtype."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self)
+
+
+class Channels(eqx.Module):
+    """A sum of cut potentials with different radii: a decision of every pair for each.
+
+    The kind of a decision is the pair type, plus the number of pair types for each channel before its own.
+    """
+
+    parts: tuple[CutPotential, ...]
+
+    @classmethod
+    def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential | Channels:
+        """The sum of terms by name, those with the same radii in one channel.
+
+        Raises:
+            InputError: a name that is no part of a key.
+        """
+        for name in terms:
+            if not name.replace("_", "").replace("-", "").isalnum():
+                message = f"a term is called {name!r}; expected letters, digits, - and _"
+                raise InputError(message, where="terms", remedy="Give it another name")
+        groups: dict[bytes, dict[str, CutPotential]] = {}
+        for name, term in terms.items():
+            groups.setdefault(np.asarray(term.r_cut).tobytes(), {})[name] = term
+        parts = tuple(CutPotential.of_terms(group) for group in groups.values())
+        return parts[0] if len(parts) == 1 else cls(parts)
+
+    @property
+    def terms(self) -> dict[str, CutPotential]:
+        """As of a `CutPotential`."""
+        return {name: term for part in self.parts for name, term in part.terms.items()}
+
+    @property
+    def potential(self) -> SumPotential:
+        """The bare potentials of all terms."""
+        return SumPotential(tuple(self.terms), tuple(term.potential for term in self.terms.values()))
+
+    @property
+    def cutoff(self) -> Together:
+        """The ends of all terms."""
+        return Together(tuple(term.cutoff for term in self.terms.values()))
+
+    @property
+    def weights(self) -> tuple[Any, ...]:
+        """Those of all channels."""
+        return tuple(weight for part in self.parts for weight in part.weights)
+
+    @property
+    def r_cut(self) -> Float[Array, "kinds"]:
+        """The cutoff of each kind of decision, length."""
+        return jnp.concatenate([part.r_cut for part in self.parts])
+
+    def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
+        """As of a `CutPotential`, by kinds of decisions."""
+        sides = zip(*(part.jumps() for part in self.parts), strict=True)
+        return np.stack([np.asarray(block_diag(*one)) for one in sides])
+
+    def astype(self, dtype) -> Channels:
+        """As of a `CutPotential`."""
+        return Channels(tuple(part.astype(dtype) for part in self.parts))
+
+
+def each_term(
+    model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
+) -> CutPotential | Channels:
+    """A model with each of its terms changed; outside jit."""
+    made = {name: change(term) for name, term in model.terms.items()}
+    return made[""] if "" in made else Channels.of_terms(made)
 
 
 def pair_type(first, second, species: int):

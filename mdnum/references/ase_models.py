@@ -75,7 +75,9 @@ def reference(subject: Simulation | System) -> Reference:
     if kind == "tersoff":
         constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(TersoffModel()))}
         return Reference("ASE Tersoff", True, "none", lambda: Tersoff(constants, skin=0.0))
-    known = _ASE_PAIR.get((kind, model.cutoff.name)) if simulation.pairwise else None
+    # a sum of terms has no class there
+    plain = simulation.pairwise and "" in model.terms
+    known = _ASE_PAIR.get((kind, model.cutoff.name)) if plain else None
     if known is None or isinstance(simulation.potential, PairFunction):
         return independent(simulation)
     label, conversion, made = known
@@ -104,8 +106,9 @@ def independent(subject: Simulation | System) -> Reference:
     models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
     if not simulation.pairwise and kind not in models:
         raise InputError("nothing here evaluates an energy function a second time", where=kind)
-    own = isinstance(simulation.potential, PairFunction)
-    make_model = (lambda: PairModel(_forms(simulation))) if simulation.pairwise else models[kind]
+    model, compare = simulation.model, simulation.decider.compare
+    own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
+    make_model = models[kind] if kind in models else lambda: PairModel.of(model, simulation.symbols, compare)
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
         False,

@@ -27,7 +27,7 @@ from mdnum.systems.structures import species_of
 
 # a change of either is another program; positions and cell are arguments of it
 _REBUILD = {"numbers", "pbc"}
-_SAID = {"potential", "cutoff", "units"}
+_SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
@@ -35,7 +35,7 @@ class _Recipe(NamedTuple):
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
-    tables: Mapping[str, Any]  # what it says of itself; a cutoff where energies belong to atoms
+    tables: Mapping[str, Any]  # what it says of itself; a cutoff or terms where energies belong to atoms
 
 
 def _of_system(system: Simulation | System) -> _Recipe:
@@ -123,7 +123,7 @@ class MdnumCalculator(ClassicalCalculator):
         self._recipe = _of_potential(potential, cutoff, units) if system is None else _of_system(system)
         self._given = system if isinstance(system, Simulation) else None
         self.parameters = Parameters(self._recipe.tables)
-        if "cutoff" not in self._recipe.tables:
+        if not {"cutoff", "terms"} & self._recipe.tables.keys():
             # a potential of many bodies need not split its energy by atom
             self.implemented_properties = [one for one in self.implemented_properties if one != "energies"]
 

@@ -15,7 +15,7 @@ from mdnum.md.integrators import VelocityVerlet as OwnVerlet
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
-from mdnum.references.independent import SLACK, Edges, PairModel, edges_of, pair_forms
+from mdnum.references.independent import SLACK, Edges, PairModel, edges_of
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import build
 from mdnum.systems.evaluate import Evaluation
@@ -133,7 +133,8 @@ def check_energy(
     compared: list[FrameComparison] = []
     sampled: set[int] = set()
     for seed, (name, atoms) in enumerate(named):
-        sample = simulation.pairwise and len(atoms) > SAMPLED
+        # of some of the atoms nobody knows the weights
+        sample = simulation.pairwise and not simulation.model.weights and len(atoms) > SAMPLED
         whole, mine = _evaluated(atoms, simulation, stress=not sample)
         if not sample:
             compared.append(_compare(name, whole, mine, simulation, calculator, other))
@@ -282,14 +283,16 @@ class _Scales:
         if places < unit:
             # the distance itself is rounded, too
             shift = shift + unit * r
-        model = PairModel(pair_forms(simulation.model, simulation.symbols, simulation.decider.compare))
+        model = PairModel.of(simulation.model, simulation.symbols, simulation.decider.compare)
         edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
         energies, forces, stiffness = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i))
-        for form, rows in model.groups(edges):
+        for form, rows, factor in model.groups(edges):
             u, du = form(r[rows])
-            step = 1e-4 * form.r_cut
-            energies[rows], forces[rows] = np.abs(u), np.abs(du)
-            stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
+            step, size = 1e-4 * form.r_cut, np.abs(factor)
+            energies[rows] += size * np.abs(u)
+            forces[rows] += size * np.abs(du)
+            bend = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1])
+            stiffness[rows] += size * bend / (2 * step)
         squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
         per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
@@ -307,11 +310,11 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
     # as the judges asked for it, where that has the room: the list is made once
     edges = edges_of(atoms, model.reach + (bound if bound > SLACK / 2 * model.reach else 0.0))
     once = edges.i < edges.j
-    radius = np.zeros(len(edges.i))
-    for a, b in model.forms:
+    close = np.zeros(len(edges.i), bool)
+    for (a, b), form in (row for forms, _ in model.terms for row in forms.items()):
         chosen = (edges.symbols[edges.i] == a) & (edges.symbols[edges.j] == b)
-        radius[chosen] = model.forms[a, b].r_cut
-    return int((once & (np.abs(edges.r - radius) <= bound)).sum())
+        close |= chosen & (np.abs(edges.r - form.r_cut) <= bound)
+    return int((once & close).sum())
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:

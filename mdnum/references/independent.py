@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff
-from mdnum.md.potentials import CutPotential, PairPotential
+from mdnum.md.potentials import Channels, CutPotential, PairPotential
 
 
 @dataclass(frozen=True)
@@ -211,29 +211,41 @@ _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
 
 @dataclass(frozen=True)
 class PairModel(Model):
-    """Any pair potential with any cutoff, species by species."""
+    """Any pair potential with any cutoff, species by species, or a sum of several."""
 
-    forms: Mapping[tuple[str, str], PairForm]  # see `pair_forms`
+    #: of each term its forms (see `pair_forms`) and the weights of the atoms, None for 1
+    terms: Sequence[tuple[Mapping[tuple[str, str], PairForm], Any]]
+
+    @classmethod
+    def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
+        """Of a cut potential; arguments as for `pair_forms`."""
+        parts = model.terms.values()
+        weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
+        forms = [pair_forms(part, symbols, compare) for part in parts]
+        return cls(tuple(zip(forms, weights, strict=True)))
 
     @property
     def reach(self) -> float:
-        return max(form.r_cut for form in self.forms.values())
+        return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
-    def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray]]:
-        """The edges inside the cutoff, by the form that applies to them: (form, edge numbers)."""
+    def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
+        """The edges inside the cutoff, by the form that applies: (form, edge numbers, factors)."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
-        for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
-            chosen = np.flatnonzero((first == a) & (second == b))
-            if len(chosen):
-                form = self.forms[a, b]
-                yield form, chosen[form.inside(edges.r[chosen])]
+        for forms, weights in self.terms:
+            for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
+                chosen = np.flatnonzero((first == a) & (second == b))
+                if len(chosen):
+                    form = forms[a, b]
+                    rows = chosen[form.inside(edges.r[chosen])]
+                    factor = 1.0 if weights is None else weights[edges.i[rows]] * weights[edges.j[rows]]
+                    yield form, rows, factor
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         energies, gradient = np.zeros(len(edges.symbols)), np.zeros_like(edges.d)
-        for form, rows in self.groups(edges):
+        for form, rows, factor in self.groups(edges):
             u, du = form(edges.r[rows])
-            energies += np.bincount(edges.i[rows], 0.5 * u, len(edges.symbols))
-            gradient[rows] = (0.5 * du / edges.r[rows])[:, None] * edges.d[rows]
+            energies += np.bincount(edges.i[rows], 0.5 * u * factor, len(edges.symbols))
+            gradient[rows] += (0.5 * du * factor / edges.r[rows])[:, None] * edges.d[rows]
         return energies, gradient
 
 

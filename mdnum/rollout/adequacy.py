@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -58,23 +59,22 @@ def beyond_cutoff(simulation: Simulation) -> Mapping[str, float] | None:
 
     Returns:
         `energy` per atom, `pressure` in the user's unit (Allen and Tildesley, section 2.8); None where there
-        is no such bulk (an axis is not periodic) or the potential has its end inside.
+        is no such bulk (an axis is not periodic), the potential has its end inside or atoms have weights.
     """
-    if not simulation.pairwise or not all(simulation.pbc):
+    if not simulation.pairwise or not all(simulation.pbc) or simulation.model.weights:
         return None
     density = simulation.atoms / simulation.cell.volume
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(_NODES)
     node, weight = (node + 1) / 2, weight / 2
     energy = pressure = 0.0
-    potential = simulation.potential
-    kinds = zip(*np.triu_indices(len(simulation.symbols)), strict=True)
-    for kind, (a, b) in enumerate(kinds):
-        constants = potential.constants(kind)
-        end = float(simulation.model.r_cut[kind])
+    kinds = list(enumerate(zip(*np.triu_indices(len(simulation.symbols)), strict=True)))
+    for term, (kind, (a, b)) in product(simulation.model.terms.values(), kinds):
+        constants = term.potential.constants(kind)
+        end = float(term.r_cut[kind])
         # from r = end to infinity is s = end / r from 1 to 0
         r = end / node
-        u, slope = potential.reference(r, **constants)
+        u, slope = term.potential.reference(r, **constants)
         pairs = share[a] * share[b] * (1 if a == b else 2) * 2 * np.pi * density
         energy += pairs * float(weight @ (u * r**4)) / end
         pressure -= pairs * density / 3 * float(weight @ (slope * r**5)) / end

@@ -63,13 +63,14 @@ class ReferenceFrame:
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
         """Keys of pairs of this run, in the other's labels."""
-        i, j = np.divmod(own, len(self.labels))
-        return np.sort(self.keys_of(i, j))
+        return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
         """As `keys`, for pairs given by their ends, in their order."""
+        atoms = len(self.labels)
+        channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
-        return np.minimum(a, b).astype(np.int64) * len(self.labels) + np.maximum(a, b)
+        return (channel * atoms + np.minimum(a, b).astype(np.int64)) * atoms + np.maximum(a, b)
 
 
 # --- pairs that two runs decide differently, kept up to date from the flips of both -------------------
@@ -238,7 +239,7 @@ def _largest(a, b, boxes, out):
 
 @njit
 def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthest):
-    atoms = order.shape[0]
+    atoms, listed = order.shape[0], index.shape[0] // 8
     for row in range(count.shape[0]):
         at, box = x[row], box_of(boxes, row)
         for word in range(own.shape[1]):
@@ -252,7 +253,7 @@ def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthe
                 for k in range(8):
                     if not (bits >> k) & 1:
                         continue
-                    other = index[8 * word + k, column]
+                    other = index[8 * (word % listed) + k, column]
                     # a pair is listed from both ends
                     if other >= atoms or order[column] >= order[other]:
                         continue
@@ -262,7 +263,8 @@ def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthe
                     dz = np.float64(at[2, other]) - np.float64(at[2, column])
                     dx, dy, dz = nearest_image(box, dx, dy, dz)
                     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-                    off = abs(distance - r_cut[species[order[column]], species[order[other]]])
+                    own_cut = r_cut[word // listed]
+                    off = abs(distance - own_cut[species[order[column]], species[order[other]]])
                     count[row] += 1
                     if furthest[row] == furthest[row] and not off <= furthest[row]:
                         furthest[row] = off
@@ -293,7 +295,7 @@ class Apart:
         table: PairTable,
         x: Float[np.ndarray, "rows 3 atoms"],
         species: Int[np.ndarray, "atoms"],
-        r_cut: Float[np.ndarray, "species species"],
+        r_cut: Float[np.ndarray, "channels species species"],
     ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
         """How many pairs are decided otherwise in two records, and the furthest of them from its cutoff.
 
@@ -302,7 +304,7 @@ class Apart:
             table: the list.
             x: positions in its order of atoms.
             species: of each atom, in the user's order.
-            r_cut: cutoff by species, length.
+            r_cut: cutoff of each channel by species, length.
         """
         count, furthest = np.zeros(len(own), np.int64), np.zeros(len(own))
         _overridden(own, told, table.index, table.order, x, species, r_cut, self._boxes, count, furthest)

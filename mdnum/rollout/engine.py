@@ -311,7 +311,7 @@ class Engine:
             held: decisions of the list at the step before; None where it has to look back.
         """
         table, tables = listed
-        words = table.slots // 8
+        words = self.simulation.channels * table.slots // 8
         told = self._pinned(table, int(start.state.step), words) or (None, None)
         look_back, earlier = held is None, held
         if look_back and not self.rows:
@@ -367,7 +367,7 @@ class Engine:
         """What the rows of the next epoch are told, and where; nothing without pins."""
         if self.pins is None:
             return ()
-        return self.pins.rows(table, first, self._room(words))
+        return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def _closes(self, next_step: int, *, rebuild: int, finite: int, runaway: int) -> str | None:
         if not finite:

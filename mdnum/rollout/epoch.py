@@ -25,7 +25,7 @@ from mdnum.md.pairforce import Forces
 class Pin:
     """What a run is told about one pair."""
 
-    # i, j: the pair, i < j
+    # i, j: the pair, i < j; to i the number of atoms is added for each channel before that of the decision
     i: int
     j: int
     # first, last: steps at which it is told
@@ -47,7 +47,7 @@ class Pins:
     pins: Sequence[Pin]
 
     def rows(
-        self, table: PairTable, first: int, count: int
+        self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
         """Packed decisions and where they hold, for consecutive steps of one list.
 
@@ -57,9 +57,10 @@ class Pins:
             table: the list.
             first: step of the first row.
             count: number of rows.
+            channels: decisions of a pair.
         """
         atoms = len(table.order)
-        shape = (count, table.slots // 8, atoms)
+        shape = (count, channels * table.slots // 8, atoms)
         told, where = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
         steps = np.arange(first, first + count)
         index = table.index.reshape(-1, atoms)
@@ -68,9 +69,10 @@ class Pins:
             if not held.any():
                 continue
             inside = pin.at(steps)
-            for atom, other in ((pin.i, pin.j), (pin.j, pin.i)):
+            channel, i = divmod(pin.i, atoms)
+            for atom, other in ((i, pin.j), (pin.j, i)):
                 column = table.place[atom]
-                for slot in np.flatnonzero(index[:, column] == table.place[other]):
+                for slot in np.flatnonzero(index[:, column] == table.place[other]) + channel * table.slots:
                     bit = np.uint8(1 << (slot % 8))
                     where[held, slot // 8, column] |= bit
                     told[held & inside, slot // 8, column] |= bit
@@ -274,11 +276,11 @@ def run_epoch(
 
     before, inside = None, jnp.zeros((), jnp.int64)
     if program.record:
-        words = tables.index.shape[0]
+        shape = jax.eval_shape(program.force.decide, x, tables).bits.shape  # type: ignore[attr-defined]
         before = lax.cond(
             look_back,
             lambda x: force_in(cell=state.cells[moves]).decide(x, tables).bits,
-            lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8) if held is None else held,
+            lambda x: jnp.zeros(shape, jnp.uint8) if held is None else held,
             state.x_before[:, order],
         )
         inside = inside_of(before)

@@ -35,18 +35,19 @@ def _mixed(key):
 def fingerprint_of_bits(bits, index, order):
     """Number and mixed sum of the keys of all pairs inside; the same for every list that decides alike."""
     count, total = 0, np.uint64(0)
-    atoms = order.shape[0]
+    atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
+        channel, own = w // listed, w % listed
         for c in range(bits.shape[1]):
             byte = bits[w, c]
             if byte:
                 i = order[c]
                 for k in range(8):
                     if (byte >> k) & 1:
-                        j = order[index[8 * w + k, c]]
+                        j = order[index[8 * own + k, c]]
                         if i < j:
                             count += 1
-                            total += _mixed(i * atoms + j)
+                            total += _mixed((channel * atoms + i) * atoms + j)
     return count, total
 
 
@@ -85,11 +86,15 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
     atoms, room, place = len(labels), np.empty((4, flips), np.int64), np.empty_like(i)
+    types = len(kinds) * (len(kinds) + 1) // 2
+    many = atoms * (bounds.shape[1] // types)
     for q in range(flips):
         one, other = labels[pairs[q, 1]], labels[pairs[q, 2]]
         i[q], j[q] = min(one, other), max(one, other)
-        room[0, q] = (pairs[q, 0] * atoms + i[q]) * atoms + j[q]
-    order = digit_order(room, flips, len(bounds) * atoms * atoms)
+        # the channel of a decision counts as one of its first atom
+        i[q] += pairs[q, 3] // 2 * atoms
+        room[0, q] = (pairs[q, 0] * many + i[q]) * atoms + j[q]
+    order = digit_order(room, flips, len(bounds) * many * atoms)
     for f in range(flips):
         place[order[f]] = f
     step, subject = np.empty(flips, np.int64), np.empty((2, flips), np.int64)
@@ -98,8 +103,9 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
     # as they were noted: they come from further away than their places, which are near one another
     for q in range(flips):
         f = place[q]
-        row, now = pairs[q, 0], pairs[q, 3] != 0
-        k = kinds[species[i[q]], species[j[q]]] if len(kinds) > 1 else np.int64(0)
+        row, now = pairs[q, 0], pairs[q, 3] % 2 != 0
+        k = kinds[species[i[q] % atoms], species[j[q]]] if len(kinds) > 1 else np.int64(0)
+        k += pairs[q, 3] // 2 * types
         x0, y0, z0, x1, y1, z1 = ends[q, 0], ends[q, 1], ends[q, 2], ends[q, 3], ends[q, 4], ends[q, 5]
         box = box_of(boxes, row)
         dx, dy, dz = nearest_image(box, wide(x1) - wide(x0), wide(y1) - wide(y0), wide(z1) - wide(z0))
@@ -218,11 +224,7 @@ class PairRecorder:
         # almost always no pair comes that close; where one does, the host looks again
         close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max(axis=1))
         if len(close):
-            slot, first = np.nonzero(table.index < self.simulation.atoms)
-            second = table.index[slot, first]
-            i, j = table.order[first], table.order[second]
-            once = i < j
-            first, second, i, j = first[once], second[once], i[once], j[once]
+            first, second, i, j = table.listed(self.simulation.channels)
         for row in close:
             x = segment.rows_of("x")[row]
             kind = self.simulation.type_of(i, j)
@@ -238,7 +240,7 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """The flips of a segment, sorted by step, i and j (user's labels, i < j).
+        """The flips of a segment, sorted by step, i and j (user's labels, i < j; channels as in `type_of`).
 
         Distance, margin and radial speed are those of the step of the flip, the margin with the bits that the
         decision was made with.
@@ -261,8 +263,12 @@ class PairRecorder:
         pairs, ends = pairs[:kept], ends[:kept]
         if replaced is not None:
             keys, now = replaced
-            a, b = table.place[np.stack(np.divmod(keys, self.simulation.atoms))]
-            added = np.stack([np.zeros(len(keys), np.int64), a, b, now], axis=1).astype(np.int32)
+            i, j = np.divmod(keys, self.simulation.atoms)
+            channel, i = np.divmod(i, self.simulation.atoms)
+            a, b = table.place[np.stack([i, j])]
+            added = np.stack([np.zeros(len(keys), np.int64), a, b, now + 2 * channel], axis=1).astype(
+                np.int32
+            )
             pairs = np.concatenate([added, pairs])
             ends = np.concatenate([np.concatenate([x[0][:, a], x[0][:, b], v[0][:, a], v[0][:, b]]).T, ends])
         if segment.closes:
@@ -284,6 +290,10 @@ class PairRecorder:
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
             )
         margin, bound, jump, distance, speed, force_jump = numbers
+        if self.simulation.pairwise and self.simulation.model.weights:
+            # in the compiled loop each kind of pair has one jump
+            sign = np.where(entered, 1.0, -1.0)
+            jump, force_jump = (sign * one for one in self.simulation.jumps_of(i, j))
         return FlipTable(
             i=i, j=j, rank=np.broadcast_to(np.int32(0), len(i)), entered=entered, distance=distance,
             margin=margin, bound=bound, ambiguous=np.abs(margin) <= bound, decided_by="program",
@@ -331,7 +341,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """One sorted integer for each pair i < j."""
+    """One sorted integer for each pair i < j; to i the channel of a decision is added, as in `type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
@@ -344,14 +354,16 @@ def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "wor
 @njit
 def _write_keys(bits, index, order, place, keys):
     """Keys atom after atom, each with its neighbors in order; returns how many there are."""
-    atoms, at = order.shape[0], 0
-    for i in range(atoms):
+    atoms, listed, at = order.shape[0], index.shape[0] // 8, 0
+    # the channel of a decision counts as one of its first atom
+    for first in range(atoms * (bits.shape[0] // listed)):
+        i, words = first % atoms, first // atoms * listed
         begin, c = at, place[i]
-        for w in range(bits.shape[0]):
-            byte = bits[w, c]
+        for w in range(listed):
+            byte = bits[words + w, c]
             for k in range(8):
                 if (byte >> k) & 1 and order[index[8 * w + k, c]] > i:
-                    key = i * atoms + order[index[8 * w + k, c]]
+                    key = first * atoms + order[index[8 * w + k, c]]
                     q = at
                     while q > begin and keys[q - 1] > key:
                         keys[q] = keys[q - 1]
@@ -370,11 +382,8 @@ def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) ->
     """Keys of all pairs inside, from a fresh search; same convention and bits as the program's."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
-    slot, column = np.nonzero(table.index < simulation.atoms)
-    i, j = table.order[column], table.order[table.index[slot, column]]
-    keep = i < j
-    i, j = i[keep], j[keep]
-    d = displacement(simulation.cell, wrapped[i], wrapped[j], np.dtype(decider.dtype))
+    _, _, i, j = table.listed(simulation.channels)
+    d = displacement(simulation.cell, wrapped[i % simulation.atoms], wrapped[j], np.dtype(decider.dtype))
     margin = decider.host_margin(d, simulation.type_of(i, j))
     inside = margin >= 0 if decider.compare.endswith("<=") else margin > 0
     return pair_keys(i[inside], j[inside], simulation.atoms)

@@ -277,7 +277,7 @@ def pair_margin(
     """
     decider = simulation.decider
     kind = int((labels or simulation).type_of(np.array([i]), np.array([j]))[0])
-    d = HostCell(simulation.cell, decider.dtype).displacement(x[[i]], x[[j]])
+    d = HostCell(simulation.cell, decider.dtype).displacement(x[[i % len(x)]], x[[j]])
     return decider.thresholds[kind].value - float(decider.host_quantity(*d)[0])
 
 

@@ -188,7 +188,7 @@ class Rollout:
         rows = series_columns(self.simulation, segment, pairs, ambiguous, ledger)
         self.folder.append("series", rows)
         if len(ledger):
-            self.folder.append("flips", ledger.columns())
+            self.folder.append("flips", {**ledger.columns(), **self.simulation.first_atoms(ledger.i)})
         for row in done.health.take(segment, self.recorder.missed):
             self.folder.append("epochs", row)
         done.tally.take(segment, rows, ledger, self.recorder.bounds(segment))

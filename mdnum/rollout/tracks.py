@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -251,7 +252,7 @@ class Handed:
             tables = self._tables
         else:
             table, home, built, tables, place = self._list(segment)
-            told = _mapped(told, place)
+            told = _mapped(told, place, simulation.channels)
         held, self._record = self._record, None
         if held is None or held.bits.shape != told.shape:
             moves = simulation.integrator.moves_cell
@@ -301,14 +302,14 @@ class Handed:
         return table, home, built, self._tables, self._place
 
 
-def _by_species(simulation: Simulation) -> Float[np.ndarray, "species species"]:
-    """The cutoff of each pair of species, length."""
-    radii = np.array(simulation.decider.r_cut)
+def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
+    """The cutoff of each channel and pair of species, length."""
+    radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
-    if len(radii) == 1:
-        return np.full((count, count), radii[0])
+    if radii.shape[1] == 1:
+        return np.repeat(radii, count * count).reshape(-1, count, count)
     first, second = np.indices((count, count))
-    return radii[pair_type(first, second, count)]
+    return radii[:, pair_type(first, second, count)]
 
 
 def _places(
@@ -328,14 +329,14 @@ def _places(
     return np.where(found, flat[at], led.index.size).astype(np.int32)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="channels")
 def _mapped(
-    bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"]
+    bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"], channels: int = 1
 ) -> UInt8[Array, "rows own atoms"]:
     """The decisions of one list in the slots of another."""
-    rows, words, atoms = bits.shape
+    rows, _, atoms = bits.shape
     shift = jnp.arange(8, dtype=jnp.uint8)[None, None, :, None]
-    each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows, words * 8 * atoms)
-    each = jnp.concatenate([each, jnp.zeros((rows, 1), jnp.uint8)], axis=1)
+    each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows * channels, -1)
+    each = jnp.concatenate([each, jnp.zeros((rows * channels, 1), jnp.uint8)], axis=1)
     taken = each[:, place].reshape(rows, -1, 8, atoms)
     return jnp.sum(taken << shift, axis=2, dtype=jnp.uint8)

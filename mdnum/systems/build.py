@@ -14,11 +14,11 @@ from pydantic import TypeAdapter, ValidationError
 from mdnum.errors import InputError
 from mdnum.md.integrators import INTEGRATORS
 from mdnum.md.neighbors import RebuildRule
-from mdnum.md.potentials import POTENTIALS, PairFunction
+from mdnum.md.potentials import POTENTIALS, Channels, PairFunction
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.systems import code, pairs, schema
-from mdnum.systems.construct import assembled, cut
+from mdnum.systems.construct import assembled, cut, weights
 from mdnum.systems.load import System, load
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import species_of
@@ -64,17 +64,32 @@ def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder:
     Raises:
         InputError: a species for which there are no constants.
     """
+    if isinstance(spec, schema.SystemSpec) and spec.terms is not None:
+        tables = spec.interactions
+        return Channels.of_terms(
+            {
+                key: _pair_model(tables[key], atoms, folder, weights(one.weight, atoms, key))
+                for key, one in spec.terms.items()
+            }
+        )
     if spec.cutoff is None:
         return _many_body_model(spec.potential, atoms, folder, name)
+    return _pair_model(schema.Interaction(spec.potential, spec.cutoff), atoms, folder)
+
+
+def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tuple[Any, ...] = ()):
+    table, cutoff = tables
+    assert cutoff is not None
     species, _ = species_of(atoms)
-    if isinstance(spec.potential, schema.PythonTable):
-        potential = PairFunction(code.function(spec.potential.function, folder), **spec.potential.parameters)
+    if isinstance(table, schema.PythonTable):
+        potential = PairFunction(code.function(table.function, folder), **table.parameters)
     else:
-        tables = pairs.pair_constants(spec, species)
-        constants = {name: jax.device_put(_per_type(table)) for name, table in tables.items()}
-        potential = POTENTIALS[spec.potential.kind](**constants)
-    ends = (table if table is None else _per_type(table) for table in pairs.cutoff_radii(spec, species))
-    return cut(potential, spec.cutoff.kind, species, *ends)
+        constants = pairs.pair_constants(tables, species).items()
+        potential = POTENTIALS[table.kind](
+            **{name: jax.device_put(_per_type(row)) for name, row in constants}
+        )
+    ends = (row if row is None else _per_type(row) for row in pairs.cutoff_radii(tables, species))
+    return cut(potential, cutoff.kind, species, *ends, weights=own)
 
 
 def _many_body_model(potential: Any, atoms: Atoms, folder: Path, name: str):
@@ -125,7 +140,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
         system.atoms,
         units,
         model_of(spec, system.atoms, system.folder, system.name),
-        "r <" if spec.cutoff is None else spec.cutoff.compare,
+        spec.compare,
         RebuildRule(spec.skin, rebuild.every, rebuild.delay, rebuild.check),
         neighbors.builder,
         policy,

@@ -19,7 +19,7 @@ from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.lattice import Lattice, LatticeDecider
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
-from mdnum.md.potentials import CutPotential, PairPotential, pair_type
+from mdnum.md.potentials import Channels, CutPotential, PairPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
@@ -55,9 +55,29 @@ class Cut:
     compare: str = "r2 <"
 
 
+@dataclass(frozen=True)
+class Term:
+    """One of several pair potentials that are added, with its own end.
+
+    Example:
+        >>> Term(LennardJones(sigma=2.3, epsilon=0.01), Cut("switched", 8.5))
+        >>> Term(PairFunction(coulomb), Cut("shifted", 8.5), weight={"Na": 1.0, "Cl": -1.0})
+
+    Args:
+        potential: of a pair of weights 1.
+        cutoff: where it ends. Terms with the same radii share the decision of each pair.
+        weight: a number for each species, or an array with one for each atom; the energy of a pair is
+            multiplied by those of both its atoms. Default 1.
+    """
+
+    potential: PairPotential
+    cutoff: Cut
+    weight: Mapping[str, float] | Float[np.ndarray, "atoms"] | None = None
+
+
 def simulation(
     atoms: Atoms,
-    potential: PairPotential | ManyBody,
+    potential: PairPotential | ManyBody | Mapping[str, Term],
     cutoff: Cut | None = None,
     *,
     timestep: float | None = None,
@@ -89,9 +109,9 @@ def simulation(
 
     Args:
         atoms: positions, cell and periodicity; masses default to ASE's, in reduced units to 1.
-        potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; or one of
-            `mdnum.md.manybody`.
-        cutoff: of a pair potential; one of many bodies has its own.
+        potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; a dictionary of
+            `Term`s, which add; or one of `mdnum.md.manybody`.
+        cutoff: of a pair potential; terms and one of many bodies have their own.
         timestep: in ps, or in reduced time; not beside an integrator that has one.
         units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
         temperature: of velocities that are drawn, and of a thermostat.
@@ -128,10 +148,20 @@ def simulation(
     model: Any = potential
     if isinstance(potential, PairPotential) and cutoff is not None:
         model = cut(potential, cutoff.kind, symbols, cutoff.radius, cutoff.onset)
+    elif isinstance(potential, Mapping):
+        cutoff = common(potential)
+        model = Channels.of_terms(
+            {
+                key: cut(
+                    term.potential, term.cutoff.kind, symbols, term.cutoff.radius, term.cutoff.onset,
+                    weights(term.weight, atoms, key), where=f"terms.{key}.",
+                )
+                for key, term in potential.items()
+            }
+        )  # fmt: skip
     r_cut = float(np.max(model.r_cut))
     skin = DEFAULT_SKIN[units] if skin is None else float(skin)
-    sigmas = np.asarray(model.potential.leaves.get("sigma", ())).tolist() if pairwise else ()
-    check(atoms, r_cut, skin, smallest_distance(potential.name, units, sigmas), system.length)
+    check(atoms, r_cut, skin, closest(model, units), system.length)
     if not isinstance(integrator, Integrator):
         if timestep is None:
             raise InputError("no time step", where=name, remedy="Add timestep=...")
@@ -156,12 +186,23 @@ def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal
 
 
 def cut(
-    potential: PairPotential, kind: str, symbols: Sequence[str], radius: Any, onset: Any = None
+    potential: PairPotential,
+    kind: str,
+    symbols: Sequence[str],
+    radius: Any,
+    onset: Any = None,
+    weights: tuple[Any, ...] = (),
+    *,
+    where: str = "",
 ) -> CutPotential:
-    """A potential with its end, everything with one entry per pair type; arguments as those of `Cut`."""
+    """A potential with its end, everything with one entry per pair type; arguments as those of `Cut`.
+
+    Args:
+        weights: of the atoms, if there are any. where: begins the names of parameters in messages.
+    """
 
     def table(value: Any, what: str):
-        return jax.device_put(by_type(value, symbols, what))
+        return jax.device_put(by_type(value, symbols, f"{where}{what}"))
 
     cutoff, r_cut = CUTOFFS.parse(kind), table(radius, "cutoff.radius")
     r_onset = r_cut
@@ -171,9 +212,54 @@ def cut(
     tree = jax.tree.map(
         lambda one: np.array(one) if _is_array(one) else one, potential.shared, is_leaf=_is_array
     )
-    shared = (_finite(leaf, f"potential.{path}") for path, leaf in leaves_by_path(tree).items())
+    shared = (_finite(leaf, f"{where}potential.{path}") for path, leaf in leaves_by_path(tree).items())
     leaves |= jax.device_put(dict(jax.tree.unflatten(jax.tree.structure(tree), shared)))
-    return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset)
+    return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset, weights)
+
+
+def common(terms: Mapping[str, Term]) -> Cut:
+    """A cutoff whose convention is that of all terms.
+
+    Raises:
+        InputError: there are no terms, or their conventions differ.
+    """
+    compared = {name: term.cutoff.compare for name, term in terms.items()}
+    if len(set(compared.values())) != 1:
+        seen = ", ".join(f"{name} {compare!r}" for name, compare in compared.items()) or "no term"
+        message = f"one convention is needed for all terms, and there is {seen}"
+        raise InputError(message, where="cutoff.compare", remedy="Give every term the same")
+    return next(iter(terms.values())).cutoff
+
+
+def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
+    """The weight of each atom as `CutPotential` holds it; nothing where there is none.
+
+    Raises:
+        InputError: a species, or an atom, has none.
+    """
+    if weight is None:
+        return ()
+    what = f"terms.{term}.weight"
+    symbols = atoms.get_chemical_symbols()
+    if isinstance(weight, Mapping):
+        if missing := sorted(set(symbols) - set(weight)):
+            remedy = "Give a number for every species"
+            raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
+        weight = [weight[symbol] for symbol in symbols]
+    numbers = np.array(weight, np.float64)
+    if numbers.shape != (len(atoms),) or not np.isfinite(numbers).all():
+        seen = f"an array of shape {numbers.shape}"
+        raise InputError(f"{seen}; expected a finite number for each of {len(atoms)} atoms", where=what)
+    return (jax.device_put(numbers),)
+
+
+def closest(model: Any, units: str) -> float:
+    """Atoms closer than this are a mistake in a structure with this potential, length."""
+    if not isinstance(model, CutPotential | Channels):
+        return smallest_distance(model.name, units)
+    each = [term.potential for term in model.terms.values()]
+    sigmas = [np.asarray(one.leaves.get("sigma", ())).tolist() for one in each]
+    return max(smallest_distance(one.name, units, own) for one, own in zip(each, sigmas, strict=True))
 
 
 def _is_array(value: Any) -> bool:
@@ -242,7 +328,7 @@ def assembled(
     positions = np.asarray(atoms.positions, np.float64)
     masses = np.asarray(atoms.get_masses(), np.float64)
     symbols, species = species_of(atoms)
-    pairwise = isinstance(model, CutPotential)
+    pairwise = isinstance(model, CutPotential | Channels)
     if not pairwise:
         if policy != PrecisionPolicy():
             raise InputError(DOUBLE_ONLY, where="precision", remedy="Remove the [precision] table")
@@ -287,9 +373,17 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
     if simulation.pairwise:
         places = np.array([old.index(one) for one in symbols])
         first, second = np.triu_indices(len(places))
-        kinds = pair_type(places[first], places[second], len(old))
-        ends = (leaf[kinds] for leaf in (model.r_cut, model.r_onset))
-        model = CutPotential(model.potential.of(kinds), model.cutoff, *ends)
+        kinds = jax.device_put(pair_type(places[first], places[second], len(old)))
+
+        def of_kinds(one: CutPotential) -> CutPotential:
+            ends = one.r_cut[kinds], one.r_onset[kinds]
+            return CutPotential(one.potential.of(kinds), one.cutoff, *ends, one.weights)
+
+        model = each_term(model, of_kinds)
+        if model.weights and not np.array_equal(atoms.numbers, simulation.structure.numbers):
+            remedy = "Give atoms of the same species in the same order"
+            message = "the atoms have weights, and these are others"
+            raise InputError(message, where=simulation.name, remedy=remedy)
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,
         simulation.decider.compare, replace(simulation.rule, skin=skin), simulation.builder,

@@ -17,6 +17,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.md.manybody import leaves_by_path
+from mdnum.md.potentials import CutPotential
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, write_text
 from mdnum.store.folder import system_tables
@@ -36,12 +37,7 @@ def program(simulation: Simulation) -> dict[str, Any]:
     rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
     tables: dict[str, Any] = {
         "units": simulation.units.name,
-        "potential": {
-            "kind": simulation.potential.name,
-            **_constants(simulation),
-            **_code(getattr(simulation.potential, "function", None)),
-        },
-        "cutoff": _cutoff(simulation),
+        **_interactions(simulation),
         "neighbors": {
             "skin": rule.skin,
             "builder": simulation.builder,
@@ -163,13 +159,33 @@ def _start(simulation: Simulation) -> str:
     return sums.hexdigest()
 
 
-def _constants(simulation: Simulation) -> dict[str, Any]:
-    potential, typed = simulation.potential, {}
-    if simulation.pairwise:
-        typed = {name: by_pair(simulation, leaf) for name, leaf in potential.leaves.items()}
-        potential = potential.shared
-    leaves = leaves_by_path(potential).items()
-    return typed | {name: plain_leaf(leaf) for name, leaf in leaves if eqx.is_array_like(leaf)}
+def _interactions(simulation: Simulation) -> dict[str, Any]:
+    """The tables of the potential and its cutoff, or one of several terms."""
+    model = simulation.model
+    if not simulation.pairwise:
+        return {
+            "potential": {"kind": model.name, **_leaves(model), **_code(getattr(model, "function", None))}
+        }
+    tables = {name: _pair_tables(simulation, term) for name, term in model.terms.items()}
+    return tables.get("", {"terms": tables})
+
+
+def _pair_tables(simulation: Simulation, term: CutPotential) -> dict[str, Any]:
+    potential, cutoff = term.potential, term.cutoff
+    constants = {name: by_pair(simulation, leaf) for name, leaf in potential.leaves.items()}
+    constants |= _leaves(potential.shared) | _code(getattr(potential, "function", None))
+    onset = {"onset": by_pair(simulation, term.r_onset)} if cutoff.switches else {}
+    radius, compare = by_pair(simulation, term.r_cut), simulation.decider.compare
+    return {
+        "potential": {"kind": potential.name, **constants},
+        "cutoff": {"kind": cutoff.name, "radius": radius, **onset, "compare": compare},
+        **({"weight": plain_leaf(term.weights[0])} if term.weights else {}),
+    }
+
+
+def _leaves(tree: Any) -> dict[str, Any]:
+    leaves = leaves_by_path(tree).items()
+    return {name: plain_leaf(leaf) for name, leaf in leaves if eqx.is_array_like(leaf)}
 
 
 def _code(function: Any) -> dict[str, Any]:
@@ -183,15 +199,6 @@ def _code(function: Any) -> dict[str, Any]:
     compiled = getattr(function, "__code__", None)
     hashed = source.encode() or repr(compiled and (compiled.co_code, compiled.co_consts)).encode()
     return {"code": {"source": source, "sha256": hashlib.sha256(hashed).hexdigest()}}
-
-
-def _cutoff(simulation: Simulation) -> dict[str, Any] | None:
-    if not simulation.pairwise:
-        return None
-    model = simulation.model
-    onset = {"onset": by_pair(simulation, model.r_onset)} if model.cutoff.switches else {}
-    radius = by_pair(simulation, model.r_cut)
-    return {"kind": model.cutoff.name, "radius": radius, **onset, "compare": simulation.decider.compare}
 
 
 def _dynamics(simulation: Simulation) -> dict[str, Any]:

@@ -157,7 +157,8 @@ def _numbers(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, x, 
         return (jnp.minimum(found[0], least), jnp.max(r2, where=there, initial=found[1])), None
 
     closest, furthest = jax.lax.scan(wider, (jnp.full(types, jnp.inf), jnp.zeros(())), tables.groups())[0]
-    pair = jnp.zeros(types) if bare is None else bare.evaluate(closest)[0]
+    # of several terms their sum
+    pair = jnp.zeros(types) if bare is None else sum(jax.tree.leaves(bare.evaluate(closest)[0]))
     closest, pair = (jnp.where(jnp.isinf(closest), 0.0, one) for one in (closest, pair))
     found = {"force": made.force, "r2": jnp.append(closest, furthest), "pair": pair}
     return jnp.sum(made.energy, dtype=jnp.float64), found

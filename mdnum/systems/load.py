@@ -178,17 +178,27 @@ class System:
     def program(self) -> dict[str, Any]:
         """Every number and choice but the structure, plain values: what is hashed."""
         made = self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
-        if isinstance(self.spec.potential, schema.PythonTable):
-            made["potential"]["code"] = [sha256(file.read_bytes()).hexdigest() for file in self.tables]
+        if made.get("terms") is None:
+            made.pop("terms", None)
+        for table, potential in self._potentials(made):
+            if isinstance(potential, schema.PythonTable):
+                table["code"] = [sha256(file.read_bytes()).hexdigest() for file in self._files(potential)]
         return made
+
+    def _potentials(self, data: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
+        """The table of each potential in the tables of the file, with what it was read as."""
+        tables = {"": data} if self.spec.terms is None else data["terms"]
+        return [(tables[name]["potential"], one.potential) for name, one in self.spec.interactions.items()]
+
+    def _files(self, potential: Any) -> set[Path]:
+        if isinstance(potential, schema.PythonTable):
+            return {code.parts(potential.function, self.folder)[0]}
+        return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtomTable) else set()
 
     @property
     def tables(self) -> set[Path]:
         """Files the potential reads, or executes."""
-        potential = self.spec.potential
-        if isinstance(potential, schema.PythonTable):
-            return {code.parts(potential.function, self.folder)[0]}
-        return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtomTable) else set()
+        return {file for one in self.spec.interactions.values() for file in self._files(one.potential)}
 
     def to_toml(self, *, beside: bool = True) -> str:
         """The system file with every default written out.
@@ -200,21 +210,19 @@ class System:
         """
         spec = self.spec.model_dump(mode="python", exclude_none=True)
         structure = spec["structure"]
+        potentials = [table for table, _ in self._potentials(spec)]
         if not beside:
-            for table, key in (
-                (structure, "file"),
-                (spec["potential"], "file"),
-                (spec["potential"], "function"),
-            ):
-                if key in table:
-                    table[key] = str((self.folder / table[key]).resolve())
+            for table in (structure, *potentials):
+                for key in ("file", "function"):
+                    if key in table:
+                        table[key] = str((self.folder / table[key]).resolve())
             return toml.dump({"name": self.name, **spec})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
-        if isinstance(self.spec.potential, schema.EmbeddedAtomTable):
-            spec["potential"]["file"] = Path(self.spec.potential.file).name
-        if isinstance(self.spec.potential, schema.PythonTable):
-            spec["potential"]["function"] = Path(self.spec.potential.function).name
+        for table in potentials:
+            for key in ("file", "function"):
+                if key in table:
+                    table[key] = Path(table[key]).name
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
@@ -477,18 +485,20 @@ def _md(spec: schema.SystemSpec, source: Source) -> System:
     try:
         atoms = structures.make(spec.structure, spec.units, source.path.parent)
         system = System(spec.name or source.name, spec, source.path, atoms)
-        potential: Any = spec.potential
-        sigmas = [potential.sigma] if getattr(potential, "sigma", None) is not None else []
-        sigmas += [
-            row.sigma for row in (getattr(potential, "pairs", None) or {}).values() if hasattr(row, "sigma")
-        ]
-        smallest = structures.smallest_distance(potential.kind, spec.units, sigmas)
+        smallest = max(_smallest(one.potential, spec.units) for one in spec.interactions.values())
         structures.check(atoms, system.r_cut, spec.skin, smallest, system.units.length)
     except InputError as error:
         if error.where:
             raise
         raise InputError(error.message, remedy=error.remedy, where=source.where) from None
     return system
+
+
+def _smallest(potential: Any, units: str) -> float:
+    sigmas = [potential.sigma] if getattr(potential, "sigma", None) is not None else []
+    rows = (getattr(potential, "pairs", None) or {}).values()
+    sigmas += [row.sigma for row in rows if hasattr(row, "sigma")]
+    return structures.smallest_distance(potential.kind, units, sigmas)
 
 
 def _ball(spec: BallSpec, source: Source) -> BallSystem:

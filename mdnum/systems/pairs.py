@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -34,7 +35,7 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
     Raises:
         InputError: a pair of species has no constants.
     """
-    potential = spec.potential
+    potential: Any = spec.potential
     if not isinstance(potential, schema.PairPotentialTable):
         raise TypeError(f"{potential.kind} is not a pair potential")
     if isinstance(potential, schema.PythonTable):
@@ -74,7 +75,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
     """
     cutoff = spec.cutoff
     if cutoff is None:
-        raise TypeError(f"{spec.potential.kind} has no [cutoff]")
+        raise TypeError("a potential without a [cutoff]")
     given = {pair_key(*name.split("-")): radius for name, radius in (cutoff.pairs or {}).items()}
     shape = (len(species), len(species))
     if cutoff.in_sigma is not None:
@@ -103,10 +104,12 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
 def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
     """The distance beyond which no pair of atoms interacts directly (length)."""
     potential = spec.potential
-    if isinstance(potential, schema.PairPotentialTable):
-        radius, _ = cutoff_radii(spec, species)
-        pair_constants(spec, species)
-        return float(radius.max())
+    if potential is None or isinstance(potential, schema.PairPotentialTable):
+        longest = 0.0
+        for one in spec.interactions.values():
+            pair_constants(one, species)
+            longest = max(longest, float(cutoff_radii(one, species)[0].max()))
+        return longest
     from mdnum.md import manybody
 
     if isinstance(potential, schema.EmbeddedAtomTable):

@@ -27,7 +27,7 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.manybody import leaves_by_path, quantities_of, with_quantities
 from mdnum.md.neighbors import check_radius
-from mdnum.md.potentials import CutPotential
+from mdnum.md.potentials import Channels, CutPotential, SumPotential, Together
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
 from mdnum.registry import nearest
@@ -49,8 +49,6 @@ _UNITS = {
     "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
     "velocity": "{length}/{time}",
 }  # fmt: skip
-#: Parameters of a cutoff, by the name of their field.
-_ENDS = {"cutoff.radius": "r_cut", "cutoff.onset": "r_onset"}
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
     """The paths of all parameters, those of single entries aside."""
     model, draw = simulation.model, simulation.draw
     if simulation.pairwise:
-        potential = model.potential
-        found = [f"potential.{key}" for key in (*potential.leaves, *leaves_by_path(potential.shared))]
-        found += ["cutoff.radius", *["cutoff.onset"] * simulation.cutoff.switches]
+        found = list(pair_leaves(model))
     else:
         found = [f"potential.{key}" for key in quantities_of(model)]
     keys = dict.fromkeys(("timestep", *["temperature"] * draw.drawn, *simulation.integrator.numbers()))
@@ -101,7 +97,8 @@ def numbers(simulation: Simulation) -> tuple[str, ...]:
     """The paths of all parameters that are one number, those of single coordinates and weights aside."""
     file = simulation.origin.system
     # as its file has it the radius would move along with sigma
-    moving = "sigma" if file and file.spec.cutoff and file.spec.cutoff.in_sigma is not None else None
+    ends = [] if file is None else [one.cutoff for one in file.spec.interactions.values()]
+    moving = "sigma" if any(end and end.in_sigma is not None for end in ends) else None
     found = (*names(simulation), *_of_pairs(simulation))
     return tuple(name for name in found if _is_number(simulation, name) and name.rpartition(".")[2] != moving)
 
@@ -109,7 +106,7 @@ def numbers(simulation: Simulation) -> tuple[str, ...]:
 def _is_number(simulation: Simulation, name: str) -> bool:
     here = value(simulation, name)
     # a radius of all pairs is one
-    return here.ndim == 0 or (name.startswith("cutoff.") and bool(np.all(here == here[0])))
+    return here.ndim == 0 or ("cutoff." in name and bool(np.all(here == here[0])))
 
 
 def number(simulation: Simulation, name: str) -> float:
@@ -125,7 +122,7 @@ def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
 def is_positive(simulation: Simulation, name: str) -> bool:
     """Whether only values above 0 make sense of a number: not of coordinates and weights."""
     whole = entry(simulation, name).whole
-    if whole.startswith("potential."):
+    if "potential." in whole:
         return _is_typed(simulation, whole) and number(simulation, name) > 0
     return not whole.startswith("initial.")
 
@@ -138,8 +135,7 @@ def by(simulation: Simulation, name: str) -> str:
 
 
 def _is_typed(simulation: Simulation, name: str) -> bool:
-    typed = getattr(simulation.potential, "leaves", ())
-    return name in _ENDS or name.removeprefix("potential.") in typed
+    return simulation.pairwise and name in pair_leaves(simulation.model, shared=False)
 
 
 def unit(simulation: Simulation, name: str) -> str:
@@ -157,7 +153,7 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
     table, _, key = name.partition(".")
-    if table in ("potential", "cutoff"):
+    if table in ("potential", "cutoff", "terms"):
         array = np.array(leaf_of(simulation.model, name), np.float64)
         return array.reshape(()) if array.shape == (1,) and _is_typed(simulation, name) else array
     if name == "dynamics.temperature" and simulation.draw.temperature:
@@ -172,13 +168,34 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 def leaf_of(model: Any, name: str) -> Any:
     """Where a parameter of a potential, or of its end, is in it."""
-    if name in _ENDS:
-        return getattr(model, _ENDS[name])
-    # the only potential; one of several would be found by its own prefix
-    key = name.removeprefix("potential.")
-    if not isinstance(model, CutPotential):
-        return quantities_of(model)[key]
-    return {**model.potential.leaves, **leaves_by_path(model.potential.shared)}[key]
+    if not isinstance(model, CutPotential | Channels):
+        return quantities_of(model)[name.removeprefix("potential.")]
+    return pair_leaves(model)[name]
+
+
+def pair_leaves(model: CutPotential | Channels, shared: bool = True) -> dict[str, Any]:
+    """The arrays of pair potentials and their ends by path; those that all pairs share where wanted.
+
+    The radius of terms that share their decisions is one, and among others it has no path.
+    """
+    if isinstance(model, Channels):
+        each = [pair_leaves(part, shared) for part in model.parts]
+        return {key: leaf for one in each for key, leaf in one.items() if key != "cutoff.radius"}
+    bare, cutoff = model.potential, model.cutoff
+    if isinstance(bare, SumPotential) and isinstance(cutoff, Together):
+        rows = zip(
+            [f"terms.{name}." for name in bare.names], bare.parts, cutoff.ends, model.r_onset, strict=True
+        )
+        only = f"terms.{bare.names[0]}." if len(bare.names) == 1 else ""
+    else:
+        rows, only = [("", bare, cutoff, model.r_onset)], ""
+    found: dict[str, Any] = {}
+    ends = {f"{only}cutoff.radius": model.r_cut}
+    for prefix, potential, end, onset in rows:
+        own = {**potential.leaves, **(leaves_by_path(potential.shared) if shared else {})}
+        found |= {f"{prefix}potential.{key}": leaf for key, leaf in own.items()}
+        ends |= {f"{prefix}cutoff.onset": onset} if end.switches else {}
+    return found | ends
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
@@ -211,17 +228,19 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
         # its radius may follow
         decider = replace(simulation.decider, r_cut=(float(model.r_cut),))
         return replace(simulation, model=model, decider=decider)
-    if table in ("potential", "cutoff"):
+    if table in ("potential", "cutoff", "terms"):
         leaf = jnp.asarray(new.reshape(leaf_of(model, name).shape))
         model = eqx.tree_at(lambda one: leaf_of(one, name), model, leaf)
-        if table == "potential":
+        if "potential." in name:
             return replace(simulation, model=model)
-        if not model.cutoff.switches:
+        if table == "cutoff" and not model.cutoff.switches and "" in model.terms:
             model = eqx.tree_at(lambda one: one.r_onset, model, leaf)
-        radius, onset = np.asarray(model.r_cut), np.asarray(model.r_onset)
-        if model.cutoff.switches and np.any(onset >= radius):
-            seen = f"an onset of {float(np.max(onset))!r} is not below"
-            raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
+        for term in model.terms.values():
+            radius, onset = np.asarray(term.r_cut), np.asarray(term.r_onset)
+            if term.cutoff.switches and np.any(onset >= radius):
+                seen = f"an onset of {float(np.max(onset))!r} is not below"
+                raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
+        radius = np.asarray(model.r_cut)
         check_radius(simulation.cell, float(np.max(radius)), simulation.rule.skin)
         decider = replace(simulation.decider, r_cut=tuple(radius.tolist()))
         return replace(simulation, model=model, decider=decider)
@@ -269,9 +288,8 @@ class Entry(NamedTuple):
 
 def entry(simulation: Simulation, name: str) -> Entry:
     """The parameter or the entry of one that a path names; the path itself where there is none such."""
-    if (kind := _of_pairs(simulation).get(name)) is not None:
-        table, _, _, key = name.split(".", 3)
-        return Entry(f"{table}.{key}", (kind,))
+    if (of_pair := _of_pairs(simulation).get(name)) is not None:
+        return of_pair
     table, *at = name.split(".")
     if table in ("position", "velocity") and len(at) == 2 and at[1] in ("x", "y", "z"):
         if not at[0].isdigit() or int(at[0]) >= simulation.atoms:
@@ -290,12 +308,16 @@ def entry(simulation: Simulation, name: str) -> Entry:
     return Entry(name)
 
 
-def _of_pairs(simulation: Simulation) -> dict[str, int]:
-    """The pair types of the paths of single pairs of species, where there are several."""
+def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
+    """The paths of single pairs of species, where there are several."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
-    pairs = enumerate(schema.pair_names(simulation.symbols))
-    return {f"potential.pairs.{pair}.{key}": k for k, pair in pairs for key in simulation.potential.leaves}
+    typed = [name for name in pair_leaves(simulation.model, shared=False) if "potential." in name]
+    return {
+        name.replace("potential.", f"potential.pairs.{pair}.", 1): Entry(name, (k,))
+        for k, pair in enumerate(schema.pair_names(simulation.symbols))
+        for name in typed
+    }
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:

@@ -500,6 +500,34 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
         raise ValueError(f"[cutoff] given, but {kind} carries its own cutoff; remove the table")
 
 
+class TermTable(TomlTable):
+    """One of several pair potentials that add."""
+
+    potential: Potential
+    cutoff: CutoffTable | None = None
+    weight: dict[str, float] | None = Field(
+        default=None, description="of the atoms of each species; a pair's energy is multiplied by both"
+    )
+
+    @model_validator(mode="after")
+    def _cutoff_fits_potential(self) -> TermTable:
+        if not isinstance(self.potential, PairPotentialTable):
+            raise ValueError(f"{self.potential.kind} is no pair potential, and only those add")
+        check_interaction(self.potential, self.cutoff)
+        return self
+
+
+def _with_onset(cutoff: CutoffTable | None) -> CutoffTable | None:
+    if cutoff is not None and cutoff.switches and cutoff.onset is None and cutoff.base is not None:
+        return cutoff.model_copy(update={"onset": ONSET_FRACTION * cutoff.base})
+    return cutoff
+
+
+def _one_of(made: dict[str, Any]) -> None:
+    """Of a table that may be left out, what an editor expects where it is not."""
+    made |= made.pop("anyOf")[0]
+
+
 class SystemSpec(TomlTable):
     """A system file."""
 
@@ -507,8 +535,11 @@ class SystemSpec(TomlTable):
     about: str = Field(default="", description="one sentence or more for people, with the source")
     units: Literal["metal", "lj"] = Field(description="metal: Å, eV, amu, ps, K; lj: reduced")
     structure: Structure
-    potential: Potential
+    potential: Potential | None = Field(default=None, json_schema_extra=_one_of)
     cutoff: CutoffTable | None = Field(default=None, description="pair potentials only")
+    terms: dict[str, TermTable] | None = Field(
+        default=None, description="pair potentials that add, by name, instead of potential and cutoff"
+    )
     neighbors: NeighborsTable = Field(default_factory=lambda: NeighborsTable())
     dynamics: Dynamics
     precision: PrecisionTable = Field(default_factory=lambda: PrecisionTable())
@@ -519,8 +550,27 @@ class SystemSpec(TomlTable):
 
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> SystemSpec:
-        check_interaction(self.potential, self.cutoff)
+        if (self.potential is None) != bool(self.terms) or (self.terms and self.cutoff):
+            raise ValueError(
+                "give either [potential], with [cutoff] for pairs, or [terms.NAME.potential] alone"
+            )
+        if self.potential is not None:
+            check_interaction(self.potential, self.cutoff)
+        if len({one.cutoff.compare for one in self.interactions.values() if one.cutoff}) > 1:
+            raise ValueError("all terms need the same cutoff.compare")
         return self
+
+    @property
+    def interactions(self) -> dict[str, Interaction]:
+        """Potentials with their cutoffs by the name of their term, "" where there are no terms."""
+        if self.terms is None:
+            return {"": Interaction(self.potential, self.cutoff)}
+        return {name: Interaction(one.potential, one.cutoff) for name, one in self.terms.items()}
+
+    @property
+    def compare(self) -> str:
+        """What inside means."""
+        return next((one.cutoff.compare for one in self.interactions.values() if one.cutoff), "r <")
 
     @property
     def skin(self) -> float:
@@ -532,9 +582,12 @@ class SystemSpec(TomlTable):
     def resolved(self) -> SystemSpec:
         """With the defaults that depend on other keys written out."""
         update: dict[str, Any] = {"neighbors": self.neighbors.model_copy(update={"skin": self.skin})}
-        cutoff = self.cutoff
-        if cutoff is not None and cutoff.switches and cutoff.onset is None and cutoff.base is not None:
-            update["cutoff"] = cutoff.model_copy(update={"onset": ONSET_FRACTION * cutoff.base})
+        update["cutoff"] = _with_onset(self.cutoff)
+        if self.terms is not None:
+            update["terms"] = {
+                name: one.model_copy(update={"cutoff": _with_onset(one.cutoff)})
+                for name, one in self.terms.items()
+            }
         return self.model_copy(update=update)
 
     @staticmethod

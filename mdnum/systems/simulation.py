@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.errors import InputError
 from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.lattice import Lattice, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
-from mdnum.md.pairforce import ManyBodyForce, PairForce
-from mdnum.md.potentials import CutPotential, pair_type
+from mdnum.md.pairforce import ChannelForce, ManyBodyForce, PairForce
+from mdnum.md.potentials import Channels, CutPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.numerics.roles import LATTICE, WIDE
 from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.structures import Draw
 from mdnum.units import Units
@@ -100,6 +102,14 @@ class Simulation:
     save_every: int
     lattice: Lattice | None = None
 
+    def __post_init__(self):
+        short = self.policy.state == LATTICE or self.policy.force not in WIDE
+        if short and self.pairwise and "" not in self.model.terms:
+            seen = f"not with {self.policy.state} state and {self.policy.force} forces"
+            remedy = "Leave out state and force, or write the sum as one potential"
+            message = f"terms are added in float64 and float32, {seen}"
+            raise InputError(message, where="precision", remedy=remedy)
+
     @property
     def name(self) -> str:
         """Such as "argon/liquid-864"."""
@@ -128,7 +138,7 @@ class Simulation:
     @property
     def pairwise(self) -> bool:
         """Whether the fast pair path serves it (else the general path does)."""
-        return isinstance(self.model, CutPotential)
+        return isinstance(self.model, CutPotential | Channels)
 
     @property
     def pbc(self) -> tuple[bool, bool, bool]:
@@ -159,7 +169,7 @@ class Simulation:
             if self.lattice is not None:
                 return LatticeForce.on(self.lattice, *parts)
             if self.pairwise:
-                return PairForce.create(*parts)
+                return (PairForce if self.channels == 1 else ChannelForce).create(*parts)
             return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
 
     @cached_property
@@ -208,22 +218,65 @@ class Simulation:
         return self.lattice.positions(self.positions) + 0.0, np.asarray(v).T + 0.0
 
     @property
+    def channels(self) -> int:
+        """How many decisions a pair has: one for all terms that share their radii."""
+        return len(self.model.parts) if isinstance(self.model, Channels) else 1
+
+    @property
     def pair_types(self) -> int:
         """How many kinds of pairs there are."""
-        return len(self.decider.r_cut)
+        return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Pair type of atoms i and j."""
-        if self.pair_types == 1:
-            return np.zeros(np.broadcast(i, j).shape, np.int64)
-        return pair_type(self.species[i], self.species[j], len(self.symbols))
+        """Kind of the decision of atoms i and j: their pair type, and the types of the channels before.
 
-    def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
-        """Energy and radial force that a pair brings when it enters, per pair type."""
-        if self.pairwise:
-            return self.model.jumps()
-        smoothness = self.model.smoothness
-        return np.array([smoothness.energy_jump]), np.array([smoothness.force_jump])
+        Args:
+            i: atoms, plus the number of atoms for each channel before that of the decision.
+        """
+        channel, i = np.divmod(i, self.atoms)
+        if self.pair_types == 1:
+            return channel + np.zeros(np.broadcast(i, j).shape, np.int64)
+        return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
+
+    def first_atoms(self, i: Any) -> dict[str, Any]:
+        """Labels of the first atoms of decisions as of `type_of`, and their terms if there are channels."""
+        if self.channels == 1:
+            return {"i": i}
+        channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
+        return {"i": i, "terms": np.array([part.potential.name for part in self.model.parts])[channel]}
+
+    def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
+        """Energy and radial force that a pair brings when it enters, per kind of decision.
+
+        Where atoms have weights the largest of any pair, without a sign; `jumps_of` has a pair's own.
+        """
+        if not self.pairwise:
+            smoothness = self.model.smoothness
+            return np.array([smoothness.energy_jump]), np.array([smoothness.force_jump])
+        jumps, weights = self.model.jumps(), self._weights
+        if weights is not None:
+            jumps = np.abs(jumps) * np.max(np.square(weights), axis=1, initial=0.0)[:, None]
+        energy, force = (reduce(np.add, one) for one in jumps)
+        return energy, force
+
+    @property
+    def _weights(self) -> Float[np.ndarray, "terms atoms"] | None:
+        """Those of all terms; None where none has any."""
+        if not self.pairwise or not self.model.weights:
+            return None
+        each = (term.weights for term in self.model.terms.values())
+        return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
+
+    def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
+        """As `jumps`, of given pairs; i as for `type_of`."""
+        kind, weights = self.type_of(i, j), self._weights
+        if weights is None:
+            energy, force = (jump[kind] for jump in self.jumps())
+        else:
+            energy, force = np.sum(
+                self.model.jumps()[:, :, kind] * weights[:, i % self.atoms] * weights[:, j], 1
+            )
+        return energy, force
 
     @property
     def lists(self) -> tuple[Any, ...]:
@@ -261,17 +314,26 @@ class Simulation:
 
         Switching begins where it did, and at 0.9 of the radius where it did not switch before.
         """
-        made, model = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff, self.model
-        if made.switches != model.cutoff.switches:
-            model = replace(model, r_onset=model.r_cut * (ONSET_FRACTION if made.switches else 1))
-        return replace(self, model=replace(model, cutoff=made))
+        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
+        return self._ended(lambda _: made)
+
+    def _ended(self, change: Callable[[Cutoff], Cutoff]) -> Simulation:
+        """The same with other cutoffs, of every term."""
+
+        def ended(term: CutPotential) -> CutPotential:
+            made, onset = change(term.cutoff), term.r_onset
+            if made.switches != term.cutoff.switches:
+                onset = term.r_cut * (ONSET_FRACTION if made.switches else 1)
+            return replace(term, cutoff=made, r_onset=onset)
+
+        return replace(self, model=each_term(self.model, ended))
 
     @property
     def continuous(self) -> Simulation:
         """The same forces from an energy that does not jump at the cutoff."""
-        if not self.pairwise or self.cutoff.continuous is self.cutoff:
+        if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
-        return self.with_cutoff(self.cutoff.continuous)
+        return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
         """The same system in floats of these roles, by default float64 throughout."""
@@ -316,6 +378,8 @@ class Simulation:
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
         i, j = table.decided(bits)
+        if self.channels > 1:
+            i, j = np.divmod(np.unique(i % self.atoms * self.atoms + j), self.atoms)
         order = np.lexsort((j, i))
         i, j = i[order], j[order]
         dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])

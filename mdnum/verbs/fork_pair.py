@@ -260,7 +260,8 @@ def _decision(made: Fork) -> dict[str, Any] | None:
             length = decision.margin / (2.0 * run.decider.r_cut[kind])
         root = np.sqrt if space == "r2" else float
         distance, *cutoffs = (float(root(x)) for x in (thresholds[2] - decision.margin, *thresholds[:2]))
-        subject = {"i": i, "j": j, "distance": distance, "margin_length": length,
+        first = {key: np.asarray(value).item() for key, value in a.first_atoms(i).items()}
+        subject = {**first, "j": j, "distance": distance, "margin_length": length,
                    "cutoffs": dict(zip("AB", cutoffs, strict=True))}  # fmt: skip
     before = decision.separation
     return {
@@ -303,11 +304,14 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
         "protected_until": sure.protected, "shadow": sure.shadow, "shadow_horizon": sure.shadow_step,
     }  # fmt: skip
     names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
-    tables["cross_flips"] = {name: [getattr(flip, name) for flip in made.flips] for name in names}
+    named = made.twin.a.simulation.first_atoms
+    columns = {name: [getattr(flip, name) for flip in made.flips] for name in names}
+    tables["cross_flips"] = {**columns, **named(columns["i"])}
     tables["ambiguous_pairs"] = {
         name: np.concatenate([getattr(rows, name) for rows in made.doubts.values()])
         for name in ("step", "i", "j", "margin", "bound")
     }
+    tables["ambiguous_pairs"] |= named(tables["ambiguous_pairs"]["i"])
     runs = [np.full(len(rows.step), name) for name, rows in made.doubts.items()]
     tables["ambiguous_pairs"]["run"] = np.concatenate(runs)
     if asked.lyapunov:
@@ -401,6 +405,8 @@ def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
         )
     except InputError as error:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
-    pairs = found.pairs and [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs]
+    pairs = found.pairs and [
+        {"i": i % made.twin.a.size, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs
+    ]
     row = {**vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "pairs": pairs}
     return row | {"reason": TEXTS(f"minimal_{found.code}", **row, n=len(pairs or ()))}

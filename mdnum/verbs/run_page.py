@@ -204,12 +204,17 @@ def _numbers(run: RunView) -> dict[str, Any]:
 def _what(run: RunView) -> list[tuple[str, str]]:
     """What was run; what the system file leaves out is left out."""
     units, system, time = run.units, run.system, run.series["time"]
-    lengths, given = dict.fromkeys(("radius", "onset", "skin"), units.length), {}
-    for key in ("potential", "cutoff", "neighbors", "precision"):
-        table = system.get(key) or {}
-        if code := table.get("code"):
-            table = table | {"code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
-        given[key] = in_words(table, lengths) if table else None
+    lengths = dict.fromkeys(("radius", "onset", "skin"), units.length)
+
+    def said(table: Mapping[str, Any] | None) -> str | None:
+        if table and (code := table.get("code")):
+            table = {**table, "code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
+        return in_words(table, lengths) if table else None
+
+    given = {key: said(system.get(key)) for key in ("potential", "cutoff", "neighbors", "precision")}
+    parts = (system.get("terms") or {}).items()
+    terms = [f"{name}: {said(of['potential'])}, {said(of['cutoff'])}" for name, of in parts]
+    given["terms"] = "; ".join(terms) or None
     # how many steps were made is said above; the file says how many were planned
     made = {key: value for key, value in (system.get("dynamics") or {}).items() if key != "steps"}
     return TEXTS.rows("what", **{

@@ -307,7 +307,7 @@ def test_overridden_decisions_are_counted_once_with_their_distances():
                 slot = int(np.flatnonzero(index[:, one] == other)[0])
                 told[row, slot // 8, one] ^= np.uint8(1 << slot % 8)
             wanted[row] = sorted(set(wanted[row]) ^ {(k, n)})
-    counts, furthest = Apart(cell).overridden(own, told, table, x, species, r_cut)
+    counts, furthest = Apart(cell).overridden(own, told, table, x, species, r_cut[None])
     assert counts.tolist() == [len(pairs) for pairs in wanted] and counts[4] > 6
     for row, pairs in enumerate(wanted):
         off = [0.0]

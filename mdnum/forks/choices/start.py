@@ -74,6 +74,7 @@ class Relabel(Summed):
 
     def make(self, system: Simulation) -> Twin:
         applies(not is_langevin(system), "the thermostat's noise belongs to labels: other atoms would get it")
+        applies(not (system.pairwise and system.model.weights), "the atoms' weights belong to labels")
         a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
         b = replace(

@@ -20,7 +20,7 @@ import numpy as np
 from mdnum.errors import InputError, NumericalError
 from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
-from mdnum.gradients.parameters import columns_of
+from mdnum.gradients.parameters import columns_of, directions
 from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, tape_of
 from mdnum.gradients.tangents import by_column, tangents
@@ -213,7 +213,7 @@ def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[in
     tape = tape_of(problem, True)
     cell, radii = HostCell(simulation.cell), np.asarray(simulation.decider.r_cut)
     nearest = {-1: np.inf, 1: np.inf}
-    along = 1.0 if name == "cutoff.radius" else 0.0
+    along = np.asarray(directions(simulation, columns_of(simulation, [name])).r_cut)[0]
     followed = tangents(tape, [name], states=True, progress=in_phase(progress, "tangents"))
     for part in followed:
         stretch, moved = part.stretch, part.x
@@ -224,7 +224,7 @@ def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[in
             x, dx = stretch.x[row].astype(np.float64), moved[row, 0].astype(np.float64)
             apart = np.stack(cell.displacement(x[:, first].T, x[:, second].T))
             r = np.sqrt(np.sum(apart * apart, axis=0))
-            rate = along - np.sum(apart * (dx[:, second] - dx[:, first]), axis=0) / r
+            rate = along[kind] - np.sum(apart * (dx[:, second] - dx[:, first]), axis=0) / r
             with np.errstate(divide="ignore", invalid="ignore"):
                 shift = -(radius - r) / rate
             for sign in nearest:

@@ -163,7 +163,8 @@ class Near:
         timestep, share = simulation.integrator.timestep, np.zeros(len(row))
         for step in np.unique(found["step"][(by_energy != 0) | (by_virial != 0)]):
             share[found["step"] == step] = float(self.pace.share(jnp.asarray(step), timestep))
-        energy, force = (np.asarray(jump)[found["kind"]] for jump in simulation.jumps())
+        channel = found["kind"] // simulation.pair_types
+        energy, force = simulation.jumps_of(found["i"] + channel * simulation.atoms, found["j"])
         radius = np.asarray(simulation.decider.r_cut)[found["kind"]]
         seen = share * (by_energy * energy + by_virial * force * radius)
         found["weight"] = force * along + seen
