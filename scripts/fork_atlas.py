@@ -135,8 +135,9 @@ def system_of(word: str) -> System:
     head, _, atoms = word.partition(":")
     system = liquid(int(atoms)) if head == "liquid" and atoms.isdigit() else load(word, world="md")
     if system.spec.cutoff is None:
+        what = "a sum of terms" if system.spec.potential is None else system.spec.potential.kind
         raise InputError(
-            f"{system.spec.potential.kind} carries its own cutoff, so there is no other kind of it",
+            f"{what} carries its own cutoffs, so there is no other kind of them",
             where=system.name,
             remedy="Choose systems with a pair potential",
         )

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import nose_hoover
 import numpy as np
@@ -25,7 +26,7 @@ import mdnum
 from mdnum.errors import InputError
 from mdnum.gradients import Problem, method, parameters
 from mdnum.gradients.diagnose.growth import spectrum
-from mdnum.md.integrators import KickDrift, VelocityVerlet
+from mdnum.md.integrators import KickDrift, VelocityVerlet, quantity
 from mdnum.rollout.engine import Engine, Start, first_state
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
@@ -300,3 +301,24 @@ def test_a_kick_that_derivatives_would_not_see_is_refused_when_its_class_is_made
     mixin = type("Mixin", (), {name: lambda self, *given: given})
     with pytest.raises(TypeError, match=f"Planted has its own {name}"):
         type("Planted", (mixin, base), {})
+
+
+class Shaken(VelocityVerlet):
+    """Constant energy, with a key that somebody's noise would use."""
+
+    name = "shaken"
+    generator: Any = quantity("seed")
+
+
+def test_whatever_has_a_seed_has_noise():
+    from mdnum.forks.choices import parse, twin_of, unavailable
+    from mdnum.gradients.diagnose.trust import no_half_step
+
+    still = build(make(crystal(), LENNARD_JONES, QUINTIC))
+    noisy = replace(still, integrator=Shaken(still.integrator.timestep, jax.random.key(still.draw.seed)))
+    for word in ("relabel", "rotate"):
+        assert unavailable(parse(word), still) is None and "noise" in str(unavailable(parse(word), noisy))
+    assert unavailable(parse("noise"), still) and no_half_step(noisy) and not no_half_step(still)
+    twin = twin_of(parse("noise"), noisy)
+    keys = [one.simulation.integrator.generator for one in (twin.a, twin.b)]
+    assert not np.array_equal(*map(jax.random.key_data, keys))

@@ -204,7 +204,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 def _what(run: RunView) -> list[tuple[str, str]]:
     """What was run; what the system file leaves out is left out."""
     units, system, time = run.units, run.system, run.series["time"]
-    lengths = dict.fromkeys(("radius", "onset", "skin"), units.length)
+    lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 
     def said(table: Mapping[str, Any] | None) -> str | None:
         if table and (code := table.get("code")):

@@ -239,13 +239,6 @@ def plural(count: int, noun: str) -> str:
     return noun if abs(count) == 1 else f"{noun}s"
 
 
-def is_langevin(simulation: Simulation) -> bool:
-    """Whether the run has a thermostat, and so noise."""
-    from mdnum.md.integrators import Langevin
-
-    return isinstance(simulation.integrator, Langevin)
-
-
 def summing(both: str | None) -> str:
     """The end of a sentence that says how both runs sum."""
     return "" if both is None else f" (both with {both} sums)"

@@ -19,7 +19,6 @@ from mdnum.forks.choices.base import (
     applies,
     check,
     choice,
-    is_langevin,
     number,
     plural,
     simulations,
@@ -73,7 +72,8 @@ class Relabel(Summed):
         check(self.seed >= 0, f"seed {self.seed} is negative", "relabel")
 
     def make(self, system: Simulation) -> Twin:
-        applies(not is_langevin(system), "the thermostat's noise belongs to labels: other atoms would get it")
+        noisy = system.integrator.noisy()
+        applies(not noisy, "the thermostat's noise belongs to labels: other atoms would get it")
         applies(not (system.pairwise and system.model.weights), "the atoms' weights belong to labels")
         a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
@@ -113,7 +113,7 @@ class Rotate(Summed):
         )
 
     def make(self, system: Simulation) -> Twin:
-        applies(not is_langevin(system), "the thermostat's noise belongs to axes: others would get it")
+        applies(not system.integrator.noisy(), "the thermostat's noise belongs to axes: others would get it")
         known = _SYMMETRIES if self.axes is None else (self.axes,)
         word = next((word for word in known if _is_symmetry(word, system.structure)), "")
         applies(bool(word), f"the box is not the same with axes {self.axes} in place of xyz")
@@ -264,7 +264,8 @@ class Ulps(Choice):
         before, dtype = as_used(system, self.key)
         after = float(neighbor(before, self.ulps, np.dtype(dtype)))
         difference = f"{self.key} = {after!r}, not {before!r}"
-        if self.key == "dynamics.temperature" and not is_langevin(system) and not system.draw.drawn:
+        bath = world_of(system) == "md" and "temperature" in system.integrator.numbers()
+        if self.key == "dynamics.temperature" and not bath and not system.draw.drawn:
             from mdnum.systems.parameters import redrawn
 
             system = redrawn(system)
@@ -365,12 +366,14 @@ class NoiseChoice(Choice):
         import equinox as eqx
         import jax
 
-        applies(is_langevin(system), "there is no noise at constant energy (dynamics.kind is nve)")
+        kind = system.integrator
+        applies(kind.noisy(), f"there is no noise in {type(kind).__name__} (dynamics.kind)")
         own = system.draw.seed
         seed = own + 1 if self.seed is None else self.seed
         applies(seed != own, f"the seed is {seed} already")
         a = system
-        integrator = eqx.tree_at(lambda one: one.key, a.integrator, jax.random.key(seed))
+        name = kind.keys()["seed"].name
+        integrator = eqx.tree_at(lambda one: getattr(one, name), kind, jax.random.key(seed))
         return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
 
 

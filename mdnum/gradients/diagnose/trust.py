@@ -34,7 +34,6 @@ from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, radial_speed
 from mdnum.gradients.tangents import StretchTangents, tangents
 from mdnum.gradients.tape import RunTape, TapeStretch, pace_of
-from mdnum.md.integrators import Langevin
 from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
@@ -395,7 +394,7 @@ def grew(growth: GradientGrowth) -> bool:
 
 def no_half_step(simulation: Simulation) -> bool:
     """Whether a run cannot be compared with one at half the time step: a thermostat's noise is another."""
-    return isinstance(simulation.integrator, Langevin)
+    return simulation.integrator.noisy()
 
 
 def verdict_of(
