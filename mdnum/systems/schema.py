@@ -215,9 +215,9 @@ def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registr
     """One of some tables by its kind, or that of a kind which another package adds to a registry."""
     tags = dict(zip(_kinds(*tables), tables, strict=True))
 
-    def kind_of(value: Any) -> str | None:
+    def kind_of(value: Any) -> Any:
         kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-        if kind in tags or not isinstance(kind, str):
+        if not isinstance(kind, str) or kind in tags:
             return kind
         return "other" if kind in loaded(registry) else kind
 

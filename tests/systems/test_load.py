@@ -119,6 +119,12 @@ def test_overrides_are_read_as_toml():
     assert load(ARGON, {"neighbors.skin": 0.5, "neighbors.rebuild.check": False}).spec.skin == 0.5
 
 
+@pytest.mark.parametrize("key", ["potential.kind", "dynamics.kind"])
+def test_a_kind_that_is_no_word_is_unknown(key):
+    with pytest.raises(InputError, match=r"unknown .* kind"):
+        load(ARGON, {key: ["nve", "hard"]})
+
+
 def test_another_kind_drops_the_keys_it_does_not_have():
     switched = load(ARGON, {"cutoff.kind": "switched", "cutoff.onset": "7.0"})
     assert switched.spec.cutoff.onset == 7.0
