@@ -12,8 +12,8 @@ from mdnum.safe_path import environment, python
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
-#: Its path through the package is that of tests/systems/test_objects.py.
-_LONG = ("morse",)
+#: Their paths through the package are those of tests/systems/test_objects.py and of the tests of terms.
+_LONG = ("morse", "two_terms")
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_one_path_stands_for_all_parameters_below_it(mixture, by_hand):
     assert all(np.all(value != 0) for value in by_hand.values())
 
 
-@pytest.mark.parametrize("other", ["unrolled", "forward"])
+@pytest.mark.parametrize("other", [pytest.param("unrolled", marks=pytest.mark.nightly), "forward"])
 def test_other_ways_through_the_steps_give_the_same(mixture, by_hand, other):
     """Of tangents one layer: each weight takes one."""
     names = ("potential",) if other == "unrolled" else (*WEIGHTS[:2], "potential.depth")

@@ -106,6 +106,7 @@ WANTED = (
 )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_methods_agree_on_terms(mixed):
     by_hand = method("symmetric")(mixed, WANTED)
     assert by_hand.gradient["terms.core.potential.sigma"].shape == (3,)

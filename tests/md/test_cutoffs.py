@@ -45,7 +45,7 @@ def closed_form(kind, r):
 
 def test_a_cutoff_without_an_independent_form_is_refused():
     """Which would otherwise be compared with the form of another one."""
-    with pytest.raises(ValueError, match="no independent form of the cutoff 'tilted'"):
+    with pytest.raises(ValueError, match="'tilted'"):
         oracles.cut_energy("tilted", 1.5, 2.5, 2.0, bare, lambda r: 0.0)
 
 

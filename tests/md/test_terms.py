@@ -222,6 +222,7 @@ def test_flips_are_those_of_all_pairs(three_terms):
         np.testing.assert_array_equal(changes[name], column)
 
 
+@pytest.mark.nightly
 def test_changes_that_no_host_notes_have_their_terms():
     """In single precision jax notes what changed, on a CPU too."""
     simulation, _ = made(

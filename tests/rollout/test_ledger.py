@@ -349,11 +349,11 @@ def recorded(simulation, rows, steps=60, most=None):
 @pytest.mark.parametrize(
     ("name", "on"),
     [
-        ("fluid", "device"),
         ("argon/langevin-500", "host"),
         *(
             pytest.param(*one, marks=pytest.mark.nightly)
             for one in (
+                ("fluid", "device"),
                 ("fluid", "host"),
                 ("argon/langevin-500", "device"),
                 ("binary/kob-andersen-1000", "host"),

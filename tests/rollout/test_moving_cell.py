@@ -152,7 +152,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.nightly] * (k not in (0, 4))) for k, name in enumerate(CASES)],
+)
 def test_every_step_is_that_of_all_pairs_in_its_own_box(name):
     simulation = CASES[name]()
     judge, recorder, inside, builds = AllPairs(simulation), PairRecorder(simulation), None, 0
@@ -194,7 +197,13 @@ def test_every_step_is_that_of_all_pairs_in_its_own_box(name):
     assert not np.allclose(box.matrix, first, rtol=1e-3)
 
 
-@pytest.mark.parametrize("policy", [PrecisionPolicy(), PrecisionPolicy(state="float32", force="float32")])
+@pytest.mark.parametrize(
+    "policy",
+    [
+        PrecisionPolicy(),
+        pytest.param(PrecisionPolicy(state="float32", force="float32"), marks=pytest.mark.nightly),
+    ],
+)
 def test_a_list_that_is_kept_gives_the_bits_of_one_rebuilt_at_every_step(policy):
     """With sums that do not depend on their order; and the list serves for several steps."""
     options: dict[str, Any] = {"reduction": "exact", "precision": policy}
@@ -340,6 +349,7 @@ def test_a_checkpoint_without_a_box_has_that_of_the_simulation(tmp_path):
     assert ends[0] == ends[1]
 
 
+@pytest.mark.nightly
 def test_two_runs_are_forked_in_their_boxes(tmp_path):
     """Separations against positions unwrapped in the boxes of their rows; own decisions change no bit."""
     a = moving(cutoff="switched", steps=60)
@@ -384,9 +394,9 @@ def test_many_bodies_feel_the_box_of_their_row():
 
 def test_what_has_one_box_alone_refuses_another_by_name():
     simulation = moving()
-    with pytest.raises(InputError, match="gradients need one box, and strained moves it"):
+    with pytest.raises(InputError, match=r"gradients.*strained"):
         Problem(simulation, everything(108), 10)
-    with pytest.raises(InputError, match="processes of their own need one box, and strained moves it"):
+    with pytest.raises(InputError, match=r"processes.*strained"):
         variants(simulation, 3)
     assert "strained" in str(unsupported(simulation))
     with pytest.raises(InputError, match="strained is another"):
@@ -400,7 +410,7 @@ def test_what_has_one_box_alone_refuses_another_by_name():
 
 def test_a_box_that_becomes_too_narrow_ends_the_run_in_a_line(tmp_path):
     simulation = moving(dynamics={"stretch": -1.0, "shear": 0.0}, steps=49)
-    with pytest.raises(InputError, match="exceeds half the smallest perpendicular box width"):
+    with pytest.raises(InputError, match="perpendicular"):
         run(simulation, out=tmp_path / "run")
 
 

@@ -469,12 +469,12 @@ _VERSIONS = {"nvalchemi-toolkit-ops": "0.5.0", "torch": None, "vesin": None}
 
 def test_all_packages_that_are_missing_are_named(monkeypatch: pytest.MonkeyPatch):
     """An adaptor may need more than the package that it is named after."""
-    monkeypatch.setattr("mdnum.references.conformance.lists._version", _VERSIONS.get)
+    monkeypatch.setattr("mdnum.references.conformance.lists.version", _VERSIONS.get)
     for word, remedy in (("nvalchemi-ops", "pip install torch"), ("vesin", "pip install vesin")):
         with pytest.raises(InputError) as caught:
             load(word)
         assert (caught.value.remedy or "").endswith(remedy)
-    monkeypatch.setattr("mdnum.references.conformance.lists._version", {}.get)
+    monkeypatch.setattr("mdnum.references.conformance.lists.version", {}.get)
     with pytest.raises(InputError, match=r"nvalchemi-toolkit-ops and torch, .*not"):
         load("nvalchemi-ops")
     assert not installed()
