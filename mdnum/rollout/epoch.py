@@ -137,7 +137,9 @@ class EpochRecord(NamedTuple):
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
         """The boxes of the first rows, on the host; none where there is one for all."""
-        return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows] if one.size)
+        if not self.cell.size:
+            return ()
+        return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
 
 
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved", "inside")

@@ -207,6 +207,8 @@ class PairRecorder:
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
         """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
         decider = self.simulation.decider
+        if not decider.grows and not segment.cells:
+            return np.repeat([decider.bounds], segment.rows, axis=0)
         x = segment.rows_of("x") if decider.grows else np.empty((segment.rows, 3, 0))
         if not segment.cells:
             return decider.bounds_at(x)
@@ -295,7 +297,7 @@ class PairRecorder:
             sign = np.where(entered, 1.0, -1.0)
             jump, force_jump = (sign * one for one in self.simulation.jumps_of(i, j))
         return FlipTable(
-            i=i, j=j, rank=np.broadcast_to(np.int32(0), len(i)), entered=entered, distance=distance,
+            i=i, j=j, rank=np.zeros(len(i), np.int32), entered=entered, distance=distance,
             margin=margin, bound=bound, ambiguous=np.abs(margin) <= bound, decided_by="program",
             step=step, radial_speed=speed, energy_jump=jump, force_jump=force_jump,
         )  # fmt: skip
