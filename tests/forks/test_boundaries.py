@@ -130,7 +130,7 @@ def test_both_sides_differ_in_a_fresh_process(make, key, low, high, steps):
         ("sigma", 2.0, 1.0, "nothing between"),
         ("timestep", -1.0, 1.0, "above 0"),
         ("position.7.x", 0.0, 1.0, "no atom 7"),
-        ("sgima", 1.0, 2.0, "'sgima' is no number"),
+        ("sgima", 1.0, 2.0, "'sgima'"),
     ],
 )
 def test_bad_input_is_refused(key, low, high, words):
