@@ -102,12 +102,6 @@ class Integrator(eqx.Module):
         return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
     @classmethod
-    def noisy(cls) -> bool:
-        """Whether it draws random numbers, which belong to labels, axes and steps."""
-        known = cls.keys()
-        return "seed" in known
-
-    @classmethod
     def numbers(cls) -> list[str]:
         """The keys of its numbers, which it may be differentiated by."""
         return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]

@@ -72,8 +72,8 @@ class Relabel(Summed):
         check(self.seed >= 0, f"seed {self.seed} is negative", "relabel")
 
     def make(self, system: Simulation) -> Twin:
-        noisy = system.integrator.noisy()
-        applies(not noisy, "the thermostat's noise belongs to labels: other atoms would get it")
+        still = system.integrator.random is None
+        applies(still, "the thermostat's noise belongs to labels: other atoms would get it")
         applies(not (system.pairwise and system.model.weights), "the atoms' weights belong to labels")
         a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
@@ -113,7 +113,8 @@ class Rotate(Summed):
         )
 
     def make(self, system: Simulation) -> Twin:
-        applies(not system.integrator.noisy(), "the thermostat's noise belongs to axes: others would get it")
+        still = system.integrator.random is None
+        applies(still, "the thermostat's noise belongs to axes: others would get it")
         known = _SYMMETRIES if self.axes is None else (self.axes,)
         word = next((word for word in known if _is_symmetry(word, system.structure)), "")
         applies(bool(word), f"the box is not the same with axes {self.axes} in place of xyz")
@@ -367,13 +368,12 @@ class NoiseChoice(Choice):
         import jax
 
         kind = system.integrator
-        applies(kind.noisy(), f"there is no noise in {type(kind).__name__} (dynamics.kind)")
+        applies(kind.random is not None, f"there is no noise in {type(kind).__name__} (dynamics.kind)")
         own = system.draw.seed
         seed = own + 1 if self.seed is None else self.seed
         applies(seed != own, f"the seed is {seed} already")
         a = system
-        name = kind.keys()["seed"].name
-        integrator = eqx.tree_at(lambda one: getattr(one, name), kind, jax.random.key(seed))
+        integrator = eqx.tree_at(lambda one: one.random, kind, jax.random.key(seed))
         return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
 
 

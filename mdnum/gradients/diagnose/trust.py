@@ -394,7 +394,7 @@ def grew(growth: GradientGrowth) -> bool:
 
 def no_half_step(simulation: Simulation) -> bool:
     """Whether a run cannot be compared with one at half the time step: a thermostat's noise is another."""
-    return simulation.integrator.noisy()
+    return simulation.integrator.random is not None
 
 
 def verdict_of(
