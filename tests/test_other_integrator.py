@@ -19,7 +19,7 @@ from gradient_problems import everything
 from nose_hoover import NoseHoover, PerAtom
 from other_package import install
 from rollout.harness import go, liquid, write_system
-from rollout.test_resume import CHILD, assert_same, stopped_at
+from rollout.test_resume import CHILD, assert_goes_on, assert_same
 from small_systems import LENNARD_JONES, crystal, make
 
 import mdnum
@@ -27,7 +27,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import Problem, method, parameters
 from mdnum.gradients.diagnose.growth import spectrum
 from mdnum.md.integrators import KickDrift, VelocityVerlet, quantity
-from mdnum.rollout.engine import Engine, Start, first_state
+from mdnum.rollout.engine import Engine, first_state
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems import load
@@ -176,22 +176,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_state(site, tmp_path, monkeypat
     conserved, total = (np.asarray(series[name]) for name in ("conserved", "total"))
     jumps = np.cumsum(np.asarray(series["energy_jump"]))
     assert np.ptp(total - jumps) > 20 * np.ptp(conserved - jumps)
-    for folder, forget in (("run", False), ("other", True)):
-        stopped_at(system, tmp_path / folder, 60, monkeypatch)
-        if forget:
-            restore = Start.from_arrays
-
-            def from_arrays(arrays, simulation, restore=restore):
-                start, extra = restore(arrays, simulation), first_state(simulation).state.extra
-                return replace(start, state=start.state._replace(extra=extra))
-
-            monkeypatch.setattr(Start, "from_arrays", from_arrays)
-        again = run(None, resume=tmp_path / folder), RunFolder.open(tmp_path / folder)
-        if forget:
-            with pytest.raises(AssertionError):
-                assert_same(whole, again)
-        else:
-            assert_same(whole, again)
+    assert_goes_on(whole, system, None, "extra", tmp_path, monkeypatch)
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from jaxtyping import Float
 from mdnum.forks.reordered import ReorderedSimulation
 from mdnum.md.cell import displacement
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
-from mdnum.md.potentials import Channels
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.simulation import Simulation
@@ -222,8 +221,7 @@ def shorter(a: Simulation, factor: float) -> Simulation:
     """The same simulation with all its cutoff radii, and where a switch sets in, scaled."""
 
     def ends(model):
-        parts = model.parts if isinstance(model, Channels) else (model,)
-        return jax.tree.leaves([(part.r_cut, part.r_onset) for part in parts])
+        return jax.tree.leaves([(part.r_cut, part.r_onset) for part in model.parts])
 
     model = eqx.tree_at(ends, a.model, [leaf * factor for leaf in ends(a.model)])
     radii = tuple(factor * r for r in a.decider.r_cut)

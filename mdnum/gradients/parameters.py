@@ -135,8 +135,8 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
         total = total + (leaf if along is None else np.sum(leaf * along))
     if entry.whole.endswith("cutoff.radius"):
         # and the times of the flips
-        parts_of, types = getattr(simulation.model, "parts", [simulation.model]), simulation.pair_types
-        channel = next(c for c, part in enumerate(parts_of) if entry.whole in parameters.pair_leaves(part))
+        channels, types = enumerate(simulation.model.parts), simulation.pair_types
+        channel = next(c for c, part in channels if entry.whole in parameters.pair_leaves(part))
         total = total + np.asarray(parts.r_cut)[channel * types : (channel + 1) * types]
     if entry.whole.startswith("initial."):
         return np.array(total.T[entry.index] / entry.factor)

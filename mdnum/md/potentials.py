@@ -313,6 +313,11 @@ class CutPotential(eqx.Module):
         return cls(SumPotential(tuple(terms), bare), Together(ends), parts[0].r_cut, onsets, weights)
 
     @property
+    def parts(self) -> tuple[CutPotential, ...]:
+        """The channels of decisions: this one."""
+        return (self,)
+
+    @property
     def terms(self) -> dict[str, CutPotential]:
         """Its terms by name, each with its weights; of a plain potential itself, without a name."""
         if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):

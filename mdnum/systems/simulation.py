@@ -220,7 +220,7 @@ class Simulation:
     @property
     def channels(self) -> int:
         """How many decisions a pair has: one for all terms that share their radii."""
-        return len(self.model.parts) if isinstance(self.model, Channels) else 1
+        return len(self.model.parts) if self.pairwise else 1
 
     @property
     def pair_types(self) -> int:

@@ -19,7 +19,7 @@ from ase.stress import full_3x3_to_voigt_6_stress
 from gradient_problems import everything
 from moving_box import Drifting, Flat, Forgetful, Pressed, Strained
 from rollout.harness import liquid
-from rollout.test_resume import assert_same, stopped_at
+from rollout.test_resume import assert_goes_on, assert_same
 from small_systems import LENNARD_JONES, crystal, make
 
 import mdnum
@@ -259,22 +259,7 @@ def test_a_run_that_was_stopped_goes_on_in_its_box(tmp_path, monkeypatch):
     """To the bit; in the box of step 0 it is another run."""
     simulation = moving(steps=120)
     whole = run(simulation, out=tmp_path / "whole"), RunFolder.open(tmp_path / "whole")
-    for folder, forget in (("run", False), ("other", True)):
-        stopped_at(simulation, tmp_path / folder, 60, monkeypatch)
-        if forget:
-            restore = Start.from_arrays
-
-            def from_arrays(arrays, simulation, restore=restore):
-                start, first = restore(arrays, simulation), first_state(simulation).state
-                return replace(start, state=start.state._replace(cells=first.cells))
-
-            monkeypatch.setattr(Start, "from_arrays", from_arrays)
-        again = run(simulation, resume=tmp_path / folder), RunFolder.open(tmp_path / folder)
-        if forget:
-            with pytest.raises(AssertionError):
-                assert_same(whole, again)
-        else:
-            assert_same(whole, again)
+    assert_goes_on(whole, simulation, simulation, "cells", tmp_path, monkeypatch)
 
 
 _KILLED = """

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from ase import Atoms
 from rollout.harness import assert_ledger_is_complete, frames_of, go, liquid, tables_equal, write_system
 
 from mdnum.errors import FolderError, InputError, NumericalError
+from mdnum.rollout.engine import Start, first_state
 from mdnum.rollout.run import RunResult, run
 from mdnum.store import RunFolder
 from mdnum.systems import load
@@ -78,6 +80,30 @@ def stopped_at(system, out, stop, monkeypatch, **options):
     options = options or {"out": out, "steps": STEPS, "save_every": 10}
     with pytest.raises(Stop):
         run(system, progress=progress, **options)
+
+
+def assert_goes_on(whole, subject, given, part, tmp_path, monkeypatch):
+    """A run that was stopped goes on to the bit; with a part of its state as at the start it is another.
+
+    Args:
+        whole: what was never stopped, and its folder. given: the objects again, None for a file.
+    """
+    restore = Start.from_arrays
+
+    def forgetful(arrays, simulation):
+        start, first = restore(arrays, simulation), first_state(simulation).state
+        return replace(start, state=start.state._replace(**{part: getattr(first, part)}))
+
+    for folder, forget in (("run", False), ("other", True)):
+        stopped_at(subject, tmp_path / folder, 60, monkeypatch)
+        if forget:
+            monkeypatch.setattr(Start, "from_arrays", forgetful)
+        again = run(given, resume=tmp_path / folder), RunFolder.open(tmp_path / folder)
+        if forget:
+            with pytest.raises(AssertionError):
+                assert_same(whole, again)
+        else:
+            assert_same(whole, again)
 
 
 @pytest.mark.slow

@@ -367,13 +367,13 @@ class NoiseChoice(Choice):
         import equinox as eqx
         import jax
 
-        kind = system.integrator
-        applies(kind.random is not None, f"there is no noise in {type(kind).__name__} (dynamics.kind)")
+        scheme = system.integrator
+        applies(scheme.random is not None, f"there is no noise in {type(scheme).__name__} (dynamics.kind)")
         own = system.draw.seed
         seed = own + 1 if self.seed is None else self.seed
         applies(seed != own, f"the seed is {seed} already")
         a = system
-        integrator = eqx.tree_at(lambda one: one.random, kind, jax.random.key(seed))
+        integrator = eqx.tree_at(lambda one: one.random, a.integrator, jax.random.key(seed))
         return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
 
 
