@@ -12,8 +12,8 @@ from mdnum.safe_path import environment, python
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
-#: Their paths through the package are those of tests/systems/test_objects.py and of the tests of terms.
-_LONG = ("morse", "two_terms")
+#: Their paths through the package are those of other tests: of objects, of the verbs and of terms.
+_LONG = ("fork", "morse", "two_terms")
 
 
 @pytest.mark.parametrize(

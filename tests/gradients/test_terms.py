@@ -117,6 +117,7 @@ def test_methods_agree_on_terms(mixed):
             np.testing.assert_allclose(other.gradient[key], by_hand.gradient[key], rtol=0, atol=1e-9 * scale)
 
 
+@pytest.mark.nightly
 def test_differences_agree_on_terms(mixed):
     problem = replace(mixed, steps=8)
     names = (

@@ -241,6 +241,7 @@ def test_a_flip_of_another_term_is_seen(three_terms):
         compare_flips({**table, "terms": other}, expected)
 
 
+@pytest.mark.nightly
 def test_a_run_closes_its_budget_and_agrees_with_an_independent_sum(tmp_path):
     simulation, _ = made("core", "tail", "screen")
     summary = mdnum.run(simulation, steps=60, out=tmp_path / "run").summary

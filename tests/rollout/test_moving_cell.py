@@ -364,6 +364,7 @@ def test_two_runs_are_forked_in_their_boxes(tmp_path):
     assert "strained is another" in made.summary["lyapunov_reason"]
 
 
+@pytest.mark.nightly
 def test_many_bodies_feel_the_box_of_their_row():
     plain = build("silicon/stillinger-weber-512")
     numbers = {name: jax.numpy.float64(value) for name, value in {"stretch": 0.5, "shear": 0.5}.items()}

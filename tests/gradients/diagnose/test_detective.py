@@ -47,6 +47,7 @@ def gone(frame, origin, around):
     return jnp.sum(jnp.sqrt(jnp.sum(jnp.square(frame.x - origin.x), axis=0)))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_pair_whose_second_derivative_overflows_is_named(meeting):
     found = detective(meeting, ("sigma",))
