@@ -31,7 +31,7 @@ INSIDE = {
     "scaling.py": {"mdnum.safe_path"},
     "topology_flip_report.py": {"mdnum.verbs", "mdnum.verbs.run_page"},
 }
-PROGRAMS = sorted([*(ROOT / "scripts").glob("*.py"), *(ROOT / "examples").glob("*.py")])
+PROGRAMS = sorted([*(ROOT / "scripts").rglob("*.py"), *(ROOT / "examples").glob("*.py")])
 
 
 def imported(path: Path) -> set[str]:

@@ -613,7 +613,7 @@ def test_odd_values_in_tables_with_right_digests_are_no_traceback(small, tmp_pat
     ],
 )
 def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch, kinds, damages):
-    scripts = Path(__file__).resolve().parents[1] / "scripts"
+    scripts = Path(__file__).resolve().parents[1] / "scripts" / "campaigns"
     monkeypatch.syspath_prepend(str(scripts))
     monkeypatch.setattr(sys, "argv", ["damaged_folders.py"])
     script = runpy.run_path(str(scripts / "damaged_folders.py"), run_name="damaged_folders")

@@ -203,7 +203,7 @@ def test_a_density_off_the_table_is_never_silent():
 def test_the_table_is_the_published_form():
     import importlib.util
 
-    script = Path(__file__).parents[2] / "scripts" / "make_eam_table.py"
+    script = Path(__file__).parents[2] / "scripts" / "makers" / "make_eam_table.py"
     spec = importlib.util.spec_from_file_location("make_eam_table", script)
     assert spec is not None and spec.loader is not None
     form = importlib.util.module_from_spec(spec)

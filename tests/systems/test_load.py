@@ -44,7 +44,7 @@ def test_the_shipped_json_schema_is_current_and_describes_every_key(file, root):
     """Kinds, defaults and ranges of every key."""
     shipped = json.loads((shipped_folder() / file).read_text(encoding="utf-8"))
     made = json_schema(file)
-    assert shipped == made, "run scripts/make_systems.py --schema"
+    assert shipped == made, "run scripts/makers/make_systems.py --schema"
     tables = {"structure", "potential", "cutoff", "neighbors", "dynamics", "precision", "record", "rebuild"}
     tables |= {"start", "flight", "contact", "integrator", "loss", "gradient", "control"}
     silent = [

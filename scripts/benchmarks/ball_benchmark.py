@@ -1,0 +1,64 @@
+"""How fast is a batch of recorded balls, and what does a gradient through it cost?
+
+Ten thousand balls take a thousand steps in three worlds (a spring floor, located impacts, a projection
+that iterates), every contact and iteration recorded; then the loss and its gradient by one parameter and
+the start height are worked out. Runs and gradients take turns, so that a busy machine is busy for both.
+Seconds are medians over the turns, after compilation; the ratio is that of the medians.
+
+How to read it. The ratio travels to other machines, seconds do not. A few times the recorded run is what
+reverse mode costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import _shared  # noqa: F401  what scripts share is found by it
+import numpy as np
+from _output import start, table
+
+from mdnum import ball
+
+WORLDS = {
+    "spring": (ball.Penalty(1e4), ball.SemiImplicitEuler(1e-3), "k"),
+    "located impacts": (ball.Impact(0.8, 1e-6), ball.EventLocated(1e-3), "restitution"),
+    "projection": (ball.Projection(0.5, 0.5, ball.PerInstance(1e-6)), ball.SemiImplicitEuler(1e-3), "k"),
+}
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """How long a call takes."""
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
+def main() -> None:
+    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("--balls", type=int, default=10_000, help="balls of a batch")
+    words.add_argument("--steps", type=int, default=1000, help="steps of 1 ms")
+    words.add_argument("--turns", type=int, default=3, help="turns, of which medians are taken")
+    asked = words.parse_args()
+    rows = []
+    for name, (contact, scheme, parameter) in WORLDS.items():
+        world = ball.World.create(contact, scheme)
+        problem = ball.BallProblem(world, np.linspace(0.5, 1.5, asked.balls), 0.0, asked.steps)
+
+        def gradient(problem=problem, parameter=parameter):
+            return problem.value_and_grad([parameter, "y0"])
+
+        problem.run()
+        gradient()
+        turns = [(seconds(problem.run), seconds(gradient)) for _ in range(asked.turns)]
+        run, both = (median(column) for column in zip(*turns, strict=True))
+        rows.append((name, parameter, f"{run:.4f}", f"{both:.4f}", f"{both / run:.2f}"))
+    title = f"{asked.balls:,} balls, {asked.steps:,} steps"
+    table(title, ("world", "parameter", "run, s", "gradient, s", "ratio"), rows)
+
+
+if __name__ == "__main__":
+    start(main)

@@ -1,0 +1,246 @@
+"""How often is the verdict on a gradient wrong? Starts of several systems, each with a truth of its own.
+
+`mdnum.gradients.diagnose.trust` calls the derivative of each loss by each parameter trusted, or not. The
+truth comes from central differences of free runs, over shifts of the parameter between 1e-5 and 1e-8 of it:
+
+    hard, shifted   of runs in which pairs cross the cutoff at the time at which they do (_located.py, which
+                    shares no code with mdnum), at an eighth of the time step
+    switched        of mdnum's own runs at an eighth of the time step: no force jumps there
+
+Where differences do not agree within 2 % over the last factor of a hundred in shift, there is no derivative
+that anyone could use, and "trusted" is wrong. Starts are the shipped structures with new velocities, run for
+a while first. Every start is kept in a file of its own as soon as it is done (--store): the study goes on
+where it was stopped. Seeds below 4000 are those that constants were chosen on.
+
+    nice python scripts/campaigns/gradient_trust.py
+    python scripts/campaigns/gradient_trust.py --only "crystal-108, hard" --seeds 2 --steps 60
+    python scripts/campaigns/gradient_trust.py --page docs/gradients.md
+
+How to read it. "false" must be 0: trusted, and more than 5 % off or without a derivative. "too strict" is the
+share of the derivatives right within 1 % (2 %) that are not trusted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import _shared  # noqa: F401  what scripts share is found by it
+import numpy as np
+from _located import LOSSES, reference
+from _output import say, start
+
+from mdnum.gradients import Problem, parameters
+from mdnum.gradients.diagnose import diagnose
+from mdnum.gradients.differences import replica
+from mdnum.gradients.losses import parse
+from mdnum.systems import Simulation, build
+
+NAMES = ("potential.epsilon", "potential.sigma", "cutoff.radius")
+#: Shifts as shares of a parameter; differences over the last three must agree within this.
+SHIFTS, AGREE = (1e-5, 1e-6, 1e-7, 1e-8), 0.02
+SUBSTEPS = 8
+#: Losses of each start.
+EACH = 3
+#: What counts as wrong, and as right.
+WRONG, RIGHT = 0.05, (0.01, 0.02)
+#: The first seed of the starts that are reported.
+FIRST = 4000
+MARK = "<!-- written by scripts/campaigns/gradient_trust.py -->"
+
+
+class Case(NamedTuple):
+    """A system whose starts are drawn."""
+
+    system: str  # shipped
+    starts: int  # how many
+    settle: int  # steps that each runs before its start
+    overrides: dict[str, Any]
+
+
+WARM = {"dynamics.temperature": 0.3}
+# beyond the second shell, which lies at the cutoff of the shipped file
+WIDE = {"cutoff.radius": 2.1, "neighbors.skin": 0.25}
+HOT = {**WIDE, "dynamics.temperature": 3.0}
+CASES = {
+    "crystal-108, hard": Case("argon/crystal-108", 13, 50, {}),
+    "crystal-108 at T = 0.3, hard": Case("argon/crystal-108", 15, 100, WARM),
+    "crystal-108 at T = 0.3, shifted": Case("argon/crystal-108", 12, 100, {**WARM, "cutoff.kind": "shifted"}),
+    "crystal-108 at T = 0.3, switched": Case(
+        "argon/crystal-108", 12, 100, {**WARM, **WIDE, "cutoff.kind": "quintic"}
+    ),
+    "fluid of 108, hard": Case("argon/crystal-108", 3, 300, HOT),
+    "crystal-500, hard": Case("argon/crystal-500", 2, 50, {}),
+    "fluid of 108, switched": Case("argon/crystal-108", 2, 300, {**HOT, "cutoff.kind": "quintic"}),
+    "fluid of 108, shifted": Case("argon/crystal-108", 1, 300, {**HOT, "cutoff.kind": "shifted"}),
+    "liquid-864, hard": Case("argon/liquid-864", 1, 20, {}),
+}
+
+
+def word(loss: str, steps: int) -> str:
+    """A loss as mdnum names it, by its name in the reference."""
+    return f"potential:first={steps}" if loss == LOSSES[-1] else loss
+
+
+def finer(problem: Problem) -> Problem:
+    """The same times in shorter steps."""
+    timestep = parameters.value(problem.simulation, "dynamics.timestep") / SUBSTEPS
+    loss = replace(problem.loss, every=SUBSTEPS * problem.loss.every, first=SUBSTEPS * problem.loss.first)
+    simulation = parameters.with_values(problem.simulation, {"dynamics.timestep": timestep})
+    return Problem(simulation, loss, SUBSTEPS * problem.steps)
+
+
+def values_of(
+    simulation: Simulation, problems: Sequence[Problem], chosen: list[int]
+) -> Callable[[dict[str, float]], np.ndarray]:
+    """The chosen losses of a free run, by parameters."""
+    here = {name: float(parameters.value(simulation, name)) for name in NAMES}
+    if simulation.cutoff.switches:
+        fine = [finer(problem) for problem in problems]
+        return lambda values: np.array([one.value(values) for one in fine])
+    # kinetic energy of an atom to temperature
+    scale = np.where(np.array(LOSSES) == "temperature", 2 / (3 * simulation.units.k_B), 1.0)
+    steps = problems[0].steps
+    return lambda values: (scale * reference(simulation, {**here, **values}, steps, SUBSTEPS))[chosen]
+
+
+def differences(
+    at: Callable[[dict[str, float]], np.ndarray], name: str, here: float
+) -> list[np.ndarray]:  # fmt: skip
+    """Central differences of all losses by one parameter, the widest shift first."""
+    return [
+        (at({name: here * (1 + h)}) - at({name: here * (1 - h)})) / (2 * h * here) for h in SHIFTS
+    ]  # fmt: skip
+
+
+def examined(case: Case, seed: int, steps: int) -> list[dict[str, Any]]:
+    """Verdicts and differences of one start: a row for each loss and parameter."""
+    simulation = replica(build(case.system, case.overrides), seed, case.settle)
+    # some of the losses in turn, so that there are more starts
+    chosen = sorted((seed + k) % len(LOSSES) for k in range(EACH))
+    problems = [Problem(simulation, parse(word(LOSSES[k], steps), simulation, steps), steps) for k in chosen]
+    at, rows = values_of(simulation, problems, chosen), []
+    slopes = {name: differences(at, name, float(parameters.value(simulation, name))) for name in NAMES}
+    for k, (which, problem) in enumerate(zip(chosen, problems, strict=True)):
+        made = diagnose(problem, NAMES, parts=("agreement", "trust"), methods=("event-aware",))
+        assert made.agreement is not None and made.trust is not None
+        own, found = made.agreement.gradient("event-aware"), made.trust
+        assert own is not None
+        for name in NAMES:
+            judged = found.by[name]
+            rows.append(
+                {
+                    "loss": LOSSES[which], "name": name, "gradient": float(own.gradient[name]),
+                    "differences": [float(one[k]) for one in slopes[name]], "verdict": judged.verdict,
+                    "limited_by": judged.limited_by, "unknown": judged.unknown,
+                    "limits": {one.what: one.values for one in judged.limits},
+                    "step": found.table[f"step.{name}"][-2:].tolist(),
+                }
+            )  # fmt: skip
+    return rows
+
+
+def truth(row: dict[str, Any]) -> float | None:
+    """The derivative; None where differences do not converge."""
+    last = np.array(row["differences"][1:])
+    return float(last[-1]) if np.ptp(last) <= AGREE * np.abs(last).max() else None
+
+
+def off(row: dict[str, Any]) -> float:
+    """Relative error of the gradient; infinite where there is no derivative."""
+    right = truth(row)
+    if right is None:
+        return np.inf
+    if right == 0:
+        return 0.0 if row["gradient"] == 0 else np.inf
+    return abs(row["gradient"] - right) / abs(right)
+
+
+def fill(store: Path, cases: Sequence[str], seeds: int | None, steps: int, first: int) -> None:
+    """Examine the starts that are not in the store."""
+    store.mkdir(parents=True, exist_ok=True)
+    for name in cases:
+        case = CASES[name]
+        # hard and shifted cutoffs have the same motion: every case has seeds of its own
+        own = first + 100 * list(CASES).index(name)
+        for seed in range(own, own + (seeds or case.starts)):
+            path = path_of(store, name, seed)
+            if not path.exists():
+                say(f"{name}: seed {seed}")
+                path.write_text(json.dumps(examined(case, seed, steps), default=float), encoding="utf-8")
+
+
+def path_of(store: Path, name: str, seed: int) -> Path:
+    return store / f"{name.replace(' ', '-').replace(',', '')}-{seed}.json"
+
+
+def stored(store: Path, name: str, first: int) -> Iterator[list[dict[str, Any]]]:
+    """The starts of a case that have been examined."""
+    for seed in range(first, first + 1000):
+        path = path_of(store, name, seed)
+        if path.exists():
+            yield json.loads(path.read_text(encoding="utf-8"))
+
+
+def counted(label: str, starts: int | str, rows: Sequence[dict[str, Any]]) -> list[Any]:
+    """One line of the table."""
+    errors = np.array([off(row) for row in rows])
+    trusted = np.array([row["verdict"] == "trusted" for row in rows])
+    line = [label, starts, len(rows), int(np.isinf(errors).sum()), int(trusted.sum())]
+    line += [int((trusted & (errors > WRONG)).sum())]
+    worst = errors[trusted].max(initial=0.0)
+    line += [f"{100 * worst:.2g} %" if trusted.any() and np.isfinite(worst) else "-"]
+    for right in RIGHT:
+        of, strict = int((errors <= right).sum()), int((~trusted & (errors <= right)).sum())
+        line += [f"{strict} of {of} ({100 * strict / of:.0f} %)" if of else "-"]
+    return line
+
+
+COLUMNS = (
+    "", "starts", "derivatives", "without a derivative", "trusted", "false", "worst trusted",
+    *(f"too strict ({100 * right:.0f} %)" for right in RIGHT),
+)  # fmt: skip
+
+
+def table(store: Path, cases: Sequence[str], first: int) -> str:
+    """The counts by system, by loss and by parameter, as Markdown."""
+    made = {name: list(stored(store, name, first)) for name in cases}
+    every = [row for starts in made.values() for rows in starts for row in rows]
+    lines = [
+        counted(name, len(starts), [row for rows in starts for row in rows])
+        for name, starts in made.items() if starts
+    ]  # fmt: skip
+    for key, kinds in (("loss", LOSSES), ("name", NAMES)):
+        for kind in kinds:
+            rows = [row for row in every if row[key] == kind]
+            lines.append(counted(("d " if key == "loss" else "by ") + kind, "", rows))
+    lines.append(counted("all", sum(map(len, made.values())), every))
+    text = [COLUMNS, ("---", *["--:"] * (len(COLUMNS) - 1)), *lines]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in text)
+
+
+def main() -> None:
+    """Parse, examine what is missing, count."""
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES), metavar="CASE")
+    made.add_argument("--seeds", type=int, metavar="N", help="starts of each case (default: its own number)")
+    made.add_argument("--first", type=int, default=FIRST, help=f"the first seed (default {FIRST})")
+    made.add_argument("--steps", type=int, default=100, help="of each run (default 100)")
+    made.add_argument("--store", type=Path, default=Path("gradient_trust"), help="folder of what was done")
+    made.add_argument("--page", type=Path, help="run nothing: put the table between the marks of this page")
+    chosen = made.parse_args()
+    if chosen.page is None:
+        fill(chosen.store, chosen.only, chosen.seeds, chosen.steps, chosen.first)
+        print(table(chosen.store, chosen.only, chosen.first))
+        return
+    parts = chosen.page.read_text(encoding="utf-8").split(MARK)
+    parts[1] = f"\n\n{table(chosen.store, chosen.only, chosen.first)}\n\n"
+    chosen.page.write_text(MARK.join(parts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    start(main)

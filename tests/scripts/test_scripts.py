@@ -1,0 +1,359 @@
+"""Each study runs from its command line with small settings and leaves its table and its figure."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+WHERE = {path.stem: path for path in SCRIPTS.glob("*/[a-z]*.py")}
+STUDIES = sorted(
+    name for name, path in WHERE.items() if "\nHow to read it." in path.read_text(encoding="utf-8")
+)
+
+# every one compiles; and dtypes are not strict, as a user calls it
+pytestmark = [pytest.mark.slow, pytest.mark.jax_md]
+
+
+def study(name: str, *words: str, cwd: Path, code: int = 0) -> str:
+    """What a script prints to stdout; it is run elsewhere, as a user would."""
+    done = subprocess.run(
+        [sys.executable, str(WHERE[name]), *words],
+        cwd=cwd,
+        # a worker of the tests has a terminal 80 columns wide; a table in a file has not
+        env={name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """What a script prints, run in this process: jax and mdnum are not imported again for it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+    def run(name: str, *words: str, code: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+        # as Python does for a script
+        monkeypatch.syspath_prepend(str(WHERE[name].parent))
+        ended: object = 0
+        try:
+            runpy.run_path(str(WHERE[name]), run_name="__main__")
+        except SystemExit as done:
+            ended = done.code or 0
+        out, err = capsys.readouterr()
+        assert ended == code, err
+        return err if code else out
+
+    return run
+
+
+def row(table: str, *first: str) -> list[str]:
+    """The cells of the only line whose first cells are these."""
+    lines = [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
+    (found,) = [cells for cells in lines if cells[: len(first)] == list(first)]
+    return found
+
+
+def rows(table: str, columns: str, *firsts: str | tuple[str, ...]) -> list[dict[str, str]]:
+    """The lines that begin with these cells, by the names of their columns."""
+    found = [row(table, *((first,) if isinstance(first, str) else first)) for first in firsts]
+    return [dict(zip(columns.split(), cells, strict=False)) for cells in found]
+
+
+def is_png(path: Path) -> bool:
+    """Whether a file holds a picture."""
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_help_says_the_question_and_how_to_read_the_answer(name: str, here) -> None:
+    text = here(name, "--help")
+    assert "?" in text.split("\n\n")[1]
+    assert "How to read it." in text
+
+
+@pytest.mark.nightly
+def test_hard_and_shifted_cutoffs_flip_alike_and_conserve_differently(tmp_path: Path) -> None:
+    words = ["argon/crystal-108", "--steps", "150", "--kinds", "hard", "shifted", "switched"]
+    table = study("cutoff_sensitivity", *words, "--scales", "1", "-o", "c.png", cwd=tmp_path)
+    columns = "cutoff r_cut E/N std drift flips energy_jump force_jump smooth"
+    hard, shifted, switched = rows(table, columns, "hard", "shifted", "switched")
+    assert float(hard["flips"]) > 0
+    assert hard["flips"] == shifted["flips"]
+    assert hard["force_jump"] == shifted["force_jump"]
+    assert float(hard["energy_jump"]) < 0 == float(shifted["energy_jump"])
+    assert float(hard["std"]) > 10 * float(shifted["std"]) > 0
+    assert float(switched["force_jump"]) == 0
+    assert [int(one["smooth"]) for one in (hard, shifted, switched)] == [-1, 0, 1]
+    assert is_png(tmp_path / "c.png")
+
+
+def test_a_cutoff_study_refuses_a_potential_without_one(here, tmp_path: Path) -> None:
+    text = here("cutoff_sensitivity", "silicon/stillinger-weber-512", code=2)
+    assert "carries its own cutoff" in text
+    assert "Traceback" not in text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.nightly
+def test_blind_rebuilds_lose_pairs_and_checked_ones_do_not(tmp_path: Path) -> None:
+    words = ["argon/langevin-500", "--steps", "200", "--skins", "0.3", "--every", "0", "100"]
+    table = study("skin_sensitivity", *words, "-o", "s.svg", cwd=tmp_path)
+    columns = "skin rule rebuilds dangerous used lost pair_steps first rate"
+    checked, blind = rows(table, columns, ("0.3", "check"), ("0.3", "blind, every 100"))
+    assert int(checked["lost"]) == 0
+    assert float(checked["used"]) <= 1.0
+    assert checked["first"] == "-"
+    assert int(blind["pair_steps"]) >= int(blind["lost"]) > 0
+    assert 0 < int(blind["first"]) <= 200
+    assert (tmp_path / "s.svg").read_text().lstrip().startswith("<?xml")
+
+
+def test_flips_of_a_new_run_and_of_its_folder_are_the_same(here, tmp_path: Path) -> None:
+    words = ["--busiest", "3", "-o", "t.png"]
+    made = here("topology_flip_report", "argon/crystal-108", "--steps", "150", "--folder", "run", *words)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    flips = summary["flips_entered"] + summary["flips_left"]
+    assert flips > 0
+    assert row(made, "flips")[1].startswith(f"{flips:,}: ")
+    assert (tmp_path / made.splitlines()[-1]).is_file()
+    assert is_png(tmp_path / "t.png")
+    assert here("topology_flip_report", "run", *words) == made
+
+
+@pytest.mark.nightly
+def test_ase_agrees_and_searches_are_listed_with_where_they_stop(here, tmp_path: Path) -> None:
+    words = ["argon/crystal-108", "--every-kind", "none", "--pairs", "argon/crystal-108"]
+    table = here("ase_comparison", *words, "-o", "a.png")
+    compared = row(table, "argon/crystal-108", "hard")
+    assert compared[-1] == "yes"
+    assert float(compared[3]) <= 1e-12
+    assert float(compared[4]) <= 1e-10
+    assert row(table, "vesin")[-1] == "agrees"
+    assert row(table, "vesin")[-2] == "-1 ulp"
+    assert any("relative" in cell for cell in row(table, "mdanalysis"))
+    assert is_png(tmp_path / "a.png")
+
+
+@pytest.mark.nightly
+def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
+    made = json.loads(study("benchmark", "--quick", "--turns", "1", "--json", "-o", "b.png", cwd=tmp_path))
+    speeds = {one["code"]: one for one in made["speeds"]}
+    assert {"mdnum, recorded", "mdnum, unrecorded", "jax-md loop"} <= set(speeds)
+    assert all(one["steps_per_second"] > 0 and one["cpu_ms_per_step"] > 0 for one in speeds.values())
+    assert {one["atoms"] for one in speeds.values()} == {500}
+    steps = [one["step"] for one in made["memory"]]
+    assert len(steps) == 4
+    assert steps == sorted(set(steps))
+    assert all(one["flips"] > 0 for one in made["memory"])
+    assert set(made["list_builds_ms"]["500"]) == {"mdnum host", "vesin", "jax-md update"}
+    assert made["start_up"]["cpu_seconds"] > 0
+    assert is_png(tmp_path / "b.png")
+
+
+@pytest.mark.nightly
+def test_no_table_and_no_row_of_positions_leaves_an_accelerator(tmp_path: Path) -> None:
+    words = ["--sizes", "256", "500", "--steps", "60", "--json"]
+    made = json.loads(study("accelerator", *words, cwd=tmp_path))["sizes"]
+    for one in made:
+        # the numbers of a stretch's steps come with it: seven of 128 steps, read once
+        numbers = 9_000 * (one["stretches"] + 1)
+        assert one["to_host"] <= 2 * 112 * one["flips"] + 8 * one["atoms"] * one["lists"] + numbers
+        assert one["to_host"] >= 112 * one["flips"] and one["flips"] > one["steps"] > 50 and one["lists"] > 2
+    # what goes there does not grow with the system
+    assert all(one["to_device"] <= 500 * (one["lists"] + one["stretches"] + 1) for one in made)
+
+
+@pytest.mark.nightly
+def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
+    made = json.loads(study("flips_benchmark", "--quick", "--json", "-o", "b.png", cwd=tmp_path))
+    speeds = {(one["frames"], one["code"]): one for one in made["speeds"]}
+    for frames in ("every step", "every 100th step"):
+        ours, merged = (speeds[frames, code] for code in ("mdnum", "vesin, sorted merge"))
+        # the same pairs, found by two searches that share nothing
+        assert ours["flips"] == merged["flips"] > 0
+        assert ours["cpu_ms"] > 0 and speeds[frames, "MDAnalysis, sets"]["count"] == 4
+    taken = {(one["what"], one["frames"]): one["cpu_seconds"] for one in made["file"]}
+    # a command begins with what reading alone does not need, whatever the machine is busy with
+    assert all(taken["command", frames] > taken["reading", frames] > 0 for frames in (60, 240))
+    assert len(made["memory"]) == 4
+    assert {one["atoms"] for one in made["many"]} == {1000}
+    assert is_png(tmp_path / "b.png")
+
+
+@pytest.mark.nightly
+def test_a_ball_answers_to_its_knobs(tmp_path: Path) -> None:
+    words = ["--points", "9", "--factors", "0.9", "1", "2"]
+    table = study("ball_sensitivity", *words, "-o", "k.png", cwd=tmp_path)
+    columns = "floor knob value contact at iterations most loss by_k by_y0"
+    # twice the step: half as many until the first contact, give or take one
+    one, two = rows(table, columns, ("spring", "h", "0.01"), ("spring", "h", "0.02"))
+    assert abs(int(one["contact"]) - 2 * int(two["contact"])) <= 2
+    # a tolerance that changes no number of iterations changes nothing at all; one that does, the loss
+    tolerances = (("projection", "tol", tol) for tol in ("9e-07", "1e-06", "2e-06"))
+    near, own, far = rows(table, columns, *tolerances)
+    assert near | {"value": "1e-06"} == own
+    assert int(far["iterations"]) < int(own["iterations"])
+    assert float(far["loss"]) > 2 * float(own["loss"])
+    # soft floors have derivatives of the size of the motion's, hard ones of the size of a lost step
+    soft, hard = rows(table, columns, ("softplus", "k", "3000"), ("spring", "k", "3000"))
+    assert abs(float(soft["by_y0"])) < 5 < 50 < abs(float(hard["by_y0"]))
+    assert is_png(tmp_path / "k.png")
+
+
+@pytest.mark.nightly
+def test_balls_are_timed_against_their_own_recorded_run(tmp_path: Path) -> None:
+    words = ["--balls", "50", "--steps", "40", "--turns", "1"]
+    printed = study("ball_benchmark", *words, cwd=tmp_path)
+    for world in ("spring", "located impacts", "projection"):
+        assert float(row(printed, world)[4]) > 0
+
+
+def test_a_projection_that_cannot_converge_is_refused(here, tmp_path: Path) -> None:
+    text = here("ball_sensitivity", "--factors", "1", "9", code=2)
+    assert "overshoots" in text and "below 8" in text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.nightly
+def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path) -> None:
+    words = ["--sums", "bfloat16", "--orders", "sequential", "pairwise", "--steps", "60", "-o", "p.png"]
+    table = study("termination_precision", *words, cwd=tmp_path)
+    columns = "sum order iterations early late capped first loss slope change"
+    names = (("float64", "sequential"), ("bfloat16", "sequential"), ("bfloat16", "pairwise"))
+    wide, narrow, tree = rows(table, columns, *names)
+    assert int(narrow["early"]) > 0 == int(narrow["late"])
+    lost = int(wide["iterations"]) - int(narrow["iterations"])
+    assert lost == int(narrow["early"])
+    assert float(narrow["change"]) > 1e-3
+    assert tree == wide | {"sum": "bfloat16", "order": "pairwise"}
+    assert is_png(tmp_path / "p.png")
+
+
+@pytest.mark.nightly
+def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Path) -> None:
+    words = ["--steps", "1300", "--roles", "force", "accumulate", "--repeats", "0", "-o", "f.png"]
+    table = study("precision_fork", *words, cwd=tmp_path)
+    force, sums = rows(table, "role seed fork split told growth verdict", "force", "accumulate")
+    assert force["seed"] == sums["seed"] == "1"
+    assert 1 < int(force["fork"]) < 1300
+    assert force["told"] == "-"
+    assert is_png(tmp_path / "f.png")
+
+
+@pytest.mark.nightly
+def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> None:
+    words = ["--reductions", "sequential", "reversed", "exact", "--steps", "60", "-o", "r.png"]
+    table = study("reduction_order", *words, cwd=tmp_path)
+    columns = "sum error seed fork split end shuffled"
+    own, other, exact = rows(table, columns, "sequential", "reversed", "exact")
+    assert own["seed"] == "-" and other["seed"] == exact["seed"] == "1"
+    assert own["shuffled"] == other["shuffled"] == "1" and exact["shuffled"] == "-"
+    assert float(exact["error"]) == 0 < float(own["error"]) < 1000
+    assert 0 < float(other["end"]) < 1e-10
+    assert is_png(tmp_path / "r.png")
+
+
+def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(here, tmp_path: Path) -> None:
+    columns = "system,cutoff,choice,asked,repeats,verdict,seed,fork,split,told,nats,steps,seconds,note"
+    kept = "argon/crystal-108,hard,start,60,0,cause,0,7,11,,2.5,60,1.0,made up"
+    # the second line is what a killed process leaves behind, the third what failed
+    torn = "argon/crystal-108,hard,translate=0.25,60,0,bysta"
+    failed = "argon/crystal-108,hard,order,60,0,failed,,,,,,0,0.1,no memory"
+    (tmp_path / "m.csv").write_text("\n".join((columns, kept, failed, torn)))
+    words = ["--quick", "--steps", "60", "--kinds", "hard"]
+    words += ["--choices", "start", "order", "translate=0.25", "noise", "-o", "m.png"]
+    table = here("fork_atlas", *words)
+    names = (("argon/crystal-108", "hard", choice) for choice in ("start", "order", "translate=0.25"))
+    start, order, moved = (row(table, *name)[3:7] for name in names)
+    assert (start, order) == (["cause", "0", "7", "11"], ["no fork", "1", "-", "-"])
+    assert moved[0] in ("same", "no fork")
+    assert "finding" not in table
+    lines = (tmp_path / "m.csv").read_text().splitlines()
+    assert lines[:2] == [columns, kept] and torn not in lines
+    # a choice that does not apply is kept with the reason
+    assert any(line.split(",")[5] == "does not apply" for line in lines)
+    assert is_png(tmp_path / "m.png")
+
+
+@pytest.mark.nightly
+def test_the_cost_of_a_comparison_is_a_ratio(tmp_path: Path) -> None:
+    words = ["--quick", "--no-answers", "--json", "-o", "r.png"]
+    made = json.loads(study("fork_benchmark", *words, cwd=tmp_path))
+    (one,) = made["ratios"]
+    assert one["system"] == "argon/crystal-108" and one["atoms"] == 108
+    # three runs; on a busy machine a clock can say anything
+    assert 1 < one["cpu_ratio"] < 30
+    assert one["triple_compile"] > 0
+    assert is_png(tmp_path / "r.png")
+
+
+@pytest.mark.nightly
+def test_a_gradient_in_float32_agrees_with_one_in_float64_over_a_short_horizon(tmp_path: Path) -> None:
+    words = ["--cutoffs", "quintic", "--steps", "100", "--points", "5", "--replicas", "0", "-o", "g.png"]
+    table = study("gradient_horizon", *words, cwd=tmp_path)
+    (found,) = rows(table, "cutoff growth exponent float32 float64 ratio scatter flips", "quintic")
+    # neither format reaches the tolerance, no other start was asked for
+    assert [found[word] for word in ("float32", "float64", "ratio", "scatter")] == ["-"] * 4
+    assert 0 < float(found["growth"]) < 0.1 and 0 < float(found["exponent"]) < 0.1
+    assert is_png(tmp_path / "g.png")
+
+
+@pytest.mark.nightly
+def test_fewer_frames_and_fewer_decimals_lose_flips(tmp_path: Path) -> None:
+    words = ["--steps", "200", "--strides", "1,20", "--decimals", "3,2", "-o", "f.png"]
+    table = study("flips_of_a_trajectory", *words, cwd=tmp_path)
+    assert row(table, "1", "0.002")[3] == "100.0%"
+    kept = float(row(table, "20", "0.04")[3].rstrip("%"))
+    assert 90 < kept < 100
+    fine, coarse = (float(row(table, decimals)[2].rstrip("%")) for decimals in ("3", "2"))
+    assert 0 < fine < coarse
+    assert is_png(tmp_path / "f.png")
+
+
+@pytest.mark.nightly
+def test_calculators_side_by_side(tmp_path: Path) -> None:
+    own = "ase.calculators.emt:EMT"
+    told = study("audit_calculator", own, "--checks", "forces,curl", "-o", "a.png", cwd=tmp_path)
+    cells = row(told, "EMT")
+    assert cells[2:5] == ["not asked", "not asked", "-"] and float(cells[5]) < 1e-6
+    assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@pytest.mark.nightly
+def test_runs_that_locate_crossings_have_the_derivative_of_the_motion(monkeypatch) -> None:
+    """A pair that leaves its well through a hard cutoff: its last speed follows from its energy."""
+    monkeypatch.syspath_prepend(str(SCRIPTS / "campaigns"))
+    located = importlib.import_module("_located")
+    x = np.array([[5.0, 5, 5], [6.8, 5, 5]])
+    v = np.array([[-0.5, 0, 0], [0.5, 0, 0]])
+
+    def u(r: float) -> float:
+        return 4 * (r**-12 - r**-6)
+
+    def speed(radius: float) -> float:
+        made = located.losses(
+            x, v, np.full(2, 2.0), np.full(3, 20.0), 1.0, 1.0, radius, False, 0.002, 1000, 4
+        )
+        # the mean over the two atoms of v(0) · v(t), each half as fast as they part
+        return 4 * made[located.LOSSES.index("vacf")]
+
+    right = np.sqrt(1 + 2 * u(1.8) - 2 * u(2.5))
+    assert speed(2.5) == pytest.approx(right, rel=1e-5)
+    slope = (speed(2.5 + 1e-6) - speed(2.5 - 1e-6)) / 2e-6
+    steep = 24 * (2.5**-7 - 2 * 2.5**-13)
+    assert slope == pytest.approx(-steep / right, rel=1e-4)
