@@ -172,7 +172,8 @@ class Seen:
         self.folder = folder
         self.answers: dict[str, dict[str, Any]] = {}
         for name, text in COMMANDS["files"].items():
-            (folder / f"{name}.py").write_text(text.replace("{tests!r}", repr(str(RECORDS.parent))))
+            support = repr(str(RECORDS.parent / "support"))
+            (folder / f"{name}.py").write_text(text.replace("{support!r}", support))
 
     def of(self, golden: Golden, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
         if golden.name in self.answers:

@@ -139,7 +139,7 @@ class StillingerWeber(ManyBody):
     Smooth at its cutoff to every order: a flip changes neither energy nor force.
 
     Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7; checked against a plain
-    numpy evaluation of those equations (tests/oracles_manybody.py).
+    numpy evaluation of those equations (tests/support/oracles_manybody.py).
     """
 
     epsilon: float = eqx.field(static=True, default=2.1683)  # energy scale, energy
@@ -202,7 +202,7 @@ class Tersoff(ManyBody):
     for n < 1 the force is continuous but infinitely steep there (dilute silicon; not the crystal).
 
     Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table I, in LAMMPS's notation; checked
-    against ase.calculators.tersoff and a plain numpy evaluation (tests/oracles_manybody.py).
+    against ase.calculators.tersoff and a plain numpy evaluation (tests/support/oracles_manybody.py).
     """
 
     # A, B: repulsion and attraction, energy
@@ -549,7 +549,7 @@ class EmbeddedAtom(ManyBody):
     the form it tabulates is the table's, not counted here.
 
     Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984); checked against ase.calculators.eam and a plain
-    evaluation in extended precision (tests/oracles_manybody.py).
+    evaluation in extended precision (tests/support/oracles_manybody.py).
     """
 
     # pair, density, embedding: phi, density and F as splines

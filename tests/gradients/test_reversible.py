@@ -150,7 +150,8 @@ def digest() -> str:
 
 
 CHILD = (
-    'import sys; sys.path[:0] = ["tests", "tests/gradients"]; import test_reversible as t; print(t.digest())'
+    'import sys; sys.path[:0] = ["tests/support", "tests/gradients"]; '
+    "import test_reversible as t; print(t.digest())"
 )
 
 

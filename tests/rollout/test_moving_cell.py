@@ -278,7 +278,8 @@ run(moving(), out={out!r}, progress=progress)
 @pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_in_its_box(tmp_path):
     whole = run(moving(), out=tmp_path / "whole"), RunFolder.open(tmp_path / "whole")
-    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    tests = Path(__file__).parents[1]
+    here = {**os.environ, "PYTHONPATH": f"{tests}{os.pathsep}{tests / 'support'}"}
     code = _KILLED.format(out=str(tmp_path / "run"))
     killed = subprocess.run([sys.executable, "-c", code], env=here, capture_output=True, text=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr

@@ -21,7 +21,7 @@ from mdnum.references.conformance.questions import LARGE_EDGE, SMALL_EDGE, catal
 from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Examiner, examine
 
-TESTS = Path(__file__).parents[2]
+SUPPORT = Path(planted_lists.__file__).parent
 # what needs more atoms than the small questions have
 _LARGE = {"rows beyond 4096": SMALL_EDGE, "32-bit keys": LARGE_EDGE}
 # some are the same mistake as another to whoever sees the pairs alone
@@ -231,7 +231,7 @@ def test_failures_shrink_and_are_reproduced_without_mdnum(
         code, said = _run(path, capsys)
         assert (code, f"the list is {'wrong' if wanted else 'right'}" in said) == (wanted, True), said
     if defect == "half stencil":  # a process of its own has the same to say
-        blocked = f"import sys, runpy; sys.modules['mdnum'] = None; sys.path.insert(0, {str(TESTS)!r}); "
+        blocked = f"import sys, runpy; sys.modules['mdnum'] = None; sys.path.insert(0, {str(SUPPORT)!r}); "
         run = f"{blocked}runpy.run_path({str(path)!r}, run_name='__main__')"
         done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False)
         assert done.returncode == 0 and "the list is right" in done.stdout, done.stderr

@@ -435,7 +435,7 @@ def test_a_list_that_rounds_positions_to_float32_is_a_warning(
     if code == "error":  # nor many
         first = lambda *given, **named: plan(*given, **named)[:1]  # noqa: E731
         monkeypatch.setattr("mdnum.references.conformance.suite.plan", first)
-    home = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+    home = f"import sys\nsys.path.insert(0, {str(Path(planted_lists.__file__).parent)!r})\n"
     (mine / "rounds.py").write_text(home + _ROUNDS)
     asked = ["conform", f"rounds.py:{name}", "--cases", "6", "--no-large", "--no-report", "-o", "out"]
     # the random cases make no difference
@@ -459,7 +459,7 @@ def test_few_questions_show_that_positions_are_rounded(
     """Those that are asked before the others: whoever has a minute is warned, too."""
     first = lambda *given, **named: plan(*given, **named)[:1]  # noqa: E731
     monkeypatch.setattr("mdnum.references.conformance.suite.plan", first)
-    home = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+    home = f"import sys\nsys.path.insert(0, {str(Path(planted_lists.__file__).parent)!r})\n"
     (mine / "rounds.py").write_text(home + _ROUNDS)
     asked = ["conform", f"rounds.py:{name}", "--cases", "0", "--no-report", "-o", "out"]
     assert call(*asked, *(["--limits", ",".join(limits)] if limits else [])) == 1
