@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from oracles import all_pairs, cut_energy, margins
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
+from mdnum.gradients.adjoint import MODEL, pull_back
 from mdnum.md import foreign, kernel
 from mdnum.md.cell import wrap_positions
 from mdnum.md.decide import Tables
@@ -139,6 +140,24 @@ def test_derivatives_and_batches_go_through_it():
     np.testing.assert_allclose(jax.grad(energy)(x), -force, atol=1e-12 * float(np.abs(force).max()))
     both = jax.vmap(lambda x: simulation.force(x, tables, decisions=False).force)(jnp.stack([x, x + 0.01]))
     assert np.array_equal(both[0], force)
+
+
+@pytest.mark.parametrize("kind", [*CUTOFFS, "shifted"])
+def test_shipped_cutoffs_go_through_the_loop(kind):
+    """A step and a step back: XLA's own loop has the same answers, and would take their place unnoticed."""
+    switch = {"onset": 2.0} if kind in ("switched", "quintic") else {}
+    simulation = build(make(mixture(), KOB_ANDERSEN, {"kind": kind, "radius": 2.3, **switch}))
+    wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
+    table = simulation.verlet_list().build(wrapped, simulation.cell)
+    tables, x = simulation.tables(table), jnp.asarray(wrapped[table.order].T)
+
+    def back(x, bits):
+        none = jnp.zeros(())
+        return pull_back(simulation.force, x, tables, bits, x, none, none, frozenset({MODEL}))
+
+    bits = jnp.zeros((table.slots // 8, len(wrapped)), jnp.uint8)
+    for function, inputs in ((partial(simulation.force, decisions=True), (x, tables)), (back, (x, bits))):
+        assert "mdnum_pairs_" in str(jax.make_jaxpr(function)(*inputs))
 
 
 def test_what_has_no_vectors_is_left_to_xla():
