@@ -32,8 +32,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mdnum.lazy import on_first_use
-
-__version__ = "0.1.0"
+from mdnum.version import __version__ as __version__
 
 if TYPE_CHECKING:
     # submodules that docs/python.md names, first

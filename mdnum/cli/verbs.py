@@ -37,7 +37,7 @@ _STEPS = typer.Option(None, min=1)
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from mdnum import __version__
+        from mdnum.version import __version__
 
         typer.echo(f"mdnum {__version__}")
         raise typer.Exit()

@@ -16,9 +16,9 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Literal
 
-from mdnum import __version__
 from mdnum.errors import FolderError
 from mdnum.reading import whole_text
+from mdnum.version import __version__
 
 #: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
 SUBFOLDERS = ("parts", "figures", "structures")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum import units
-from mdnum.audit import base
+from mdnum.audit import base, conclusion
 from mdnum.audit.causes import heads
 from mdnum.audit.checks import CHECKS
 from mdnum.errors import InputError
@@ -263,14 +263,14 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
     if checks is None:
-        return base.in_order(list(CHECKS))
+        return conclusion.in_order(list(CHECKS))
     names = frame.words(checks)
     for name in names:
         if name not in CHECKS:
             raise unknown("check", name, CHECKS)
     if not names:
         raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
-    return base.in_order(list(names))
+    return conclusion.in_order(list(names))
 
 
 def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
@@ -330,13 +330,13 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
     atoms, given = state.atoms, units.get(state.units)
-    said = base.answers(state.shown, state.checks)
+    said = conclusion.answers(state.shown, state.checks)
     why = state.why or "not finished"
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
     whys = dict.fromkeys(left, why) | {name: "not selected" for name in CHECKS if name not in state.checks}
     rest = [{"what": f"the check of {name}", "why": why, "part": name} for name, why in whys.items()]
     rest += [{"what": what, "why": why, "part": one.name} for one in state.shown for what, why in one.skipped]
-    early = frame.UNDECIDED if base.to_come(state.shown, state.checks) else frame.PARTIAL
+    early = frame.UNDECIDED if conclusion.to_come(state.shown, state.checks) else frame.PARTIAL
     status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
     status = {frame.PARTIAL: "complete"}.get(early, early) if state.during is None else status
     return _in_units(
@@ -442,7 +442,7 @@ class AuditView(View):
 def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
     state = view.state
-    given, titles, more = units.get(state.units), {}, base.concluded(state.shown)
+    given, titles, more = units.get(state.units), {}, conclusion.concluded(state.shown)
     observed = []
     for result in state.shown:
         # what a check has said by itself goes before what several say together
@@ -463,10 +463,10 @@ def _judge(view: AuditView) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    shown, early = state.shown, base.to_come(state.shown, state.checks)
-    said, begun = base.answers(shown, state.checks), {one.name for one in shown}
+    shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
+    said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())
-    if early and base.nothing_felt(shown):
+    if early and conclusion.nothing_felt(shown):
         return TEXTS("nothing_felt", name=name)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
     asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
@@ -474,7 +474,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     rest = [
         TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name)
         for one in shown
-        if nothing or base.largely_unasked(one)
+        if nothing or conclusion.largely_unasked(one)
     ]
     rest += [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
     if nothing:
@@ -506,7 +506,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     else:
         head = TEXTS("nothing_asked", head=head)
     refused = sum(why not in (base.TIME_UP, base.CALLS_UP) for one in shown for _, why in one.skipped)
-    unselected = base.in_order([one for one in CHECKS if one not in state.checks])
+    unselected = conclusion.in_order([one for one in CHECKS if one not in state.checks])
     values = {"elements": listed(list(dict.fromkeys(state.atoms.symbols)))}
     values |= {"checks": listed(unselected)} if unselected else {}
     head += " " + TEXTS("unasked_checks" if unselected else "unasked", **values)

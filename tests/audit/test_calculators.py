@@ -17,10 +17,11 @@ from audit import planted
 from audit.planted import Good, chain, codes
 from scipy.spatial import KDTree
 
-from mdnum.audit.base import TIME_UP, TimeUp, in_order, needed_to
+from mdnum.audit.base import TIME_UP, TimeUp
 from mdnum.audit.building import default_structure
 from mdnum.audit.checks import CHECKS
 from mdnum.audit.checks.alone import AloneCheck
+from mdnum.audit.conclusion import in_order, needed_to
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.record import load_calculator
 from mdnum.audit.structures import read_structure

@@ -183,7 +183,7 @@ def test_left_handed_vectors_are_no_mirror_image():
 
 
 def test_wrong_forces_are_told_apart_by_their_curl():
-    from mdnum.audit.base import concluded
+    from mdnum.audit.conclusion import concluded
 
     expected = {
         rivals.TermMissing: ("another_energy", []),

@@ -23,8 +23,9 @@ from other_package import install
 
 import mdnum
 from mdnum.audit import checks
-from mdnum.audit.base import TIME_UP, CheckResult, Meter, answers, finding, in_order
+from mdnum.audit.base import TIME_UP, CheckResult, Meter, finding
 from mdnum.audit.causes import heads
+from mdnum.audit.conclusion import answers, in_order
 from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
 from mdnum.audit.subject import LoadedCalculator
 from mdnum.errors import InputError

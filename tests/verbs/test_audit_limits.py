@@ -7,9 +7,10 @@ from audit import planted
 from audit.planted import but
 
 import mdnum
-from mdnum.audit.base import CALLS_UP, Meter, needed_to
+from mdnum.audit.base import CALLS_UP, Meter
 from mdnum.audit.building import BUILDING_CALLS
 from mdnum.audit.checks import CHECKS
+from mdnum.audit.conclusion import needed_to
 from mdnum.audit.thresholds import WALKING_CALLS
 from mdnum.cli.output import EXIT_UNDECIDED, exit_code
 from mdnum.verbs import frame

@@ -1,0 +1,83 @@
+"""What all checks of a calculator add up to: whether it is safe to run, and to differentiate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+from mdnum.audit.base import CheckResult
+from mdnum.audit.causes import cause
+from mdnum.audit.checks import CHECKS
+
+Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
+_NEARLY = 0.9  # of the ways of a check: from here on it counts as asked
+_FAR_BELOW = 0.1  # of the share of the forces that is wrong: a curl that would be seen of this is absent
+_QUESTIONS = ("run", "differentiate")
+
+
+def in_order(names: Sequence[str]) -> list[str]:
+    """Names of checks in the order in which they are asked."""
+    return sorted(names, key=lambda name: (CHECKS[name].order, name))
+
+
+def needed_to(question: str) -> set[str]:
+    """Checks without which a question ("run", "differentiate") has no answer."""
+    return {name for name in CHECKS if question in CHECKS[name].needed_to}
+
+
+def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
+    """An answer to each question ("run", "differentiate").
+
+    Args:
+        wanted: checks that were to be made.
+    """
+    return {question: _answer(question, results, wanted) for question in _QUESTIONS}
+
+
+def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]) -> Answer:
+    found = [one for result in results for one in result.findings if cause(one.code).spares != question]
+    severities = {one.severity for one in found}
+    if "error" in severities:
+        return "no"
+    if "warning" in severities:
+        return "with care"
+    needed, begun = needed_to(question), _begun(results)
+    if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
+        return "not asked"
+    asked = {result.name for result in results if not largely_unasked(result)}
+    return "yes" if needed <= asked else "as far as asked"
+
+
+def largely_unasked(result: CheckResult) -> bool:
+    """Whether the time was up before most ways of a check were asked."""
+    return result.asked < _NEARLY * result.possible
+
+
+def nothing_felt(results: Sequence[CheckResult]) -> bool:
+    """Whether no atom feels another in the structure: what was found right there tells nothing."""
+    return any(result.numbers.get("nothing_felt") for result in results)
+
+
+def _begun(results: Sequence[CheckResult]) -> set[str]:
+    return set() if nothing_felt(results) else {result.name for result in results}
+
+
+def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
+    """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
+    begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
+    return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
+
+
+def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
+    """Variants of sentences, by code, for what only several checks tell together.
+
+    Wrong forces that do no work around loops are the forces of another energy; those that do have none.
+    """
+    numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
+    curl, forces = numbers.get("curl"), numbers.get("forces")
+    if not curl or not forces:
+        return {}
+    # a curl would be seen that is far below the share of the forces that is wrong
+    seen = curl["unseen_share"] * forces["rms_force"] < _FAR_BELOW * forces["largest_difference"]
+    which = "no_energy" if curl["with_work"] else "another_energy" if seen else ""
+    return {"FORCES_NOT_GRADIENT": which}
