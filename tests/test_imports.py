@@ -8,8 +8,10 @@ import subprocess
 import sys
 import time
 import tokenize
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import grimp
 import jaxtyping
 import numpy as np
 import pytest
@@ -46,6 +48,22 @@ def test_import_contracts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     configure()
     kept = use_cases.lint_imports(cache_dir=None, no_logo=True)
     assert kept, capsys.readouterr().out
+
+
+def test_no_module_imports_itself_through_others():
+    """Imports inside functions count; those for type checkers alone do not. Only commands import the package."""
+    graph = grimp.build_graph("mdnum", exclude_type_checking_imports=True, cache_dir=None)
+
+    def in_order() -> list[str]:
+        imports = {one: graph.find_modules_directly_imported_by(one) - {one} for one in graph.modules}
+        return list(TopologicalSorter(imports).static_order())
+
+    assert in_order().index("mdnum.errors") < in_order().index("mdnum.store.files")
+    above = {one for one in graph.find_modules_that_directly_import("mdnum") if one.startswith("mdnum.cli.")}
+    assert above == graph.find_modules_that_directly_import("mdnum")
+    graph.add_import(importer="mdnum.errors", imported="mdnum.store.files")
+    with pytest.raises(CycleError):
+        in_order()
 
 
 def test_importing_brings_in_neither_jax_nor_jax_md():

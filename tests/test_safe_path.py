@@ -74,7 +74,7 @@ class _Runs:
 
 def test_no_structure_of_any_format_is_executed(tmp_path: Path):
     """Whatever a file calls itself, ASE's and MDAnalysis's readers run neither a pickle nor Python in it."""
-    from mdnum.trajectories.trajectory import open_trajectory
+    from mdnum.trajectories.readers import open_trajectory
 
     ran = tmp_path / "ran"
     payloads = [pickle.dumps(_Runs(ran)), f"open({str(ran)!r}, 'w').write('x')\n".encode()]

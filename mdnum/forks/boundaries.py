@@ -19,8 +19,7 @@ from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program
-from mdnum.systems import BallSystem
-from mdnum.systems.load import opened
+from mdnum.systems import BallSystem, opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation

@@ -21,7 +21,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of
 from mdnum.program import Twin
 from mdnum.store import RunFolder
-from mdnum.systems.load import load, opened
+from mdnum.systems import load, opened
 from mdnum.systems.toml import flat
 
 Difference = tuple[str, Any, Any]

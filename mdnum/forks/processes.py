@@ -32,9 +32,8 @@ from jaxtyping import Float
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks.worlds import program_of, varied
 from mdnum.safe_path import environment, python
-from mdnum.systems import BallSystem, System
+from mdnum.systems import BallSystem, System, opened
 from mdnum.systems.code import allow_code, is_allowed
-from mdnum.systems.load import opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Inexact
 
-from mdnum.errors import InputError, NumericalError
+from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
@@ -262,147 +259,3 @@ def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)
-
-
-# --- the shape that JAX gives to gradients, for training loops ----------------------------------------
-# The run is made on the host, list by list; a transformation that would trace it as one program cannot.
-
-
-def value_and_grad(
-    problem: Problem, names: Sequence[str], method: Method | str = "event-aware", *, has_aux: bool = False
-) -> Callable[[Values], tuple[Any, dict[str, np.ndarray]]]:
-    """A function that gives the loss and its gradient, as `jax.value_and_grad` does.
-
-    Example:
-        >>> f = mdnum.value_and_grad(problem, ["sigma"])
-        >>> value, slopes = f({"sigma": 1.01})
-
-    Args:
-        names: parameters to differentiate by, full or short names. method: a method, or its name.
-        has_aux: whether to return the whole `Gradient` too, as ((value, gradient), gradient by name).
-
-    Returns:
-        values by name (any of the names; the others stay as the system file has them) to (value, gradient by
-        name), spelled as they were asked for. Of a complex loss z both are complex, and the derivative by a
-        real parameter p is dz/dp = d Re z/dp + i d Im z/dp, without a conjugate: d|z|² = 2 Re(conj(z) dz),
-        d arg z = Im(dz/z). It is no direction of descent; `mdnum grad` and `trust` take real losses only.
-
-    Raises:
-        InputError: no such parameter or method, or it does not apply; a value is not real.
-
-    Warns:
-        UserWarning: a derivative that is exactly zero, with the reason.
-    """
-    chosen, full = _chosen(problem, names, method)
-    # a word for several parameters is none of them
-    spelled = {word: parameters.resolve(problem.simulation, [word]) for word in reversed(names)}
-    asked = {name: name for name in full} | {one[0]: word for word, one in spelled.items() if len(one) == 1}
-
-    def function(values: Values | None = None):
-        found = _differentiated(chosen, problem.at(_in_full(problem, values or {}, full)), full)
-        gradient = {asked[name]: found.gradient[name] for name in full}
-        return ((found.value, found) if has_aux else found.value), gradient
-
-    return function
-
-
-def differentiable(
-    problem: Problem,
-    names: Sequence[str],
-    method: Method | str = "event-aware",
-    watch: Callable[[Gradient], None] | None = None,
-) -> Callable[[Values], jax.Array]:
-    """The loss as a function that JAX can differentiate in reverse mode.
-
-    Parameters may be any pytree: put a function of your own before it, which makes the named values of it,
-    and `jax.grad` goes through both.
-
-    Args:
-        problem, names, method: as for `value_and_grad`, which see for what is raised and warned of.
-        watch: called with the whole gradient each time that one is worked out.
-
-    Returns:
-        values by name to the loss, a scalar; of a complex one `jax.grad` takes real functions, as jnp.abs.
-        It runs outside of `jit` and `vmap`.
-    """
-    chosen, full = _chosen(problem, names, method)
-
-    def at(values: Values) -> Problem:
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
-            raise InputError(
-                "a rollout was called inside jit or vmap; its lists are made on the host",
-                remedy="Call it, and jax.grad of it, outside of jit and vmap",
-            )
-        return problem.at(_in_full(problem, values, full))
-
-    @jax.custom_vjp
-    def loss(values: Values) -> jax.Array:
-        return jnp.asarray(at(values).value())
-
-    def forward(values: Values):
-        found = _differentiated(chosen, at(values), full)
-        if watch is not None:
-            watch(found)
-        by_name = {}
-        for name, value in values.items():
-            (one,) = parameters.resolve(problem.simulation, [name])
-            derivative = found.gradient[one]
-            dtype = np.promote_types(jnp.result_type(value), np.complex64)
-            by_name[name] = jnp.asarray(derivative).astype(dtype)
-        return jnp.asarray(found.value), by_name
-
-    def backward(gradient, onto):
-        # the cotangent of x + iy is that of x minus i times that of y
-        return (jax.tree.map(lambda one: jnp.real(onto.astype(one.dtype) * one), gradient),)
-
-    loss.defvjp(forward, backward)
-    return loss
-
-
-def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple[Method, tuple[str, ...]]:
-    chosen = method(word) if isinstance(word, str) else word
-    return chosen, chosen.check(problem, names)
-
-
-def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """The gradient, with a warning of a derivative that is exactly zero: a training loop reads no notes.
-
-    Raises:
-        NumericalError: it is not finite; names the first operation at fault where one is.
-    """
-    found = chosen(problem, names)
-    for name, value in found.gradient.items():
-        if not np.any(np.asarray(value)):
-            note = found.notes.get(name, "exactly 0 in this run")
-            warnings.warn(f"{found.method} by {name}: {note}", UserWarning, stacklevel=3)
-    bad = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]
-    if bad or not np.isfinite(found.value):
-        from mdnum.gradients.diagnose.detective import detective
-
-        why = ""
-        with suppress(InputError):
-            blamed = detective((problem.parts or (problem,))[0], names, saltation=False)
-            inputs = ", ".join(f"{one:.3g}" for one in blamed.inputs)
-            if blamed.operation:
-                why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
-        what = "the loss" if not np.isfinite(found.value) else f"the gradient by {', '.join(bad)}"
-        raise NumericalError(f"{what} is not finite{why}", where=found.method, remedy="Mend that operation")
-    return found
-
-
-def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Values by full name.
-
-    Raises:
-        InputError: a name that is not differentiated by.
-    """
-    out = {}
-    for word, value in values.items():
-        (name,) = parameters.resolve(problem.simulation, [word])
-        if name not in full:
-            raise InputError(
-                f"a value for {word}, which the gradient was not asked for",
-                remedy=f"Name it among the parameters; they are {', '.join(full)}",
-            )
-        out[name] = np.asarray(value)
-    return out

@@ -32,8 +32,7 @@ from mdnum.rollout.summary import (
 )
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
-from mdnum.systems.build import build
-from mdnum.systems.describe import again
+from mdnum.systems.build import again, build
 from mdnum.systems.evaluate import evaluate_listed
 from mdnum.systems.load import System
 from mdnum.systems.simulation import Simulation

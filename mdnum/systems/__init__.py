@@ -5,42 +5,34 @@ Importing this package imports neither jax nor jax_md; `build` and `Simulation` 
 
 from __future__ import annotations
 
-import importlib
 import sys
+from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from mdnum.lazy import on_first_use
 from mdnum.systems.ball import BallSpec
-from mdnum.systems.load import BallSystem, System, copy, load, names, shipped_folder
+from mdnum.systems.load import BallSystem, Named, System, copy, load, names, shipped_folder, world_of
 from mdnum.systems.schema import SystemSpec
 
 if TYPE_CHECKING:
+    from mdnum.systems.build import build as build
+    from mdnum.systems.build_ball import BallSimulation as BallSimulation
+    from mdnum.systems.build_ball import build_ball as build_ball
+    from mdnum.systems.simulation import Simulation as Simulation
+
+
+def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
+    """What a verb of both worlds works with: a simulation, or the system of a ball; arguments as for `load`.
+
+    Raises:
+        InputError: anything that cannot be run, in one line.
+    """
+    if world_of(system) == "ball":
+        return load(system, overrides)  # type: ignore[arg-type]
     from mdnum.systems.build import build
-    from mdnum.systems.build_ball import BallSimulation, build_ball
-    from mdnum.systems.simulation import Simulation
 
-__all__ = [
-    "BallSimulation",
-    "BallSpec",
-    "BallSystem",
-    "Simulation",
-    "System",
-    "SystemSpec",
-    "build",
-    "build_ball",
-    "copy",
-    "load",
-    "names",
-    "shipped_folder",
-]
-
-
-_LATER = {
-    "build": "mdnum.systems.build",
-    "Simulation": "mdnum.systems.simulation",
-    "build_ball": "mdnum.systems.build_ball",
-    "BallSimulation": "mdnum.systems.build_ball",
-}
+    return build(system, overrides)  # type: ignore[arg-type]
 
 
 class _Package(ModuleType):
@@ -54,10 +46,15 @@ class _Package(ModuleType):
 
 
 sys.modules[__name__].__class__ = _Package
-
-
-def __getattr__(name: str) -> Any:
-    home = _LATER.get(name)
-    if home is not None:
-        return getattr(importlib.import_module(home), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = on_first_use(__name__)
+__all__ += [
+    "BallSpec",
+    "BallSystem",
+    "System",
+    "SystemSpec",
+    "copy",
+    "load",
+    "names",
+    "opened",
+    "shipped_folder",
+]

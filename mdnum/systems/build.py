@@ -17,15 +17,21 @@ from mdnum.md.neighbors import RebuildRule
 from mdnum.md.potentials import POTENTIALS, Channels, PairFunction
 from mdnum.numerics import PrecisionPolicy
 from mdnum.numerics.reductions import REDUCTIONS
+from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE
+from mdnum.store.folder import system_tables
 from mdnum.systems import code, pairs, schema
 from mdnum.systems.construct import assembled, cut, weights
-from mdnum.systems.load import System, load
+from mdnum.systems.describe import described
+from mdnum.systems.load import GIVE_OBJECTS, System, load
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import species_of
+from mdnum.systems.toml import flat
 
 if TYPE_CHECKING:
     from ase import Atoms
 
+#: Of a description, what says nothing about what is computed.
+_ASKED = ("name", "about", "dynamics.steps", "record.save_every")
 _CHANGE_OBJECTS = "Change the objects: mdnum.changed(simulation, {...})"
 
 
@@ -150,3 +156,32 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
         dynamics.steps,
         spec.record.save_every,
     )
+
+
+def again(folder: Path, given: Simulation | None = None) -> Simulation:
+    """The simulation that ran in a folder.
+
+    Args:
+        given: needed where it was made of objects, of which a folder holds only what they were.
+
+    Raises:
+        InputError: it is needed, not needed, or another one than ran there.
+    """
+    if not (folder / SIMULATION_FILE).is_file():
+        if given is not None:
+            message = "this run came from a system file and keeps it"
+            raise InputError(message, where=str(folder), remedy="Leave the simulation out")
+        return build(load(folder / SYSTEM_FILE))
+    if given is None:
+        load(folder)
+    assert given is not None
+    there, here = (flat(tables) for tables in (system_tables(folder / SIMULATION_FILE), described(given)))
+    keys = [key for key in dict.fromkeys((*there, *here)) if key not in _ASKED]
+    other = [key for key in keys if there.get(key) != here.get(key)]
+    if other:
+        seen = f"{other[0]} was {there.get(other[0])!r} and is {here.get(other[0])!r}"
+        more = f", and so on: {', '.join(other[1:5])}" * (len(other) > 1)
+        raise InputError(
+            f"this is not the simulation that ran there: {seen}{more}", where=str(folder), remedy=GIVE_OBJECTS
+        )
+    return given

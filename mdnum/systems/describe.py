@@ -10,26 +10,21 @@ import inspect
 import json
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
 
-from mdnum.errors import InputError
 from mdnum.md.manybody import leaves_by_path
 from mdnum.md.potentials import CutPotential
 from mdnum.numerics.reductions import BY_NAME
-from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, write_text
-from mdnum.store.folder import system_tables
-from mdnum.systems.build import build
-from mdnum.systems.load import GIVE_OBJECTS, STRUCTURE_FILE, load
+from mdnum.store.files import SIMULATION_FILE, write_text
+from mdnum.systems.load import STRUCTURE_FILE
 from mdnum.systems.schema import pair_names
-from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import to_extxyz
-from mdnum.systems.toml import flat
 
-#: Of a description, what says nothing about what is computed.
-_ASKED = ("name", "about", "dynamics.steps", "record.save_every")
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 
 def program(simulation: Simulation) -> dict[str, Any]:
@@ -83,35 +78,6 @@ def write(simulation: Simulation, folder: Path) -> None:
     write_text(folder / STRUCTURE_FILE, to_extxyz(atoms))
     text = json.dumps(described(simulation), indent=1, ensure_ascii=False)
     write_text(folder / SIMULATION_FILE, text + "\n")
-
-
-def again(folder: Path, given: Simulation | None = None) -> Simulation:
-    """The simulation that ran in a folder.
-
-    Args:
-        given: needed where it was made of objects, of which a folder holds only what they were.
-
-    Raises:
-        InputError: it is needed, not needed, or another one than ran there.
-    """
-    if not (folder / SIMULATION_FILE).is_file():
-        if given is not None:
-            message = "this run came from a system file and keeps it"
-            raise InputError(message, where=str(folder), remedy="Leave the simulation out")
-        return build(load(folder / SYSTEM_FILE))
-    if given is None:
-        load(folder)
-    assert given is not None
-    there, here = (flat(tables) for tables in (system_tables(folder / SIMULATION_FILE), described(given)))
-    keys = [key for key in dict.fromkeys((*there, *here)) if key not in _ASKED]
-    other = [key for key in keys if there.get(key) != here.get(key)]
-    if other:
-        seen = f"{other[0]} was {there.get(other[0])!r} and is {here.get(other[0])!r}"
-        more = f", and so on: {', '.join(other[1:5])}" * (len(other) > 1)
-        raise InputError(
-            f"this is not the simulation that ran there: {seen}{more}", where=str(folder), remedy=GIVE_OBJECTS
-        )
-    return given
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,7 +18,9 @@ from mdnum.md.decide import Tables
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.numerics import check_not_forked
-from mdnum.systems.simulation import Simulation
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 
 @dataclass(frozen=True)

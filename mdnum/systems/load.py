@@ -23,7 +23,6 @@ from mdnum.systems.toml import Source, apply_overrides, checked, read_overrides
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.systems.simulation import Simulation
 
 STRUCTURE_FILE = "structure.extxyz"
 #: Of a system file: words, what is hashed by itself, and what is asked about the run.
@@ -441,19 +440,6 @@ def load(
     root.follow(data, values)
     spec = checked(root, data, source)
     return _ball(spec, source) if isinstance(spec, BallSpec) else _md(spec, source)
-
-
-def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
-    """What a verb of both worlds works with: a simulation, or the system of a ball; arguments as for `load`.
-
-    Raises:
-        InputError: anything that cannot be run, in one line.
-    """
-    if world_of(system) == "ball":
-        return load(system, overrides)  # type: ignore[arg-type]
-    from mdnum.systems.build import build
-
-    return build(system, overrides)  # type: ignore[arg-type]
 
 
 def _check_world(name: str | Path, is_ball: bool, world: str | None) -> None:

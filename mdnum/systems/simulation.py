@@ -24,6 +24,8 @@ from mdnum.md.pairforce import ChannelForce, ManyBodyForce, PairForce
 from mdnum.md.potentials import Channels, CutPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
 from mdnum.numerics.roles import LATTICE, WIDE
+from mdnum.systems import describe
+from mdnum.systems.evaluate import Evaluation, Evaluator
 from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.structures import Draw
 from mdnum.units import Units
@@ -31,7 +33,6 @@ from mdnum.units import Units
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.systems.evaluate import Evaluation
     from mdnum.systems.load import System
 
 
@@ -197,15 +198,11 @@ class Simulation:
     @property
     def program(self) -> dict[str, Any]:
         """Every number and choice but the structure, plain values: what is hashed."""
-        from mdnum.systems.describe import program
-
-        return self.file.program if self.file is not None else program(self)
+        return self.file.program if self.file is not None else describe.program(self)
 
     def write(self, folder: str | Path) -> None:
         """Write what it is into a folder: its file and structure, or the objects' description."""
-        from mdnum.systems.describe import write
-
-        write(self, Path(folder))
+        describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
         """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
@@ -357,8 +354,6 @@ class Simulation:
         stress: bool = True,
     ) -> Evaluation:
         """`Evaluator.__call__` for one configuration, with a list of its own."""
-        from mdnum.systems.evaluate import Evaluator
-
         return Evaluator(self, skin=0.0)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
@@ -371,8 +366,6 @@ class Simulation:
             energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
             type and largest of all, length², `pair`: bare energies at the smallest; 0 for none.
         """
-        from mdnum.systems.evaluate import Evaluator
-
         return Evaluator(self, skin=0.0).numbers(positions)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

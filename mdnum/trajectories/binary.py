@@ -23,7 +23,7 @@ import numpy as np
 from mdnum.compiled import njit
 from mdnum.reading import reading
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.topology import NARROWED, box_of, file_of
+from mdnum.trajectories.topology import NARROWED, Topology, box_of, file_of
 from mdnum.trajectories.trajectory import Trajectory
 
 # magic number, and bytes of the length of the stream: files with more than 2^31 bytes a frame have another
@@ -276,7 +276,7 @@ class XtcTrajectory(Trajectory):
     notes = (NARROWED,)
     _file: type[Any] = XtcFile
 
-    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+    def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
         with reading(path, by="mdnum"), closing(self._file(path)) as file:
             atoms, self.bits = file.atoms, file.bits

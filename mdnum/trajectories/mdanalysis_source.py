@@ -30,11 +30,11 @@ from mdnum.trajectories.topology import (
     NARROWED,
     AtomTable,
     Boxes,
+    Topology,
     atoms_in,
     box_of,
     file_of,
     formats_of,
-    read_topology,
 )
 from mdnum.trajectories.trajectory import Trajectory
 
@@ -139,7 +139,7 @@ class MDAnalysisTrajectory(Trajectory):
     reader = "MDAnalysis"
     bits = 32
 
-    def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
+    def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str | None = None):
         super().__init__(path, topology, frames)
         with reading(path):
             self.universe, said = self._universe_of(format)
@@ -171,7 +171,7 @@ class MDAnalysisTrajectory(Trajectory):
                 check_claim(path, atoms_in(path, format=format) or 0)
                 universe = MDAnalysis.Universe(str(path), format=format)
             else:
-                self.table, universe = read_topology(self.topology)
+                self.table, universe = self.topology.read()
                 atoms = len(universe.atoms)
                 other = atoms_in(path, atoms, format)
                 check_claim(path, other or 0)
@@ -412,7 +412,7 @@ class NetcdfTrajectory(Trajectory):
 
     format = "NCDF"
 
-    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+    def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
         file = netcdf_of(path)
         atoms = 0 if file is None else file.dimensions.get("atom")

@@ -33,7 +33,7 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.reading import ase_images, ignored_velocities, reading, whole_text, with_elements
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.topology import AtomTable, topology_universe
+from mdnum.trajectories.topology import AtomTable, Topology, topology_universe
 from mdnum.trajectories.trajectory import Trajectory
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
@@ -89,7 +89,7 @@ def _ids(atoms: Any) -> np.ndarray | None:
 class AseTrajectory(AseFrames):
     """A file that `ase.io` reads, frame by frame where its format allows that."""
 
-    def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str):
+    def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
         self.format = format
         try:
@@ -201,7 +201,7 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 class TextTrajectory(Trajectory):
     """A text file of frames. A reader of a format says where a block ends and what is in it."""
 
-    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+    def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
         block = self.first()
         with self._reading(0):

@@ -120,24 +120,29 @@ class AtomTable:
             universe.add_TopologyAttr("elements", self.species)
 
 
-def read_topology(topology: str | Path) -> tuple[AtomTable, Any]:
-    """The atoms of a file, and a Universe of them without coordinates: of a topology, or any structure.
+@dataclass(frozen=True)
+class Topology:
+    """A file that says what atoms are: one that MDAnalysis takes for a topology, or any structure."""
 
-    Raises:
-        InputError: nobody reads it.
-    """
-    from mdnum.trajectories.trajectory import open_trajectory
+    path: Path
+    otherwise: Callable[[Path], AtomTable]  # the atoms of a file that MDAnalysis does not read
 
-    try:
-        universe = topology_universe(topology)
-        return AtomTable.of(universe.atoms), universe
-    except InputError as refused:
+    def read(self) -> tuple[AtomTable, Any]:
+        """The atoms of the file, and a Universe of them without coordinates.
+
+        Raises:
+            InputError: nobody reads it.
+        """
         try:
-            table = open_trajectory(topology).table
-        except InputError:
-            # MDAnalysis knows most of the formats, and says more of them
-            raise refused from None
-        return table, table.universe()
+            universe = topology_universe(self.path)
+            return AtomTable.of(universe.atoms), universe
+        except InputError as refused:
+            try:
+                table = self.otherwise(self.path)
+            except InputError:
+                # MDAnalysis knows most of the formats, and says more of them
+                raise refused from None
+            return table, table.universe()
 
 
 def topology_universe(topology: str | Path) -> Any:

@@ -94,8 +94,8 @@ def flips(
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.lost import FrameMotion
+    from mdnum.trajectories.readers import open_trajectory
     from mdnum.trajectories.resolution import grid_effect, infer
-    from mdnum.trajectories.trajectory import open_trajectory
 
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
@@ -227,7 +227,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
     """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
-    from mdnum.trajectories.trajectory import IN_MEMORY, open_trajectory
+    from mdnum.trajectories.readers import IN_MEMORY, open_trajectory
 
     for one in (first, second):
         expect_path(one, IN_MEMORY)

@@ -30,7 +30,7 @@ TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     """Indices of the atoms on either side."""
-    from mdnum.trajectories.trajectory import select
+    from mdnum.trajectories.selection import select
 
     first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
     return first, second

@@ -86,8 +86,7 @@ def fork(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
-    from mdnum.systems import BallSystem
-    from mdnum.systems.load import opened
+    from mdnum.systems import BallSystem, opened
 
     loaded = opened(system, keep.pop("overrides", None))
     own = _asked_by_default(loaded)
@@ -148,7 +147,7 @@ def fork_screen(
         its result is a list of `mdnum.forks.pair.Screened`.
     """
     from mdnum.forks.pair import screen
-    from mdnum.systems.load import opened
+    from mdnum.systems import opened
 
     loaded = opened(system, keep.get("overrides"))
     steps = _asked_by_default(loaded).get("steps") if steps is None else steps

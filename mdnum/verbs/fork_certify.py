@@ -64,8 +64,7 @@ def fork_certify(
     """
     from mdnum.forks.exact.certify import certify
     from mdnum.forks.exact.program import unsupported
-    from mdnum.systems import BallSystem
-    from mdnum.systems.load import opened
+    from mdnum.systems import BallSystem, opened
 
     loaded = opened(system, keep.get("overrides"))
     last, ball = last_step(loaded, steps), isinstance(loaded, BallSystem)

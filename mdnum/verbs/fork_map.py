@@ -74,8 +74,7 @@ def fork_map(
     """
     from mdnum.forks.boundaries import boundaries, checked
     from mdnum.forks.worlds import program_of
-    from mdnum.systems import BallSystem
-    from mdnum.systems.load import opened
+    from mdnum.systems import BallSystem, opened
 
     loaded = opened(system, keep.get("overrides"))
     if isinstance(loaded, BallSystem):

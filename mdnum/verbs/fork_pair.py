@@ -80,8 +80,7 @@ def of_md(
     Raises:
         InputError: it is a ball, has a many-body potential, or is no system.
     """
-    from mdnum.systems import BallSystem
-    from mdnum.systems.load import opened
+    from mdnum.systems import BallSystem, opened
 
     loaded = opened(system, overrides)
     if isinstance(loaded, BallSystem):

@@ -19,7 +19,7 @@ from trajectories.files import water
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.trajectory import open_trajectory
+from mdnum.trajectories.readers import open_trajectory
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

@@ -26,7 +26,9 @@ from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.binary import XtcFile
 from mdnum.trajectories.frame import FrameError, UnreadableFrame
 from mdnum.trajectories.mdanalysis_source import netcdf_of
-from mdnum.trajectories.trajectory import Trajectory, open_trajectory, select
+from mdnum.trajectories.readers import open_trajectory
+from mdnum.trajectories.selection import select
+from mdnum.trajectories.trajectory import Trajectory
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

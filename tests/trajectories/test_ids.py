@@ -13,7 +13,7 @@ from ase import Atoms
 import mdnum
 from mdnum.reading import FrameError
 from mdnum.store import RunFolder
-from mdnum.trajectories.trajectory import open_trajectory
+from mdnum.trajectories.readers import open_trajectory
 
 DUMP = Path(__file__).with_name("data") / "exchanged_types.lammpstrj"
 

@@ -14,7 +14,7 @@ from other_package import install
 import mdnum
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.trajectories.trajectory import READERS, open_trajectory
+from mdnum.trajectories.readers import READERS, open_trajectory
 
 READER = '''
 from contextlib import contextmanager

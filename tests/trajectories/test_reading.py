@@ -26,9 +26,10 @@ from mdnum.errors import InputError
 from mdnum.reading import UnreadableFrame, ase_images, first_line, reading
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.readers import open_trajectory
 from mdnum.trajectories.rules import CutoffRule
+from mdnum.trajectories.selection import select
 from mdnum.trajectories.tracker import Tracker
-from mdnum.trajectories.trajectory import open_trajectory, select
 
 SIDE = 12.0
 

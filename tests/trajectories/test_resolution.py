@@ -15,10 +15,10 @@ from trajectories.liquid import CUTOFF, liquid, memberships, missed_and_invented
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.readers import open_trajectory
 from mdnum.trajectories.resolution import grid_effect, infer
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 from mdnum.trajectories.tracker import Tracker
-from mdnum.trajectories.trajectory import open_trajectory
 
 # a liquid at every step takes longer to run than all the rest
 STRIDES = pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.nightly), 4])

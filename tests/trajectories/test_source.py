@@ -15,7 +15,9 @@ from MDAnalysisTests import datafiles
 from trajectories.files import arrays_held, universe_of, water
 
 from mdnum.errors import InputError
-from mdnum.trajectories.trajectory import chosen, open_trajectory, parse_slice, select, split_path
+from mdnum.trajectories.readers import open_trajectory, parse_slice, split_path
+from mdnum.trajectories.selection import select
+from mdnum.trajectories.trajectory import chosen
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

@@ -18,8 +18,8 @@ from ase.md.verlet import VelocityVerlet
 import mdnum
 from mdnum.store import RunFolder
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.readers import open_trajectory
 from mdnum.trajectories.separation import common_shift, displacements, growth
-from mdnum.trajectories.trajectory import open_trajectory
 from mdnum.verbs.frame import Outcome
 
 DATA = Path(__file__).parents[1] / "trajectories" / "data"

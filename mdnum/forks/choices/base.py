@@ -13,8 +13,8 @@ from mdnum.forks.worlds import changes, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry, nearest
-from mdnum.systems import BallSystem, System
-from mdnum.systems.load import opened, world_of
+from mdnum.systems import BallSystem, System, opened
+from mdnum.systems.load import world_of
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation

@@ -13,8 +13,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.program import Decision, Program
-from mdnum.systems import BallSystem
-from mdnum.systems.load import opened
+from mdnum.systems import BallSystem, opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation

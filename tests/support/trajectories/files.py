@@ -14,7 +14,7 @@ from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import FrameCheck
-from mdnum.trajectories.trajectory import open_trajectory
+from mdnum.trajectories.readers import open_trajectory
 
 SIDE = 9.0
 

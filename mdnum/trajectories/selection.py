@@ -1,0 +1,86 @@
+"""Atoms by words, in MDAnalysis's selection language, whoever reads the file."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from mdnum.errors import InputError
+from mdnum.reading import first_line
+from mdnum.trajectories.topology import AtomTable
+from mdnum.trajectories.trajectory import Trajectory
+
+_LANGUAGE = (
+    'Write it as MDAnalysis does: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
+)
+_SHOWN = 8
+
+
+def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
+    """Indices of the atoms that words name at the first frame asked for, ascending.
+
+    A selection that depends on where atoms are ("around 5 protein") is made once, there.
+
+    Raises:
+        InputError: the words are no selection, name no atom, or need what the file does not tell.
+    """
+    from MDAnalysis.exceptions import NoDataError, SelectionError
+
+    table, where = trajectory.table, str(trajectory.path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        universe = _universe(trajectory)
+        try:
+            found = universe.select_atoms(words)
+        except (NoDataError, AttributeError) as error:
+            message = f"the selection {words!r} asks for what the file does not tell ({first_line(error)})"
+            remedy = "Give a topology that has it with -s TOPOLOGY, or select by index"
+            raise InputError(message, remedy=remedy, where=where) from error
+        except (SelectionError, ValueError, TypeError) as error:
+            message = f"{words!r} is no selection ({first_line(error)})"
+            raise InputError(message, remedy=_LANGUAGE, where=where) from error
+    if len(found) == 0:
+        raise InputError(
+            f"the selection {words!r} names no atom of {trajectory.atoms:,}; {_there_are(table)}",
+            remedy=_LANGUAGE if table.named else "Give a topology with -s TOPOLOGY",
+            where=where,
+        )
+    return np.asarray(found.indices, np.int64)
+
+
+def _universe(trajectory: Trajectory) -> Any:
+    """A Universe that stands at the first frame asked for. Distances in a selection are float32."""
+    from MDAnalysis.lib.mdamath import triclinic_box
+
+    first = next(iter(trajectory.frames()), None)
+    if first is None:
+        raise InputError(
+            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+        )
+    if trajectory.universe is not None:
+        # `frames` has left the Universe there
+        return trajectory.universe
+    if trajectory.topology is not None:
+        table, universe = trajectory.topology.read()
+        table.give_elements(universe)
+    else:
+        universe = trajectory.table.universe()
+    box = triclinic_box(*first.box.matrix) if first.box.pbc.all() else np.zeros(6, np.float32)
+    universe.load_new(first.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
+    return universe
+
+
+def _there_are(table: AtomTable) -> str:
+    """What could have been named."""
+    if not table.named:
+        return "the file has no names of atoms"
+    words = []
+    for kind, values in (("names", table.names), ("residues", table.residue_names)):
+        known, counts = np.unique(values.astype(str), return_counts=True)
+        ordered = [str(one) for one in known[np.argsort(-counts, kind="stable")] if one]
+        if ordered:
+            words.append(f"{kind} {', '.join(ordered[:_SHOWN])}{', ...' if len(ordered) > _SHOWN else ''}")
+    return "there are " + "; ".join(words)
