@@ -51,7 +51,7 @@ def test_import_contracts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_no_module_imports_itself_through_others():
-    """Imports inside functions count; those for type checkers alone do not. Only commands import the package."""
+    """Those inside functions count, those for type checkers do not. Only commands import the package."""
     graph = grimp.build_graph("mdnum", exclude_type_checking_imports=True, cache_dir=None)
 
     def in_order() -> list[str]:
