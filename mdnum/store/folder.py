@@ -199,6 +199,10 @@ class RunFolder:
         """
         self._stream(table).append(columns)
 
+    def look_up(self, table: str, of: str, columns: Mapping[str, Any]) -> None:
+        """Adds columns that follow from one of indices (see `TableStream.look_up`)."""
+        self._stream(table).look_up(of, columns)
+
     def append_frame(self, atoms: Atoms) -> None:
         """Adds a frame to trajectory.traj, float64 bit for bit."""
         self._frames.append(atoms)

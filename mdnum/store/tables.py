@@ -186,6 +186,19 @@ class TableStream:
         if self._buffered >= _BUFFER_ROWS:
             self.flush()
 
+    def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
+        """Adds columns that follow from one of indices, before the first row; made when the table is written.
+
+        Args:
+            of: the column of indices.
+            columns: what belongs to each index, by name.
+        """
+        for name, values in columns.items():
+            kind = _TYPES.get(name, pa.float64())
+            self._known = MappingProxyType({**self._known, name: kind})
+            found = as_arrow(values, kind, len(values))
+            self._usual[name] = lambda table, found=found: found.take(table[of])
+
     def flush(self) -> None:
         """Writes what is in memory as one part file, or hands it to the thread that writes the table."""
         if not self._buffered:
@@ -305,8 +318,10 @@ class TableStream:
         names = columns or [*known, *(name for name in there if name not in self._known)]
         if names == there:
             return table
-        rows, kinds = len(table), self._known
-        made = {name: as_arrow(self._usual[name], kinds[name], rows) for name in names if name not in there}
+        rows, made = len(table), {}
+        for name in (name for name in names if name not in there):
+            value = self._usual[name]
+            made[name] = value(table) if callable(value) else as_arrow(value, self._known[name], rows)
         return pa.table({name: made[name] if name in made else table[name] for name in names})
 
     def _row_count(self, path: Path) -> int:

@@ -62,7 +62,8 @@ class AseFrames(Trajectory):
         if names := ignored_velocities(first.arrays):
             self.notes += (_NOT_READ.format(", ".join(f"“{name}”" for name in names), _MOMENTA),)
         order = np.arange(len(first)) if _ids(first) is None else np.argsort(first.arrays["id"])
-        return AtomTable.plain(_SYMBOLS[first.numbers[order]].tolist())
+        arrays = {name: values[order] for name, values in first.arrays.items()}
+        return AtomTable.plain(_SYMBOLS[first.numbers[order]].tolist(), arrays=arrays)
 
     def decoded(self, number: int, raw: Any) -> Frame:
         atoms = self._atoms_of(raw)

@@ -16,10 +16,11 @@ one's, though it is the next one's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +34,13 @@ from mdnum.trajectories.frame import Box
 NARROWED = "MDAnalysis hands every coordinate over in float32, whatever the file stores."
 
 _UNNAMED = "The file says how many atoms there are and nothing else; names and elements need a topology."
+# MDAnalysis's name for the one segment of a file that names none
+_NO_SEGMENT = "SYSTEM"
+# names of columns in files that ASE reads, its own first
+_ARRAYS = {
+    "names": "atomtypes atom_names atom_name names name", "resnames": "residuenames resnames resname",
+    "resids": "residuenumbers resids resid", "segids": "segids segid chainids chainid chain",
+}  # fmt: skip
 _GUESSED = "Elements are guessed from the names of the atoms."
 _ONCE = "The file gives a box once, before its first model: it is taken for all frames."
 _PDB = frozenset({"PDB", "ENT", "XPDB"})
@@ -54,6 +62,7 @@ class AtomTable:
     residue_names: np.ndarray  # "" where there are none
     residue_ids: Int[np.ndarray, "atoms"]  # number as the file has it; 0 where there are none
     residues: Int[np.ndarray, "atoms"]  # index from 0, different for two residues of one number
+    segments: np.ndarray  # names of segments, else of chains; "" where there are none
     named: bool = True  # False where the file says nothing of its atoms but their number
     guessed: bool = False  # whether the species were guessed from names
 
@@ -65,11 +74,41 @@ class AtomTable:
         """What a reader of results should know of how the atoms are named."""
         return (_UNNAMED,) if not self.named else (_GUESSED,) if self.guessed else ()
 
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Names and numbers by the names of columns, an entry an atom; without those that no atom has."""
+        numbered = any(self.residue_names) or self.residues.any()
+        every = {
+            "atom_name": self.names if self.named else (), "residue_name": self.residue_names,
+            "residue_number": self.residue_ids if numbered else (), "segment": self.segments,
+        }  # fmt: skip
+        return {name: np.asarray(values) for name, values in every.items() if any(values)}
+
     @classmethod
-    def plain(cls, species: list[str], named: bool = True) -> AtomTable:
-        """Atoms that have a species and belong to no residue."""
+    def plain(
+        cls, species: list[str], named: bool = True, arrays: Mapping[str, np.ndarray] = MappingProxyType({})
+    ) -> AtomTable:
+        """Atoms of some species.
+
+        Args:
+            named: whether the file says which.
+            arrays: further columns of a file, by the names that ASE or others give them; of these, names of
+                atoms, residues and segments and numbers of residues are kept.
+        """
         words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
-        return cls(words, words, np.full(len(species), "", dtype=object), none, none, named)
+
+        def column(part: str, otherwise: np.ndarray, kinds: str = "UOSiu") -> np.ndarray:
+            found = (np.asarray(arrays[name]) for name in _ARRAYS[part].split() if name in arrays)
+            values = next((one for one in found if one.ndim == 1 and one.dtype.kind in kinds), otherwise)
+            return values.astype(np.int64) if kinds == "iu" else np.array(list(map(str, values)), object)
+
+        blank = np.full(len(species), "", dtype=object)
+        names, residues, segments = (column(kind, blank) for kind in ("names", "resnames", "segids"))
+        numbers = column("resids", none, "iu")
+        # a residue ends where the next atom is of another name, number or segment, as MDAnalysis has it
+        parts = [values[1:] != values[:-1] for values in (residues, numbers, segments)]
+        index = np.cumsum([0, *np.any(parts, axis=0)])[: len(words)]
+        return cls(names if any(names) else words, words, residues, numbers, index, segments, named)
 
     @classmethod
     def of(cls, atoms: Any) -> AtomTable:
@@ -95,10 +134,12 @@ class AtomTable:
             guessed = any(found.values())
         elif not all(elements):
             elements = types
+        segments, blank = column("segids", ""), np.full(len(atoms), "", object)
         return cls(
             names=names if known[0] else elements, species=elements, residue_names=column("resnames", ""),
             residue_ids=np.array(getattr(atoms, "resids", np.zeros(len(atoms))), np.int64),
             residues=np.array(atoms.resindices, np.int64), named=any(known), guessed=guessed,
+            segments=blank if set(segments) == {_NO_SEGMENT} else segments,
         )  # fmt: skip
 
     def universe(self) -> Any:
@@ -106,10 +147,14 @@ class AtomTable:
         from MDAnalysis import Universe
 
         at = np.unique(self.residues, return_index=True)[1]
-        universe = Universe.empty(len(self), n_residues=len(at), atom_resindex=self.residues)
+        segments, of = np.unique(self.segments[at].astype(str), return_inverse=True)
+        universe = Universe.empty(
+            len(self), n_residues=len(at), atom_resindex=self.residues, n_segments=len(segments),
+            residue_segindex=of,
+        )  # fmt: skip
         for name, values in (
             ("names", self.names), ("types", self.species), ("elements", self.species),
-            ("resnames", self.residue_names[at]), ("resids", self.residue_ids[at]),
+            ("resnames", self.residue_names[at]), ("resids", self.residue_ids[at]), ("segids", segments),
         ):  # fmt: skip
             universe.add_TopologyAttr(name, values)
         return universe

@@ -119,6 +119,9 @@ def flips(
     found, began = next(passes), time.perf_counter()
     with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
         folder, log = answer.folder, answer.log
+        atoms = opened.table.columns
+        for end in "ij":
+            folder.look_up("flips", end, {f"{name}_{end}": values for name, values in atoms.items()})
         interrupted = rows.drain(folder, passes, found, opened.count or 0, log)
         read = time.perf_counter()
         frames = folder.read("frames")
