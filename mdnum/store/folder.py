@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -14,12 +15,14 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 import pyarrow as pa
 
+from mdnum import units
 from mdnum.errors import FolderError, MdnumError, expect_path
 from mdnum.plain import plain
 from mdnum.store import checkpoint
@@ -56,6 +59,7 @@ _NOTHING_YET = (
     SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK,
     "parts",
 )  # fmt: skip
+_QUANTITIES = ("length", "energy", "mass", "time", "temperature", "pressure")
 _RESTORE = "Restore it from a copy, or run again in a new folder"
 # what values of another kind or form than those that were written lead to
 _OF_WRONG_VALUES = (
@@ -118,6 +122,8 @@ class RunFolder:
         self._asked: float | None = None
         # the state that came too soon after the last checkpoint, and the rows there were then
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
+        # what the schemas of its tables say beside what its own files do: `system`, and further `units`
+        self.told: dict[str, Any] = {}
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], overwrite: bool = False, world: str = "md") -> RunFolder:
@@ -456,6 +462,27 @@ class RunFolder:
         file = self.system_file
         return {} if file is None else system_tables(file)
 
+    @cached_property
+    def about(self) -> dict[str, Any]:
+        """What the schemas of its tables say: version, kind, system, run (a digest) and units by quantity.
+
+        Nothing in it depends on when it is asked, so that a run has the same bytes however it was cut.
+        """
+        made, system = self._read_json("provenance.json"), self.system
+        named = system.get("units") or system.get("world")
+        known = vars(units.get(str(named))) if named else {}
+        names = {name: known[name] for name in _QUANTITIES if name in known}
+        if named and named != "ball":
+            squared = '"compare": "r2' in json.dumps(system)
+            names["decision"] = f"{names['length']}²" if squared else names["length"]
+        run = json.dumps([made.get("hashes"), made.get("fingerprint")], sort_keys=True)
+        return {
+            "version": str(made.get("versions", {}).get("mdnum") or ""), "kind": self.world,
+            "system": str(self.told.get("system") or made.get("system") or ""),
+            "run": hashlib.sha256(run.encode()).hexdigest() if made.get("hashes") else "",
+            "units": {**names, **self.told.get("units", {})},
+        }  # fmt: skip
+
     @property
     def summary(self) -> dict[str, Any]:
         """summary.json; empty if the run has not come that far."""
@@ -557,7 +584,7 @@ class RunFolder:
 
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:
-            self._streams[name] = TableStream(self.path, name, self.world)
+            self._streams[name] = TableStream(self.path, name, self.world, about=lambda: self.about)
         return self._streams[name]
 
     def _reader(self, name: str) -> TableStream:

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from mdnum.errors import FolderError
 from mdnum.plain import beside
 from mdnum.store import files as manifest
+from mdnum.store.columns import described
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
 _DECLARED = beside(__file__)
@@ -93,12 +94,17 @@ class TableStream:
     leaves a folder whose rows cannot be told apart, wherever it was killed.
     """
 
-    def __init__(self, root: Path, name: str, world: str = "md", check: Callable[[Path], None] | None = None):
+    def __init__(
+        self, root: Path, name: str, world: str = "md", check: Callable[[Path], None] | None = None,
+        about: Callable[[], Mapping[str, Any]] | None = None,
+    ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
             raise FolderError(f"no table is called {name!r}", where=str(root))
         self.name = name
         self._root = root
         self._check = check
+        # what the merged file says of its folder (see `columns.described`)
+        self._about = about
         #: digests of the part files that were written, by name
         self.written: dict[str, list[str]] = {}
         self._known = columns_of(world, name)
@@ -309,7 +315,10 @@ class TableStream:
 
     def _write_merged(self, tables: Iterator[pa.Table]) -> None:
         groups = map(self._whole, _regroup(tables, _GROUP_ROWS, self._whole))
-        self._replace(self.merged_path, groups, cast(pa.Schema, self._schema))
+        schema = cast(pa.Schema, self._schema)
+        about = None if self._about is None else self._about()
+        schema = schema.remove_metadata() if about is None else described(schema, self.name, about)
+        self._replace(self.merged_path, groups, schema)
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows with the columns that they leave out, in order; all columns where none are named."""

@@ -156,6 +156,8 @@ def _ask_all(
     from mdnum.audit.thresholds import find_thresholds
     from mdnum.deadline import interrupting
 
+    quantities = {name: getattr(loaded.units, name) for name in ("length", "energy", "mass")}
+    folder.told = {"system": loaded.name, "units": {**quantities, "decision": loaded.units.length}}
     answers = Answers(folder, state)
     answers.save()
     subject = CalculatorSubject(

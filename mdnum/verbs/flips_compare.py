@@ -16,7 +16,17 @@ from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, g
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.separation import velocities_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
-from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.flips_shared import (
+    FlipsView,
+    HeldRows,
+    about,
+    columns_about,
+    ending,
+    name_of,
+    resolution,
+    selected,
+    stem,
+)
 from mdnum.verbs.frame import Keep, Outcome, Verb, answering
 
 if TYPE_CHECKING:
@@ -69,6 +79,7 @@ def compare(
     found = next(passes)
     with answering("flips-compare", f"flips-{stem(a)}", **keep) as answer:
         folder, log = answer.folder, answer.log
+        folder.told = columns_about(a)
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
         interrupted = rows.drain(folder, passes, found, total, log)
         table = folder.read("apart")

@@ -58,6 +58,13 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
     }  # fmt: skip
 
 
+def columns_about(trajectory: Trajectory) -> dict[str, Any]:
+    """What the schemas of tables say of a file."""
+    length = trajectory.length
+    units = {"length": length, "decision": length, "time": trajectory.time}
+    return {"system": name_of(trajectory), "units": units}
+
+
 def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
     """What summary.json says of how the reading ended."""
     return {

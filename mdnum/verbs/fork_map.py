@@ -97,6 +97,7 @@ def fork_map(
             loaded, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
             progress=answer.log,
         )  # fmt: skip
+        answer.folder.told = {"units": {"parameter": spelled.unit, "loss": lost[1]}}
         edges, intervals = [_row(edge) for edge in found.boundaries], plain(found.intervals)
         at = np.searchsorted([one["low"] for one in intervals], found.at, side="right") - 1
         jumps = [abs(edge.jump) for edge in found.boundaries if np.isfinite(edge.jump)]

@@ -1,0 +1,59 @@
+"""What parquet files say of themselves: unit and description of every column, and which folder wrote them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from typing import Any
+
+import pyarrow as pa
+
+from mdnum.plain import beside
+
+_DECLARED: Mapping[str, Mapping[str, tuple[str, str]]] = beside(__file__)
+
+
+def meaning(table: str, column: str) -> tuple[str, str]:
+    """(unit in quantities, description) of a column; empty words where it is not declared."""
+    for declared in (_DECLARED.get(table, {}), _DECLARED["columns"]):
+        if found := declared.get(column):
+            return found
+        if pattern := next((one for one in declared if "*" in one and fnmatchcase(column, one)), None):
+            return declared[pattern]
+    return "", ""
+
+
+def unit(quantity: str, units: Mapping[str, str]) -> str:
+    """A unit made of quantities in those of a folder; empty where the folder does not have them all.
+
+    >>> unit("energy/length", {"energy": "eV", "length": "Å"})
+    'eV/Å'
+    """
+    words = re.findall(r"[a-z]{3,}", quantity)
+    missing = any(units.get(word) in ("", None) for word in words)
+    return "" if missing else re.sub(r"[a-z]{3,}", lambda word: units[word[0]], quantity)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def described(schema: pa.Schema, table: str, about: Mapping[str, Any]) -> pa.Schema:
+    """A schema with metadata of its folder, keys `mdnum.*`, and `unit` and `description` of its columns.
+
+    `mdnum.columns` has these once more, as JSON, for programs that read no metadata of columns.
+
+    Args:
+        about: version, kind, system, run and units of the folder; what is empty is left out.
+    """
+    fields, told = [], {}
+    for field in schema:
+        quantity, text = meaning(table, field.name)
+        held = {"unit": unit(quantity, about["units"]), "description": text}
+        told[field.name] = {key: word for key, word in held.items() if word}
+        fields.append(field.with_metadata(told[field.name]))
+    words = {key: value if isinstance(value, str) else _json(value) for key, value in about.items()}
+    words |= {"table": table, "columns": _json(told)}
+    return pa.schema(fields, {f"mdnum.{key}": word for key, word in words.items() if word})
