@@ -77,9 +77,12 @@ def test_hard_cutoffs_have_the_slopes_of_differences():
         other = liquid({"kind": "hard", "radius": radius})
         terms, details = BoundaryTerm().terms(other, seen, ("cutoff.radius",))
         near = [r[(r >= radius - h) & (r < radius + h)] for r in found]
-        slope = sum(lennard_jones(r).sum() for r in near) / (2 * h * len(seen) * simulation.atoms)
-        assert terms["cutoff.radius"].sum() == pytest.approx(slope, rel=0.01), radius
-        assert details["error"]["cutoff.radius"] < 0.03 * abs(slope)
+        energies, width = lennard_jones(np.concatenate(near)), 2 * h * len(seen) * simulation.atoms
+        slope, counting = energies.sum() / width, np.sqrt(np.square(energies).sum()) / width
+        # another version of jax has another run, and so another sample of pairs near the radius
+        error = details["error"]["cutoff.radius"]
+        assert terms["cutoff.radius"].sum() == pytest.approx(slope, abs=2 * np.hypot(error, counting)), radius
+        assert error < 0.03 * abs(slope)
 
 
 def integral(edge: float, radius: float, sigma=1.0, epsilon=1.0, kT=1.0) -> float:
