@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -10,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 
+@functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """The tables of the TOML file beside a module, which is given by its `__file__`."""
+    """The tables of the TOML file beside a module, which is given by its `__file__`; nobody changes them."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 

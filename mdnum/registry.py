@@ -70,7 +70,7 @@ class Registry(Generic[T]):
 
         Args:
             name: what people write.
-            value: the value, or "module:attribute" to import on first use.
+            value: the value, or "module:attribute", or a "module", to import on first use.
             description: one line; by default the value's `description` or the first line of its docstring.
         """
         if value is None:
@@ -108,6 +108,18 @@ class Registry(Generic[T]):
     def __contains__(self, name: object) -> bool:
         return name in self._own or name in self._added()
 
+    def place(self, name: str) -> str:
+        """The module of this name, of a registry of modules; nothing of it is imported.
+
+        Raises:
+            InputError: there is none.
+        """
+        if name in self._own:
+            return self._own[name]
+        if name not in self:
+            raise unknown(self.noun, name, self)
+        return self._added()[name].value
+
     def __getitem__(self, name: str) -> Any:
         """The value of this name.
 
@@ -118,7 +130,9 @@ class Registry(Generic[T]):
             value = self._own[name]
             if isinstance(value, str):
                 module, _, attribute = value.partition(":")
-                value = self._own[name] = getattr(importlib.import_module(module), attribute)
+                value = importlib.import_module(module)
+                if attribute:
+                    value = self._own[name] = getattr(value, attribute)
             return value
         point = self._added().get(name)
         if point is None:

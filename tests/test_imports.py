@@ -74,7 +74,7 @@ def test_importing_brings_in_neither_jax_nor_jax_md():
 def test_a_fork_of_a_ball_brings_in_no_molecular_dynamics():
     """Every module that it runs, those that are imported late included."""
     loaded = _modules_after(
-        "import mdnum.cli.fork, mdnum.verbs.fork_map, mdnum.verbs.fork_certify, mdnum.forks.choices\n"
+        "import mdnum.cli, mdnum.verbs.fork_map, mdnum.verbs.fork_certify, mdnum.forks.choices\n"
         "import mdnum.forks.boundaries, mdnum.forks.exact.certify, mdnum.forks.pair\n"
         "assert not [name for name in sys.modules if name.startswith(('mdnum.md', 'mdnum.rollout'))]\n"
     )

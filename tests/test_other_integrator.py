@@ -18,7 +18,7 @@ import pytest
 from gradient_problems import everything
 from nose_hoover import NoseHoover, PerAtom
 from other_package import install
-from rollout.harness import go, liquid, write_system
+from rollout.harness import go, liquid, run, write_system
 from rollout.test_resume import CHILD, assert_goes_on, assert_same
 from small_systems import LENNARD_JONES, crystal, make
 
@@ -28,7 +28,6 @@ from mdnum.gradients import Problem, method, parameters
 from mdnum.gradients.diagnose.growth import spectrum
 from mdnum.md.integrators import KickDrift, VelocityVerlet, quantity
 from mdnum.rollout.engine import Engine, first_state
-from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.build import build

@@ -16,9 +16,15 @@ from ase.io import read as ase_read
 
 from mdnum.errors import FolderError
 from mdnum.safe_path import environment, python
-from mdnum.store import COLUMNS, TABLES, RunFolder, columns_of, files, tables
+from mdnum.store import RunFolder, files, tables
 from mdnum.store import checkpoint as frames
+from mdnum.store import files as manifest
+from mdnum.verbs import VERBS, declared
+from mdnum.verbs.frame import layout
 
+MD = layout("md")
+#: Types of columns by table.
+COLUMNS = {name: {key: kind for key, (kind, _) in MD.columns(name).items()} for name in MD.tables}
 UNKNOWN = {"frame", "before", "margin_before"}
 
 
@@ -27,7 +33,7 @@ def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
     columns = {}
     for name, kind in COLUMNS["series"].items():
         # irrational values: every bit of a float is in use
-        columns[name] = np.sin(steps + len(name)) if str(kind) == "double" else steps * 3
+        columns[name] = np.sin(steps + len(name)) if kind == "float64" else steps * 3
     return columns | {"step": steps}
 
 
@@ -35,7 +41,7 @@ def flip_rows(start: int, stop: int) -> dict[str, np.ndarray]:
     steps = np.repeat(np.arange(start, stop), 3)
     columns = {}
     for name, kind in COLUMNS["flips"].items():
-        columns[name] = np.cos(steps * 0.1 + len(name)) if str(kind) == "double" else steps % 7
+        columns[name] = np.cos(steps * 0.1 + len(name)) if kind == "float64" else steps % 7
     known = columns | {"step": steps, "entered": steps % 2 == 0, "ambiguous": steps % 5 == 0}
     # what a run does not know, and a word that is that of all rows
     return {name: known[name] for name in known.keys() - UNKNOWN} | {"decided_by": "program"}
@@ -84,7 +90,7 @@ def no_waiting(monkeypatch):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A finished run, to be read."""
-    folder = RunFolder.create(tmp_path_factory.mktemp("store") / "whole")
+    folder = RunFolder.create(tmp_path_factory.mktemp("store") / "whole", MD)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         write_run(folder, 0, 480)
@@ -99,7 +105,9 @@ def test_what_is_appended_is_read_back_bit_for_bit(whole):
         for key, values in expected.items():
             np.testing.assert_array_equal(found[key], values, err_msg=key)
     table = pq.read_table(whole.path / "flips.parquet")
-    assert {field.name: field.type for field in table.schema} == dict(COLUMNS["flips"])
+    spelled = {"double": "float64", "dictionary<values=string, indices=int32, ordered=0>": "word"}
+    types = {field.name: spelled.get(str(field.type), str(field.type)) for field in table.schema}
+    assert types == COLUMNS["flips"]
     assert {name for name in table.column_names if table[name].null_count == len(table)} == UNKNOWN
     assert not (whole.path / "parts").exists()
     for step, atoms in enumerate(ase_read(whole.path / "trajectory.traj", index=":")):
@@ -114,7 +122,7 @@ def test_what_is_appended_is_read_back_bit_for_bit(whole):
 # ASE moves its offset table at frames 2 and 43
 @pytest.mark.parametrize(("kept", "finished"), [(10, False), (430, False), (300, True)])
 def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept, finished):
-    folder = RunFolder.create(tmp_path / "killed")
+    folder = RunFolder.create(tmp_path / "killed", MD)
     write_run(folder, 0, kept)
     if finished:
         folder.finalize()
@@ -143,7 +151,7 @@ def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept, finished):
 def test_a_run_killed_at_any_write_of_a_checkpoint_resumes_from_the_old_or_the_new_one(
     tmp_path, monkeypatch, when
 ):
-    folder = RunFolder.create(tmp_path / "killed")
+    folder = RunFolder.create(tmp_path / "killed", MD)
     write_run(folder, 0, 20)
     folder.append("series", series_rows(20, 30))
     name, replace, renamed = folder.path / "checkpoint.npz", os.replace, []
@@ -182,7 +190,7 @@ def test_a_run_killed_at_any_write_of_a_checkpoint_resumes_from_the_old_or_the_n
 
 
 def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
-    folder = RunFolder.create(tmp_path / "blown-up")
+    folder = RunFolder.create(tmp_path / "blown-up", MD)
     write_run(folder, 0, 100)
     folder.append("series", series_rows(100, 107))
     folder.finalize()
@@ -197,7 +205,7 @@ def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
     "killed_at", [*range(1, 7), 19, *(pytest.param(at, marks=pytest.mark.nightly) for at in range(7, 19))]
 )
 def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, killed_at):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     write_run(folder, 0, 60, chunk=20)
 
     class Killed(BaseException):
@@ -232,7 +240,7 @@ def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, 
 def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("mdnum.store.folder.time.monotonic", lambda: clock[0])
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     assert folder.checkpoint({"step": 0})
     folder.append("series", series_rows(0, 5))
     assert not folder.checkpoint({"step": 5})
@@ -252,7 +260,7 @@ def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path, monkey
 
 @pytest.mark.parametrize("then", [RunFolder.finalize, lambda folder: folder.checkpoint({}, force=True)])
 def test_what_goes_wrong_beside_a_run_is_raised_by_what_comes_next(tmp_path, monkeypatch, then):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     write_run(folder, 0, 30, chunk=30)
     folder.append("series", series_rows(30, 40))
 
@@ -270,7 +278,7 @@ def test_what_goes_wrong_beside_a_run_is_raised_by_what_comes_next(tmp_path, mon
 
 def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     folder.append("series", series_rows(0, 150))
     assert len(list((folder.path / "parts").iterdir())) == 1
     assert len(RunFolder.open(folder.path).read("series")["step"]) == 150
@@ -281,7 +289,7 @@ def test_a_table_that_nobody_resumes_is_written_as_it_grows(tmp_path, monkeypatc
     """Whole or not at all; of a disk that is full one is told while rows are appended, or at the end."""
     monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
     monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
-    folder = RunFolder.create(tmp_path / "ball", world="ball")
+    folder = RunFolder.create(tmp_path / "ball", layout("ball"))
     rows = {"step": np.arange(150), "ball": np.zeros(150), "y": np.linspace(0, 1, 150), "v": np.zeros(150)}
 
     def full(*_: object, **__: object) -> None:
@@ -313,7 +321,7 @@ def test_what_rows_leave_out_is_in_the_table(tmp_path):
     """Parts, which are read once more and removed, do not hold what every row has."""
     same = {"rule": np.broadcast_to(np.int32(0), 30), "rank": np.broadcast_to(np.int32(0), 30)}
     images = {"rank": np.arange(30) % 2, "decided_by": "positions"}
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     for start, more in ((0, same), (10, same | images), (20, same)):
         # with other columns in one part than in the next
         folder.append("flips", flip_rows(start, start + 10) | more)
@@ -333,7 +341,7 @@ def test_what_rows_leave_out_is_in_the_table(tmp_path):
 
 
 def test_a_run_of_an_earlier_version_is_read_and_resumed(tmp_path, whole):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     write_run(folder, 0, 300)
     folder.finalize()
     file, early = folder.path / "flips.parquet", UNKNOWN | {"rule", "rank", "decided_by"}
@@ -355,30 +363,35 @@ def test_a_run_of_an_earlier_version_is_read_and_resumed(tmp_path, whole):
 def test_row_groups_do_not_depend_on_the_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
     for name, chunk in (("a", 10), ("b", 50)):
-        folder = RunFolder.create(tmp_path / name)
+        folder = RunFolder.create(tmp_path / name, MD)
         write_run(folder, 0, 300, chunk=chunk)
         folder.finalize()
         assert pq.read_metadata(folder.path / "series.parquet").row_group(0).num_rows == 64
     assert (tmp_path / "a/series.parquet").read_bytes() == (tmp_path / "b/series.parquet").read_bytes()
 
 
-@pytest.mark.parametrize("world", list(TABLES))
-def test_empty_run_has_the_tables_of_its_world_with_columns(tmp_path, world):
-    folder = RunFolder.create(tmp_path / "run", world=world)
+KINDS = [kind for name in VERBS for kind in declared(name).get("kinds", ())]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_empty_folder_has_the_tables_of_its_kind_with_columns(tmp_path, kind):
+    held = layout(kind)
+    folder = RunFolder.create(tmp_path / "run", held)
     folder.checkpoint({"step": 0}, force=True)
     folder.finalize()
-    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
-    for name in TABLES[world]:
-        assert list(folder.read(name)) == list(columns_of(world, name))
+    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(held.always)
+    for name in held.always:
+        assert list(folder.read(name)) == list(held.columns(name))
     again = RunFolder.open(folder.path)
-    assert again.world == world
+    assert (again.kind, again.layout.command) == (kind, held.command)
+    assert all(again.layout.columns(name) == held.columns(name) for name in held.always)
     again.resume()
     again.finalize()
-    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
+    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(held.always)
 
 
 def test_a_run_of_the_other_world_is_overwritten_whole(tmp_path):
-    ball = RunFolder.create(tmp_path / "run", world="ball")
+    ball = RunFolder.create(tmp_path / "run", layout("ball"))
     ball.append("heights", {"step": [0, 0], "ball": [0, 1], "y": [1.0, np.pi], "v": [0.0, -0.0]})
     ball.append("solver", {"step": [1], "ball": [-1], "iteration": [2], "residual": [0.5],
                            "margin": [-0.25], "stopped": [False], "reason": [""]})  # fmt: skip
@@ -386,13 +399,13 @@ def test_a_run_of_the_other_world_is_overwritten_whole(tmp_path):
     read = RunFolder.open(tmp_path / "run").read("heights")
     assert read["y"].tolist() == [1.0, np.pi]
     assert np.signbit(read["v"]).tolist() == [False, True]
-    RunFolder.create(tmp_path / "run", overwrite=True).finalize()
-    assert sorted(path.stem for path in (tmp_path / "run").glob("*.parquet")) == sorted(TABLES["md"])
-    assert RunFolder.open(tmp_path / "run").world == "md"
+    RunFolder.create(tmp_path / "run", MD, overwrite=True).finalize()
+    assert sorted(path.stem for path in (tmp_path / "run").glob("*.parquet")) == sorted(MD.always)
+    assert RunFolder.open(tmp_path / "run").kind == "md"
 
 
 def test_rows_that_do_not_fit_are_refused(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     short = series_rows(0, 5)
     with pytest.raises(ValueError, match=r"missing.*kinetic"):
         folder.append("series", {key: value for key, value in short.items() if key != "kinetic"})
@@ -406,32 +419,32 @@ def test_rows_that_do_not_fit_are_refused(tmp_path):
 
 
 def test_existing_folders_are_not_overwritten(tmp_path):
-    whole = RunFolder.create(tmp_path / "whole")
+    whole = RunFolder.create(tmp_path / "whole", MD)
     write_run(whole, 0, 20)
     whole.finalize()
     with pytest.raises(FolderError, match="already holds a run") as caught:
-        RunFolder.create(whole.path)
+        RunFolder.create(whole.path, MD)
     assert caught.value.exit_code == 2
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(FolderError, match=r"not empty \(it holds 'thesis.tex'\)"):
-        RunFolder.create(tmp_path / "mine")
+        RunFolder.create(tmp_path / "mine", MD)
     with pytest.raises(FolderError, match="is a file"):
-        RunFolder.create(tmp_path / "mine" / "thesis.tex")
+        RunFolder.create(tmp_path / "mine" / "thesis.tex", MD)
     with pytest.raises(FolderError, match="holds no run"):
         RunFolder.open(tmp_path / "mine")
     with pytest.raises(FolderError, match="no such folder"):
         RunFolder.open(tmp_path / "nowhere")
 
     (whole.path / "notes.md").write_text("mine")
-    again = RunFolder.create(whole.path, overwrite=True)
+    again = RunFolder.create(whole.path, MD, overwrite=True)
     assert sorted(path.name for path in again.path.iterdir() if path.is_file()) == [
         ".lock", "manifest.json", "notes.md",
     ]  # fmt: skip
 
 
 def test_two_writers_are_refused(tmp_path):
-    first = RunFolder.create(tmp_path / "run")
+    first = RunFolder.create(tmp_path / "run", MD)
     write_run(first, 0, 10)
     with pytest.raises(FolderError, match="another process is writing"):
         RunFolder.open(first.path).resume()
@@ -441,12 +454,12 @@ def test_two_writers_are_refused(tmp_path):
 
 NAMES = """
 import sys
-from mdnum.store import RunFolder
+from mdnum.store import Layout, RunFolder
 from mdnum.store.files import default_folder
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(10):
-    print(RunFolder.create(default_folder("argon/liquid-864")).path.name)
+    print(RunFolder.create(default_folder("argon/liquid-864"), Layout("md", "run")).path.name)
 """
 
 
@@ -477,31 +490,34 @@ def test_a_run_that_began_and_ended_meanwhile_is_kept(tmp_path, monkeypatch):
     def late(self):
         if not others:
             others.append(self)
-            done = RunFolder.create(tmp_path / "run")
+            done = RunFolder.create(tmp_path / "run", MD)
             write_run(done, 0, 10)
             done.finalize()
         take(self)
 
     monkeypatch.setattr(RunFolder, "_take_lock", late)
     with pytest.raises(FolderError, match="already holds a run"):
-        RunFolder.create(tmp_path / "run")
+        RunFolder.create(tmp_path / "run", MD)
     assert RunFolder.open(tmp_path / "run").rows("series") == 10
 
 
 def test_changed_folder_is_not_resumed(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     write_run(folder, 0, 30)
     folder.close()
     (folder.path / "parts" / "series-000000000010.parquet").unlink()
     with pytest.raises(FolderError, match=r"series-000000000010\.parquet: is missing"):
         RunFolder.open(folder.path).resume()
-    (folder.path / "manifest.json").unlink()
+    manifest.update(folder.path, {}, ["parts/series-000000000010.parquet"])
     with pytest.raises(FolderError, match=r"10 to 19 .*'series' are missing"):
+        RunFolder.open(folder.path).resume()
+    (folder.path / "manifest.json").unlink()
+    with pytest.raises(FolderError, match=r"manifest\.json: is missing; it says what the tables"):
         RunFolder.open(folder.path).resume()
 
 
 def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     held = {"a": np.float64(0.1), "b": np.arange(3), "c": float("nan"), "d": (np.bool_(True), None)}
     folder.write_summary(held)
     assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
@@ -520,7 +536,7 @@ def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
 def test_full_disk_in_the_middle_of_a_frame_keeps_the_frames_before(tmp_path, monkeypatch):
     from ase.io.trajectory import TrajectoryWriter
 
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", MD)
     folder.append_frame(frame(0))
     folder.append_frame(frame(1))
 

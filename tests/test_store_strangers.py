@@ -20,14 +20,15 @@ import pyarrow.parquet as pq
 import pytest
 from ase.build import bulk
 from pydantic_core import to_json
-from test_store import frame, no_waiting, series_rows, state_at, write_run  # noqa: F401
+from test_store import COLUMNS, MD, frame, no_waiting, series_rows, state_at, write_run  # noqa: F401
 
 import mdnum
 from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
-from mdnum.store import COLUMNS, RunFolder, checkpoint, tables
+from mdnum.store import RunFolder, checkpoint, tables
 from mdnum.store import files as atomic
 from mdnum.store import files as manifest
+from mdnum.verbs.frame import layout
 
 
 def called(*words: str) -> tuple[int | None, str, str]:
@@ -47,7 +48,7 @@ PRECIOUS = b"somebody's only copy"
 
 @pytest.fixture
 def killed(tmp_path) -> Path:
-    folder = RunFolder.create(tmp_path / "killed")
+    folder = RunFolder.create(tmp_path / "killed", MD)
     atomic.write_text(folder.path / "system.toml", "units = 'lj'\n")
     folder.write_provenance({"versions": {}})
     write_run(folder, 0, 40)
@@ -110,7 +111,7 @@ def test_a_folder_in_the_folder_that_leads_out_is_refused(tmp_path, killed, name
         (killed / name).rename(tmp_path / "moved")
     (killed / name).symlink_to(outside)
     with pytest.raises(FolderError, match="is a link"):
-        RunFolder.create(killed, overwrite=True)
+        RunFolder.create(killed, MD, overwrite=True)
     with pytest.raises(FolderError, match="is a link"):
         atomic.write_text(killed / name / "energy.svg", "new")
     with pytest.raises(FolderError, match="is a link"):
@@ -139,7 +140,7 @@ def test_temporary_names_cannot_be_foreseen(tmp_path, monkeypatch):
 def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     (tmp_path / "precious.parquet").write_bytes(PRECIOUS)
     state, store = checkpoint.read(killed / "checkpoint.npz")
-    (killed / "manifest.json").unlink()
+    # a checkpoint is listed as it is written
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
     with pytest.raises(FolderError, match=r"checkpoint\.npz: counts what no folder"):
         RunFolder.open(killed).resume()
@@ -173,7 +174,7 @@ def test_a_flipped_bit_is_told_with_what_is_left(finished, name):
 
 
 def test_a_flipped_bit_of_a_page_is_told_where_there_is_no_manifest(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", layout("ball"))
     rng = np.random.default_rng(0)
     values = rng.normal(size=50_000)
     folder.append("separations", {"variant": ["a"] * 50_000, "step": np.arange(50_000), "separation": values})
@@ -191,10 +192,15 @@ def test_what_is_gone_or_foreign_is_told(finished):
     (finished / "epochs.parquet").unlink()
     with pytest.raises(FolderError, match=r"epochs\.parquet: is missing"):
         RunFolder.open(finished).read("epochs")
-    (finished / "manifest.json").unlink()
     pq.write_table(pa.table({"step": ["a", "b"]}), finished / "series.parquet")
+    manifest.update(finished, {"series.parquet": [manifest.digest(finished / "series.parquet")]})
     with pytest.raises(FolderError, match=r"series\.parquet: .* series \(column 'step' .*string\)"):
         RunFolder.open(finished).read("series")
+    (finished / "manifest.json").unlink()
+    # nobody says what it was to hold
+    assert RunFolder.open(finished).read("series")["step"].tolist() == ["a", "b"]
+    with pytest.raises(FolderError, match="holds no table 'epochs'"):
+        RunFolder.open(finished).read("epochs")
     for text in ("[]", "3", "[" * 50_000, "\x00"):
         (finished / "summary.json").write_text(text)
         with pytest.raises(FolderError, match=r"summary\.json: is damaged"):
@@ -207,7 +213,7 @@ def test_the_manifest_is_told_when_it_is_damaged_and_lists_nothing_elsewhere(fin
     path.write_text(text.replace('"finished": true', '"finished": false'))
     with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
         RunFolder.open(finished)
-    made = manifest.Manifest("md", True, {"../precious": ["0"]})
+    made = manifest.Manifest(MD, True, {"../precious": ["0"]})
     manifest.save(finished, made)
     with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
         RunFolder.open(finished)
@@ -261,7 +267,7 @@ def test_a_kill_while_a_file_is_replaced_leaves_no_damage(finished, monkeypatch,
 
 
 def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, killed):
-    started = RunFolder.create(tmp_path / "started")
+    started = RunFolder.create(tmp_path / "started", MD)
     atomic.write_text(started.path / "system.toml", "units = 'lj'\n")
     (started.path / "cu.eam.alloy").write_text("a table that belongs to the system")
     started.write_provenance({})
@@ -271,33 +277,33 @@ def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, 
         RunFolder.open(started.path).resume()
     (started.path / "mine.md").write_text("mine")
     with pytest.raises(FolderError, match="already holds a run"):
-        RunFolder.create(started.path)
+        RunFolder.create(started.path, MD)
     (started.path / "mine.md").unlink()
-    again = RunFolder.create(started.path)
+    again = RunFolder.create(started.path, MD)
     assert {path.name for path in again.path.iterdir()} == {".lock", "manifest.json"}
     again.close()
     with pytest.raises(FolderError, match="Continue it with `mdnum run --resume"):
-        RunFolder.create(killed)
+        RunFolder.create(killed, MD)
     # what was never mdnum's is not taken for it
     (tmp_path / "own").mkdir()
     (tmp_path / "own/system.toml").write_text("units = 'lj'\n")
     with pytest.raises(FolderError, match="already holds"):
-        RunFolder.create(tmp_path / "own")
+        RunFolder.create(tmp_path / "own", MD)
 
 
 @pytest.mark.parametrize(
-    ("world", "steps", "advice"),
+    ("kind", "steps", "advice"),
     [
         ("md", 0, "give the command again"),
         ("grad", 0, "give the command again"),
         ("md", 20, "continue with --res"),
     ],
 )
-def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch, world, steps, advice):
+def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch, kind, steps, advice):
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    folder = RunFolder.create(tmp_path / "run", world=world)
+    folder = RunFolder.create(tmp_path / "run", layout(kind))
     if steps:
         write_run(folder, 0, steps)
         folder.append("series", series_rows(steps, steps + 10))
@@ -312,7 +318,7 @@ def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch, wo
 
 
 def test_answers_are_listed_as_soon_as_they_are_written(tmp_path):
-    folder = RunFolder.create(tmp_path / "run", world="audit")
+    folder = RunFolder.create(tmp_path / "run", layout("audit"))
     atomic.subfolder(folder.path, "structures")
     for name in ("answers.json", "summary.json", "structures/failed-1.extxyz", "reproduce-1-missing.py"):
         for text in ("{}", '{"a": 1}', '{"a": 1, "b": 2}'):
@@ -392,25 +398,25 @@ _WRONG_AUDITS = [
 
 
 @pytest.mark.parametrize(
-    ("world", "where", "value"),
+    ("kind", "where", "value"),
     [("conform", *one) for one in _WRONG_ANSWERS] + [("audit", *one) for one in _WRONG_AUDITS],
 )
-def test_answers_of_another_shape_are_told_in_a_line(tmp_path, world, where, value):
+def test_answers_of_another_shape_are_told_in_a_line(tmp_path, kind, where, value):
     from mdnum.audit.record import kept
     from mdnum.store.answers import restored
     from mdnum.verbs.conform import Examination, conform
 
-    folder = RunFolder.create(tmp_path / "run", world=world)
-    told = _audit_state() if world == "audit" else json.loads(json.dumps(_ANSWERS))
+    folder = RunFolder.create(tmp_path / "run", layout(kind))
+    told = _audit_state() if kind == "audit" else json.loads(json.dumps(_ANSWERS))
     if where:
         _put(told, where, value)
     atomic.write_text(folder.path / "answers.json", json.dumps(told) if where else value)
     folder.close()
     with pytest.raises(FolderError, match=r"answers\.json: ") as seen:
-        kept(folder) if world == "audit" else conform(resume=folder.path, report=False)
+        kept(folder) if kind == "audit" else conform(resume=folder.path, report=False)
     assert "\n" not in str(seen.value) and "its bytes" not in str(seen.value)
     # as they were, they can be gone on with
-    if world == "audit":
+    if kind == "audit":
         atomic.write_text(folder.path / "answers.json", json.dumps(_audit_state()))
         assert kept(RunFolder.open(folder.path)).left == ["curl"]
     else:
@@ -421,7 +427,7 @@ def test_answers_of_another_shape_are_told_in_a_line(tmp_path, world, where, val
 def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):
     from mdnum.verbs.conform import conform
 
-    folder = RunFolder.create(tmp_path / "run", world="conform")
+    folder = RunFolder.create(tmp_path / "run", layout("conform"))
     atomic.write_text(folder.path / "answers.json", "{}")
     rows = {"area": ["few"], "asked": [1], "passed": [1], "failed": [0], "refused": [0], "skipped": [0]}
     folder.append("areas", rows)
@@ -429,18 +435,18 @@ def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tm
     folder.close()
     (folder.path / "reproduce-1-mine.py").write_text("mine")
     again = RunFolder.open(folder.path)
-    again.take()
+    again.take(layout("conform"))
     with pytest.raises(FolderError, match="another process"):
         # before anything of its answers is read
         conform(resume=folder.path)
-    again.write_anew(("areas", "failures"))
+    again.write_anew()
     again.append("areas", rows)
     again.finalize()
     assert len(RunFolder.open(folder.path).read("areas")["area"]) == 1
     assert RunFolder.open(folder.path).damaged() == {}
     # what is there to go on from is never taken for nothing
     with pytest.raises(FolderError, match="already holds a run"):
-        RunFolder.create(folder.path)
+        RunFolder.create(folder.path, MD)
 
 
 def test_scripts_of_a_person_stay(tmp_path):
@@ -448,7 +454,7 @@ def test_scripts_of_a_person_stay(tmp_path):
 
     from mdnum.verbs.conform import _write_scripts
 
-    folder = RunFolder.create(tmp_path / "run", world="conform")
+    folder = RunFolder.create(tmp_path / "run", layout("conform"))
     stale = folder.path / "reproduce-3-missing.py"
     atomic.write_text(stale, "of mdnum")
     names = ("reproduce-mine.py", "reproduce-1-mine.py", "reproduce-1-extra.py")
@@ -460,22 +466,22 @@ def test_scripts_of_a_person_stay(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("world", "state", "advice"),
+    ("kind", "state", "advice"),
     [
         ("fork", None, "Nothing .*`mdnum fork` command again"),
         ("audit", "answers.json", "Continue it with `mdnum audit --resume"),
         ("conform", "answers.json", "Continue it with `mdnum conform --resume"),
     ],
 )
-def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, state, advice):
+def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, kind, state, advice):
     from mdnum import run
 
-    folder = RunFolder.create(tmp_path / "killed", world=world)
+    folder = RunFolder.create(tmp_path / "killed", layout(kind))
     folder.write_provenance({})
     folder.close()
     if state is not None:
         (folder.path / state).write_text("{}")
-    with pytest.raises(InputError, match=f"folder of `mdnum {world}`.* {advice}"):
+    with pytest.raises(InputError, match=f"folder of `mdnum {kind}`.* {advice}"):
         run(None, resume=folder.path)
 
 
@@ -483,7 +489,7 @@ def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, sta
 def test_a_text_larger_than_memory_is_not_read(finished, name):
     if name != "manifest.json":
         # before its digest is made of all of it
-        (finished / "manifest.json").unlink()
+        manifest.save(finished, manifest.Manifest(MD, True))
     os.truncate(finished / name, 6 << 30)
     code, _, err = called("report", str(finished))
     assert code == 2 and err.splitlines()[-1].startswith("mdnum: ") and "6,442,450,944 bytes" in err
@@ -502,7 +508,7 @@ def test_a_structure_of_one_endless_line_is_not_read(tmp_path):
 
 def zeros(folder: Path) -> None:
     """A table of a million rows in a few kilobytes."""
-    columns = {name: np.zeros(1_000_000, kind.to_pandas_dtype()) for name, kind in COLUMNS["series"].items()}
+    columns = {name: np.zeros(1_000_000, kind) for name, kind in COLUMNS["series"].items()}
     pq.write_table(pa.table(columns), folder / "series.parquet", compression="zstd")
     (folder / "manifest.json").unlink()
     assert (folder / "series.parquet").stat().st_size < 100_000

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import signal
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import typer
-from typer.models import ParameterInfo
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
 from mdnum.plain import plain
@@ -29,9 +25,6 @@ if TYPE_CHECKING:
     from mdnum.report.section import Table
     from mdnum.verbs.frame import Outcome
 
-_TEXTS: dict[str, dict[str, str | list[str]]] = tomllib.loads(
-    Path(__file__).with_name("options.toml").read_text(encoding="utf-8")
-)
 EXIT_FINE = 0
 EXIT_FINDINGS = 1
 EXIT_USAGE = 2
@@ -48,12 +41,6 @@ _MOST_ROWS = 12
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
 
 JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
-SET_OPTION = typer.Option(
-    None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
-)
-SYSTEM_ARGUMENT = typer.Argument(
-    metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
-)
 
 
 class Stopped(MdnumError):
@@ -81,119 +68,6 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
             raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
         overrides[key] = value.strip()
     return overrides
-
-
-def refuse_beside_resume(given: Mapping[str, Any], what: str) -> None:
-    """Refuses what a folder that is resumed has already.
-
-    Args:
-        given: what was typed, by option; None where nothing was.
-        what: is resumed.
-
-    Raises:
-        InputError: something was typed.
-    """
-    from mdnum.verbs.frame import refuse
-
-    asked = {name: value is not None for name, value in given.items()}
-    refuse(asked, f"of a new {what}", "Leave it out beside --resume, or begin in a new folder")
-
-
-def changed(
-    settings: list[str] | None = SET_OPTION, potential: str | None = None, allow_code: bool = False
-) -> dict[str, Any]:
-    """Changes to a system file, as a verb takes them; whoever names code on the command line allows it."""
-    overrides = parse_overrides(settings)
-    if potential is not None:
-        file, colon, name = potential.rpartition(":")
-        function = f"{Path(file).resolve()}{colon}{name}"
-        overrides = {"potential.kind": "python", "potential.function": json.dumps(function), **overrides}
-    allowed = {"allow_code": True} if allow_code or potential is not None else {}
-    return {"overrides": overrides, **allowed}
-
-
-def of_a_folder(
-    out: Path | None = typer.Option(None, "-o", "--out"), no_report: bool = False
-) -> dict[str, Any]:
-    """Where the answer goes, as a verb takes it."""
-    return {"out": out, "report": not no_report}
-
-
-def _described(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
-    """Parameters of a function but `how`, as arguments and options with what options.toml says of them."""
-    texts = _TEXTS.get(function.__name__.rstrip("_"), {})
-    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
-        if name == "how":
-            continue
-        info: Any = copy(parameter.default)
-        if not isinstance(info, ParameterInfo):
-            # by itself a flag could be turned off by another: --no-report and --no-no-report
-            flag = [f"--{name.replace('_', '-')}"] if parameter.annotation is bool else []
-            info = typer.Option(parameter.default, *flag)
-        said = texts.get(name, info.help)
-        info.metavar, info.help = said if isinstance(said, list) else (info.metavar, said)
-        yield parameter.replace(default=info)
-
-
-def question(
-    *groups: Callable[..., dict[str, Any]],
-    noted: Sequence[str] = (),
-) -> Callable[[Callable[..., Any]], Callable[..., int]]:
-    """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
-
-    Args:
-        groups: functions whose parameters are options of the command too; what they return, the new folder
-            and the progress are one dictionary of the function's, `how`. It may return a function instead of
-            an outcome, which is called with whether JSON was asked for.
-        noted: parameters that are folders to be read; what is not as it was written there is said on stderr.
-    """
-
-    def decorate(ask: Callable[..., Any]) -> Callable[..., int]:
-        def command(*, as_json: bool, **given: Any) -> int:
-            from mdnum.store import RunFolder
-
-            how: dict[str, Any] = {}
-            for group in (*groups, of_a_folder):
-                how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
-            folders = dict.fromkeys(given[name] for name in noted if given[name] is not None)
-            # looked at before a folder is listed anew, and said where nothing is worse
-            wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
-            stopped = False
-            with watched(lambda: _again({**given, **how})) as progress:
-                how["progress"] = progress
-                try:
-                    outcome: Any = ask(**given, how=how)
-                except KeyboardInterrupt as stop:
-                    # what was found until then may be an answer
-                    if (outcome := getattr(stop, "outcome", None)) is None:
-                        raise
-                    stopped = True
-            if not hasattr(outcome, "verdict"):
-                return outcome(as_json)
-            print_lines(wrong)
-            code = print_outcome(outcome, as_json=as_json)
-            return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
-
-        whole: Any = command
-        parameters = {each.name: each for one in (ask, *groups, of_a_folder) for each in _described(one)}
-        alone = inspect.Parameter.KEYWORD_ONLY
-        parameters["as_json"] = inspect.Parameter("as_json", alone, default=JSON_OPTION, annotation=bool)
-        whole.__signature__ = inspect.Signature([each.replace(kind=alone) for each in parameters.values()])
-        whole.__annotations__ = {name: each.annotation for name, each in parameters.items()}
-        whole.__name__, whole.__doc__ = ask.__name__, ask.__doc__
-        return command
-
-    return decorate
-
-
-def _again(given: Mapping[str, Any]) -> str | None:
-    """What can be done about the folder of a command that was stopped and has a --resume."""
-    from mdnum.store import RunFolder
-
-    folder = given.get("resume") or given["out"] or given["progress"].folder
-    with suppress(MdnumError):
-        return RunFolder.open(folder).again if "resume" in given and folder is not None else None
-    return None  # it was stopped before there was one
 
 
 def print_json(document: Mapping[str, Any]) -> int:

@@ -96,14 +96,14 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     second = b if isinstance(b, RunFolder) else RunFolder.open(b)
     for folder in (first, second):
         folder.check_start()
-        if folder.summary.get("world") == "fork" or folder.world not in _ELSEWHERE:
+        if folder.kind not in _ELSEWHERE:
             raise InputError(
                 "this is a fork folder, the answer of `mdnum fork`, and no run",
                 where=str(folder.path),
                 remedy="Give two folders of `mdnum run` or of `mdnum ball`; `mdnum report DIR` shows a fork",
             )
     where = f"{first.path} and {second.path}"
-    if first.world != second.world:
+    if first.kind != second.kind:
         raise InputError("one of these is no run of a ball", where=where, remedy="Compare runs of one world")
     with first.explained(), second.explained():
         return _compared(first, second, where)
@@ -125,7 +125,7 @@ def twin_of(found: FolderFork) -> Twin:
 
 
 def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    world, remedy = first.world, "Compare runs of one system"
+    world, remedy = first.kind, "Compare runs of one system"
     elsewhere = _ELSEWHERE[world]
     keys = _different(flat(first.system), flat(second.system))
     programs = [row for row in keys if row[0] not in elsewhere and row[0].split(".")[0] not in elsewhere]

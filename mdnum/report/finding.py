@@ -43,16 +43,14 @@ word or the other.
 from __future__ import annotations
 
 import string
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from mdnum.plain import plain
+from mdnum.plain import beside, plain
 from mdnum.report import words
 from mdnum.report.browse import Browse, Column
 from mdnum.report.section import Key, Plot, Series, cell
@@ -115,7 +113,7 @@ class Texts:
     """
 
     def __init__(self, module: str | Path):
-        self.entries = _entries(Path(module).with_suffix(".toml"))
+        self.entries: Mapping[str, Any] = beside(str(module))
 
     def finding(
         self,
@@ -235,11 +233,6 @@ def fill(text: str, values: Mapping[str, Any]) -> str:
         KeyError: a field has no value.
     """
     return _Fields().vformat(text, (), values)
-
-
-@lru_cache
-def _entries(path: Path) -> Mapping[str, Any]:
-    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from mdnum.rollout.summary import (
     series_columns,
     summarize,
 )
-from mdnum.store import RunFolder
+from mdnum.store import Layout, RunFolder
 from mdnum.store.files import default_folder
 from mdnum.systems.build import again, build
 from mdnum.systems.evaluate import evaluate_listed
@@ -322,6 +322,7 @@ def _finite_rows(segment: Segment) -> Segment:
 
 def run(
     system: Simulation | System | str | Path | None,
+    layout: Layout,
     *,
     out: str | Path | None = None,
     steps: int | None = None,
@@ -336,6 +337,7 @@ def run(
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; None when resuming, but
             for a simulation that was made of objects.
+        layout: of the new run folder, which is declared by who calls this.
         out: the new run folder; default runs/<name>-<n>.
         steps: last step; default the system's.
         save_every: a trajectory frame every so many steps; default the system's.
@@ -361,12 +363,12 @@ def run(
         finished = _finished(Path(resume), steps, given)
         if finished is not None:
             return finished
-        rollout = _resumed(Path(resume), given, steps, progress, began)
+        rollout = _resumed(Path(resume), layout, given, steps, progress, began)
     elif system is None:
         raise InputError("no system given", remedy="Name a system, or a folder to resume")
     else:
         simulation = build(system, overrides)
-        rollout = _fresh(simulation, out, steps, save_every, progress, began)
+        rollout = _fresh(simulation, layout, out, steps, save_every, progress, began)
     rollout.shown = shown
     try:
         summary = rollout.run()
@@ -379,12 +381,12 @@ def run(
     return RunResult(rollout.folder.path, summary, rollout.simulation, frames)
 
 
-def _fresh(simulation: Simulation, out, steps, save_every, progress, began) -> Rollout:
+def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progress, began) -> Rollout:
     last = simulation.steps if steps is None else steps
     every = simulation.save_every if save_every is None else save_every
     if last < 0 or every < 0:
         raise InputError("steps and save_every must not be negative")
-    folder = RunFolder.create(Path(out) if out is not None else default_folder(simulation.name))
+    folder = RunFolder.create(Path(out) if out is not None else default_folder(simulation.name), layout)
     simulation.write(folder.path)
     folder.write_provenance(provenance.collect(simulation))
     return Rollout(simulation, folder, last, every, progress, began)
@@ -406,7 +408,9 @@ def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunRes
         return RunResult(path, summary, again(path, given), frames)
 
 
-def _resumed(path: Path, given: Simulation | None, steps: int | None, progress, began) -> Rollout:
+def _resumed(
+    path: Path, layout: Layout, given: Simulation | None, steps: int | None, progress, began
+) -> Rollout:
     folder = RunFolder.open(path)
     if folder.summary.get("status") == "failed":
         raise FolderError(
@@ -425,7 +429,7 @@ def _resumed(path: Path, given: Simulation | None, steps: int | None, progress, 
         rollout = Rollout(simulation, folder, last, int(state["save_every"]), progress, began)
         rollout.restore(state)
     try:
-        folder.resume()
+        folder.resume(layout)
     except BaseException:
         folder.close()
         raise

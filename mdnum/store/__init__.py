@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from mdnum.store.folder import RunFolder, expect, restoring
-from mdnum.store.tables import COLUMNS, TABLES, columns_of
+from mdnum.store.layout import Layout
 
-__all__ = ["COLUMNS", "TABLES", "RunFolder", "columns_of", "expect", "restoring"]
+__all__ = ["Layout", "RunFolder", "expect", "restoring"]

@@ -19,6 +19,7 @@ from mdnum.errors import FolderError
 from mdnum.store import files as manifest
 from mdnum.store.files import read_text, write_text
 from mdnum.store.folder import RunFolder, restoring
+from mdnum.store.layout import Layout
 
 NAME = "answers.json"
 
@@ -55,20 +56,18 @@ class Answers(Generic[T]):
             self._due = monotonic() + max(1.0, 20 * (monotonic() - now))
 
 
-def take(path: str | Path, verb: str) -> RunFolder:
+def take(path: str | Path, layout: Layout) -> RunFolder:
     """The folder of a verb that is to be resumed, which from here on only this process writes.
 
     Raises:
         FolderError: nothing of that verb to resume, another process writes it, or it was changed.
     """
     folder = RunFolder.open(path)
-    made = manifest.load(folder.path)
-    if not (folder.path / NAME).is_file() or (made is not None and made.world != verb):
-        other = f"Resume it with `mdnum {folder.verb} --resume {path}`"
-        remedy = other if manifest.resumable(folder.path) else f"Begin a new `mdnum {verb}`"
-        raise FolderError(f"holds no `mdnum {verb}` to resume", remedy=remedy, where=str(path))
-    folder.world = verb
-    folder.take()
+    if folder.kind != layout.kind or not (folder.path / NAME).is_file():
+        other = f"Resume it with `mdnum {folder.layout.command} --resume {path}`"
+        remedy = other if manifest.resumable(folder.path) else f"Begin a new `mdnum {layout.command}`"
+        raise FolderError(f"holds no `mdnum {layout.command}` to resume", remedy=remedy, where=str(path))
+    folder.take(layout)
     return folder
 
 

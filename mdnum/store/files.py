@@ -11,13 +11,14 @@ import secrets
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from mdnum.errors import FolderError
 from mdnum.reading import whole_text
+from mdnum.store.layout import Layout
 from mdnum.version import __version__
 
 #: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
@@ -193,8 +194,6 @@ NAME = "manifest.json"
 ABSENT = ""
 # listed from their first write on; scripts and structures among them, which a page or a person goes by
 _FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
-# what a command goes on from, by the world of the folder
-_STATE = {"md": "checkpoint.npz", "audit": "answers.json", "conform": "answers.json"}
 _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 
@@ -202,7 +201,7 @@ _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 class Manifest:
     """A folder's manifest."""
 
-    world: str  # which tables the folder has, a key of `TABLES`
+    layout: Layout | None  # what the folder holds; None where an earlier mdnum wrote it, which did not say
     finished: bool = False  # whether its writing came to an end
     # digests that a file may have, by its name in the folder
     files: dict[str, list[str]] = field(default_factory=dict)
@@ -251,7 +250,8 @@ def load(root: Path) -> Manifest | None:
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
             raise ValueError("it lists files of elsewhere")
-        return Manifest(str(held["world"]), bool(held["finished"]), files, str(held.get("version", "")))
+        layout = Layout(**{one.name: held[one.name] for one in fields(Layout)}) if "kind" in held else None
+        return Manifest(layout, bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
             "is damaged, so that the other files cannot be checked against it",
@@ -263,24 +263,31 @@ def load(root: Path) -> Manifest | None:
 def save(root: Path, made: Manifest) -> None:
     """Replaces the manifest of a folder."""
     held = {**asdict(made), "files": dict(sorted(made.files.items()))}
+    if made.layout is not None:
+        held = {**held.pop("layout"), "tables": made.layout.spelled, **held}
     text = json.dumps({**held, "digest": digest_of(_canonical(held))}, indent=1)
     with replacing(root / NAME) as file:
         file.write(text.encode() + b"\n")
 
 
 def update(
-    root: Path, add: Mapping[str, list[str]], drop: Iterable[str] = (), finished: bool | None = None
+    root: Path,
+    add: Mapping[str, list[str]],
+    drop: Iterable[str] = (),
+    finished: bool | None = None,
+    layout: Layout | None = None,
 ) -> None:
-    """Lists and forgets files; nothing where the folder has no manifest."""
+    """Lists and forgets files, and changes what it says; nothing where the folder has no manifest."""
     made = load(root)
     if made is None:
         return
-    before = (dict(made.files), made.finished)
+    before = (dict(made.files), made.finished, made.layout)
     made.files |= add
     for name in drop:
         made.files.pop(name, None)
     made.finished = made.finished if finished is None else finished
-    if (made.files, made.finished) != before:
+    made.layout = layout or made.layout
+    if (made.files, made.finished, made.layout) != before:
         save(root, made)
 
 
@@ -318,9 +325,8 @@ def resumable(root: Path) -> bool:
     """Whether the verb that made a folder would find something there to go on from."""
     with suppress(FolderError, OSError):
         made = load(root)
-        if made is None:
-            return any((root / name).exists() for name in _STATE.values())
-        return made.world in _STATE and (root / _STATE[made.world]).exists()
+        state = "" if made is None or made.layout is None else made.layout.resumes_from
+        return state != "" and (root / state).exists()
     return False
 
 

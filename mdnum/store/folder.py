@@ -12,9 +12,9 @@ import sys
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -38,7 +38,8 @@ from mdnum.store.files import (
     refuse_link,
     write_text,
 )
-from mdnum.store.tables import COLUMNS, TABLES, UNKNOWN, VERBS, TableStream, as_numpy
+from mdnum.store.layout import Layout
+from mdnum.store.tables import TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 _FILES = (
     SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "summary.json", "log.txt",
     "checkpoint.npz", "trajectory.traj", "report.html", "gradients.npz", "answers.json",
-    *(f"{name}.parquet" for name in COLUMNS),
 )  # fmt: skip
 _SYSTEM = (SYSTEM_FILE, SIMULATION_FILE)
 _LOCK = ".lock"
@@ -97,9 +97,9 @@ class RunFolder:
     Use `create` for a new run, `open` for one that is there (to read it, or to resume it).
     """
 
-    def __init__(self, path: Path, world: str = "md"):
+    def __init__(self, path: Path, layout: Layout | None = None):
         self.path = path
-        self.world = world  # which tables it has, a key of `TABLES`
+        self._layout = layout
         self._streams: dict[str, TableStream] = {}
         self._frames = FrameFile(path / "trajectory.traj")
         self._log: TextIO | None = None
@@ -126,18 +126,18 @@ class RunFolder:
         self.told: dict[str, Any] = {}
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], overwrite: bool = False, world: str = "md") -> RunFolder:
+    def create(cls, path: str | os.PathLike[str], layout: Layout, overwrite: bool = False) -> RunFolder:
         """A new, empty run folder.
 
         Args:
             path: made if missing, parents included.
+            layout: what it is to hold.
             overwrite: remove the run that is there. Files that are not a run's are left alone.
-            world: a key of `TABLES`.
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
         """
-        folder = cls(Path(path), world)
+        folder = cls(Path(path), layout)
         if folder.path.exists() and not folder.path.is_dir():
             raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
         folder._usable(overwrite)
@@ -154,14 +154,18 @@ class RunFolder:
             for name in SUBFOLDERS:
                 # through a link, the files of somebody else would be removed
                 refuse_link(folder.path / name / "any")
-            made = manifest.load(folder.path) if present and not overwrite else None
-            for name in (*_FILES, manifest.NAME, *(made.files if made is not None else ())):
+            listed: Iterable[str] = ()
+            with suppress(FolderError):
+                listed = getattr(manifest.load(folder.path), "files", ()) if present else ()
+            if overwrite:
+                listed = [name for name in listed if name.endswith(".parquet")]
+            for name in (*_FILES, manifest.NAME, *listed):
                 if (folder.path / name).parent == folder.path:
                     (folder.path / name).unlink(missing_ok=True)
             folder._sweep("parts/*.parquet", "figures/*.svg", "structures/*.extxyz")
             folder._foreign = frozenset(entry.name for entry in folder.path.iterdir())
             folder._owner = True
-            manifest.save(folder.path, manifest.Manifest(world))
+            manifest.save(folder.path, manifest.Manifest(layout))
         return folder
 
     @classmethod
@@ -175,33 +179,47 @@ class RunFolder:
         folder = cls(Path(path))
         if not folder.path.is_dir():
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
-        if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
+        names = (*_FILES, "parts", manifest.NAME)
+        if not any([*((folder.path / name).exists() for name in names), *folder.path.glob("*.parquet")]):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
-
         made = manifest.load(folder.path)
-        if made is not None and made.world in TABLES:
-            folder.world = made.world
-            return folder
-
-        def share(world: str) -> float:
-            there = [(folder.path / f"{name}.parquet").exists() for name in TABLES[world]]
-            return sum(there) / max(1, len(there))
-
-        # from before there were manifests: some tables are those of two worlds, and some came later
-        likeliest = max(TABLES, key=share)
-        folder.world = likeliest if share(likeliest) > 0 else folder.world
+        folder._layout = None if made is None else made.layout
         return folder
+
+    @property
+    def layout(self) -> Layout:
+        """What the folder holds.
+
+        Raises:
+            FolderError: it has no manifest, or one of a version that did not write it down.
+        """
+        if self._layout is None:
+            seen = "is missing; it says what the tables of the folder are"
+            if (self.path / manifest.NAME).exists():
+                seen = "does not say what the tables of the folder are; an earlier version of mdnum wrote it"
+            remedy = "Run again in a new folder; the parquet files can be read one by one"
+            raise FolderError(seen, remedy=remedy, where=str(self.path / manifest.NAME))
+        return self._layout
+
+    def read_as(self, layout: Layout) -> None:
+        """Reads what an earlier version wrote as if it had what its verb declares today."""
+        self._layout = layout
+
+    @property
+    def kind(self) -> str:
+        """Its kind, as the verb that made it declares it."""
+        return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
 
     def append(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Adds rows to a table (see `TABLES`); cheap, kept in memory until a checkpoint.
+        """Adds rows to a table of its layout; cheap, kept in memory until a checkpoint.
 
         Args:
-            columns: equally long arrays by column name, at least those in `columns_of(world, table)`.
+            columns: equally long arrays by column name, at least those that are declared.
 
         Raises:
-            ValueError: a column is missing, not expected or of another length.
+            ValueError: no such table is declared, or a column is missing, not expected or of another length.
         """
         self._stream(table).append(columns)
 
@@ -271,7 +289,7 @@ class RunFolder:
             stream.flush()
         log = self.path / "log.txt"
         store = {
-            "rows": {**dict.fromkeys(TABLES[self.world], 0), **self._rows()},
+            "rows": {**dict.fromkeys(self.layout.always, 0), **self._rows()},
             "frames": self._frames.mark(),
             "log": log.stat().st_size if log.exists() else 0,
         }
@@ -292,7 +310,7 @@ class RunFolder:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
             self.checkpoint(self._pending[0], force=True)
-        for name in TABLES[self.world]:
+        for name in self.layout.always:
             self._stream(name)
         self.merge()
         self._owner = True
@@ -350,12 +368,17 @@ class RunFolder:
         """
         return self._read_checkpoint()[0]
 
-    def resume(self) -> dict[str, Any]:
+    def resume(self, layout: Layout | None = None) -> dict[str, Any]:
         """Drops all rows, frames and log lines after the last checkpoint and returns its state.
+
+        Args:
+            layout: what it is to hold from now on, where its verb has further columns by now.
 
         Raises:
             FolderError: no checkpoint, another process writes the folder, or files are missing.
         """
+        held = self.layout
+        self._layout = layout or held
         self._take_lock()
         state, store = self._read_checkpoint()
         with disk_errors(self.path):
@@ -366,7 +389,7 @@ class RunFolder:
                 if name not in ("log.txt", "summary.json"):
                     self.check(name)
             self._owner = True
-            manifest.update(self.path, {}, ["trajectory.traj", "log.txt"], finished=False)
+            manifest.update(self.path, {}, ["trajectory.traj", "log.txt"], False, self._layout)
             self._sweep()
             for name, rows in store["rows"].items():
                 self._stream(name).truncate(rows)
@@ -376,30 +399,30 @@ class RunFolder:
                     os.ftruncate(file.fileno(), min(store["log"], log.stat().st_size))
         return state
 
-    def take(self) -> None:
+    def take(self, layout: Layout) -> None:
         """Makes this the only process that writes a folder which is gone on with from answers.json.
 
         Raises:
             FolderError: another process writes the folder, or what it goes on from is not as it was written.
         """
+        self._layout = layout
         self._take_lock()
         # what its end would refuse is refused before anything is asked
         for name in ("answers.json", "provenance.json"):
             self.check(name)
 
-    def write_anew(self, tables: Sequence[str]) -> None:
-        """Makes a folder that was taken an unfinished one, without the tables that are written at its end.
+    def write_anew(self) -> None:
+        """Makes a folder that was taken an unfinished one, without its tables, which are written at its end.
 
-        Args:
-            tables: names; their part files go too, which a kill during `finalize` leaves behind.
+        Their part files go too, which a kill during `finalize` leaves behind.
         """
         with disk_errors(self.path):
             refuse_link(self.path / "log.txt", in_place=True)
             refuse_link(self.path / "parts" / "any")
             self._owner = True
-            manifest.update(self.path, {}, ["log.txt"], finished=False)
+            manifest.update(self.path, {}, ["log.txt"], False, self._layout)
             self._sweep()
-            for name in tables:
+            for name in self.layout.always:
                 parts = (self.path / "parts").glob(f"{name}-*.parquet")
                 for file in (self.path / f"{name}.parquet", *parts):
                     manifest.remove(file)
@@ -433,8 +456,10 @@ class RunFolder:
     ) -> dict[str, np.ndarray]:
         """As `table`, a numpy array by column name, without the columns that this folder does not know."""
         table = self.table(name, columns, rows)
+        declared = {} if self._layout is None else self._layout.columns(name)
         gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
-        unknown = set() if columns else {key for key in UNKNOWN.get(name, ()) if gaps.get(key) == len(table)}
+        free = [key for key in gaps if declared.get(key, ("", not declared))[1]]
+        unknown = set() if columns else {key for key in free if gaps[key] == len(table)}
         if odd := [key for key in gaps if key not in unknown]:
             raise FolderError(f"column {odd[0]!r} of table {name!r} has gaps", where=str(self.path))
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
@@ -477,7 +502,7 @@ class RunFolder:
             names["decision"] = f"{names['length']}²" if squared else names["length"]
         run = json.dumps([made.get("hashes"), made.get("fingerprint")], sort_keys=True)
         return {
-            "version": str(made.get("versions", {}).get("mdnum") or ""), "kind": self.world,
+            "version": str(made.get("versions", {}).get("mdnum") or ""), "kind": self.kind,
             "system": str(self.told.get("system") or made.get("system") or ""),
             "run": hashlib.sha256(run.encode()).hexdigest() if made.get("hashes") else "",
             "units": {**names, **self.told.get("units", {})},
@@ -487,11 +512,6 @@ class RunFolder:
     def summary(self) -> dict[str, Any]:
         """summary.json; empty if the run has not come that far."""
         return self._read_json("summary.json")
-
-    @property
-    def verb(self) -> str:
-        """What of the command line made it."""
-        return VERBS.get(self.world, "run")
 
     @property
     def again(self) -> str:
@@ -560,7 +580,8 @@ class RunFolder:
             FolderError: it was changed, so that a run of it would be another one.
         """
         for name in self._listed():
-            further = name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
+            written = name in _FILES or name.endswith(".parquet")
+            further = not written and "/" not in name and not _FURTHER.fullmatch(name)
             if further or name in (*_SYSTEM, "structure.extxyz"):
                 self.check(name)
 
@@ -584,14 +605,16 @@ class RunFolder:
 
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:
-            self._streams[name] = TableStream(self.path, name, self.world, about=lambda: self.about)
+            if not self.layout.columns(name):
+                raise ValueError(f"a folder of {self.kind} is declared without a table {name!r}")
+            self._streams[name] = TableStream(self.path, name, self.layout, about=lambda: self.about)
         return self._streams[name]
 
     def _reader(self, name: str) -> TableStream:
         merged = f"{name}.parquet"
         if not (self.path / merged).exists():
             self.check(merged)
-        return TableStream(self.path, name, self.world, lambda path: self.check(manifest.place(path)[1]))
+        return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
         """Removes what a kill left of files that were being replaced, and files of these patterns."""
@@ -640,7 +663,7 @@ class RunFolder:
         listed = self._listed()
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
-        fixed = {name for name in _FILES if name != _WRITTEN_ANEW and not name.endswith(".parquet")}
+        fixed = {*_FILES} - {_WRITTEN_ANEW}
         new = [name for name in there if name not in listed and (name in fixed or _FURTHER.fullmatch(name))]
         now = manifest.listed_files(self.path, {*new, *({"log.txt", "trajectory.traj"} & set(there))})
         for name, allowed in listed.items():
@@ -668,7 +691,7 @@ class RunFolder:
         # names of tables become names of files
         if (
             not (isinstance(rows, dict) and isinstance(mark, list) and len(mark) == 3)
-            or not set(rows) <= set(COLUMNS)
+            or not (self._layout is None or all(map(self._layout.columns, rows)))
             or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
         ):
             raise FolderError(
@@ -766,8 +789,9 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
 def _again(path: Path) -> str:
     """What can be done about a folder that was not finished."""
     made = manifest.load(path)
-    world = made.world if made is not None else "conform" if (path / "answers.json").exists() else "md"
-    verb = f"mdnum {VERBS.get(world, 'run')}"
+    if made is None or made.layout is None:
+        return "Run again in a new folder"
+    verb = f"mdnum {made.layout.command}"
     if manifest.resumable(path):
         return f"Continue it with `{verb} --resume {path}`"
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):

@@ -12,7 +12,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from queue import Full, Queue
-from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -20,59 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
-from mdnum.plain import beside
 from mdnum.store import files as manifest
 from mdnum.store.columns import described
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
+from mdnum.store.layout import TYPES, Layout, type_of
 
-_DECLARED = beside(__file__)
 _WORD = pa.dictionary(pa.int32(), pa.string())
-_TYPES = {
-    name: _WORD if kind == "word" else pa.type_for_alias(kind)
-    for kind, names in _DECLARED["types"].items()
-    for name in names.split()
-}
-#: Columns that a writer may not know, by table: they are null then.
-UNKNOWN = {
-    table: frozenset(word.rstrip("?") for word in columns.split() if word.endswith("?"))
-    for table, columns in _DECLARED["columns"].items()
-}
-# what a column holds where rows leave it out, by world, table and column
-_USUAL: Mapping[str, Mapping[str, Mapping[str, Any]]] = _DECLARED["usual"]
-
-
-def _columns(declared: Mapping[str, str]) -> Mapping[str, Mapping[str, pa.DataType]]:
-    """Types by table and column; that of a column goes by its name where none is declared with it."""
-    tables: dict[str, Mapping[str, pa.DataType]] = {}
-    for table, columns in declared.items():
-        words = [word.rstrip("?").partition(":") for word in columns.split()]
-        usual = {name: _TYPES.get(name, pa.float64()) for name, _, _ in words}
-        own = {name: pa.type_for_alias(kind) for name, _, kind in words if kind}
-        tables[table] = MappingProxyType(usual | own)
-    return MappingProxyType(tables)
-
-
-#: The columns of each table; a writer may add more.
-COLUMNS = _columns(_DECLARED["columns"])
-#: Tables that go by another world's name and have columns of their own, by world.
-_OWN = {world: _columns(declared) for world, declared in _DECLARED["columns_of"].items()}
-
-
-def columns_of(world: str, table: str) -> Mapping[str, pa.DataType]:
-    """The columns of a table in a folder of some world; empty for a table that is not declared."""
-    return _OWN.get(world, {}).get(table) or COLUMNS.get(table, {})
-
-
-#: The tables that a folder has, whether they hold a row or not, by the world that was run; folders that
-#: answer another question than what a run does or where two part go by that question.
-TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {world: tuple(names.split()) for world, names in _DECLARED["tables"].items()}
-)
-#: The verb of the command line that makes a folder of a world.
-VERBS: Mapping[str, str] = MappingProxyType(dict.fromkeys(TABLES, "fork") | _DECLARED["verbs"])
-
-# the worlds of folders that are resumed from the rows they have
-_RESUMED = frozenset({"md"})
+_ARROW = {name: _WORD if name == "word" else pa.type_for_alias(name) for name in TYPES}
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
@@ -95,7 +48,8 @@ class TableStream:
     """
 
     def __init__(
-        self, root: Path, name: str, world: str = "md", check: Callable[[Path], None] | None = None,
+    def __init__(
+        self, root: Path, name: str, layout: Layout | None, check: Callable[[Path], None] | None = None,
         about: Callable[[], Mapping[str, Any]] | None = None,
     ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
@@ -107,16 +61,19 @@ class TableStream:
         self._about = about
         #: digests of the part files that were written, by name
         self.written: dict[str, list[str]] = {}
-        self._known = columns_of(world, name)
-        usual = _USUAL.get(world, {}).get(name, {})
+        declared = {} if layout is None else layout.columns(name)
+        self._known = {column: _ARROW[kind] for column, (kind, _) in declared.items()}
+        usual = {} if layout is None else layout.usual.get(name, {})
         # columns that rows may leave out, and what is in them then: parts that are written, read, packed and
         # removed do not carry what is the same in every row
-        self._usual: dict[str, Any] = {**dict.fromkeys(UNKNOWN.get(name, ())), **usual}
+        free = [column for column, (_, unknown) in declared.items() if unknown]
+        self._usual: dict[str, Any] = {**dict.fromkeys(free), **usual}
         self.merged_path = root / f"{name}.parquet"
         self.parts_folder = root / "parts"
         self._buffer: list[Mapping[str, Any]] = []
         self._buffered = 0
-        self._in_parts = world in _RESUMED
+        # of what is resumed from the rows that it has
+        self._in_parts = layout is not None and layout.resumes_from == "checkpoint.npz"
         self._writing: _Writing | None = None
         self._schema: pa.Schema | None = None
         files = self.files()
@@ -200,8 +157,8 @@ class TableStream:
             columns: what belongs to each index, by name.
         """
         for name, values in columns.items():
-            kind = _TYPES.get(name, pa.float64())
-            self._known = MappingProxyType({**self._known, name: kind})
+            kind = _ARROW[type_of(name)]
+            self._known = {**self._known, name: kind}
             found = as_arrow(values, kind, len(values))
             self._usual[name] = lambda table, found=found: found.take(table[of])
 
@@ -307,6 +264,8 @@ class TableStream:
             have += batch.num_rows
         if not tables:
             fields = self._known
+            if not fields:
+                raise FolderError(f"holds no table {self.name!r}", where=str(self._root))
             names = fields if columns is None else columns
             # as_arrow: an empty table of pyarrow's own imports pandas
             return pa.table({name: as_arrow([], fields[name]) for name in names})

@@ -1,1 +1,101 @@
-"""The verbs, a module each; their functions are those of `mdnum`."""
+"""The verbs, a module each; their functions are those of `mdnum`.
+
+A verb declares itself in its module and the text file beside it, and nothing else keeps a list of what is in
+them. The text file has
+
+    [command], or [group] and [commands.NAME]   what is typed (see `mdnum.cli.commands`)
+    [kinds.KIND]                                folders that it makes (see `mdnum.store.layout.Layout`)
+
+beside its sentences, and the module
+
+    KINDS = {"KIND": Verb(judge, page)}         how those are judged and shown (see `mdnum.verbs.frame`)
+
+with the functions that its commands call. Nothing of a verb is imported before it is asked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum.errors import InputError
+from mdnum.plain import beside
+from mdnum.registry import Registry
+
+
+def _check(module: Any) -> None:
+    """Refuses the module of another package that has not what its text file declares."""
+    texts, name = beside(module.__file__), module.__name__
+    commands = [*texts.get("commands", {}).values(), *filter(None, [texts.get("command")])]
+    calls = [one["calls"] for one in commands]
+    if lacking := [one for one in calls if not callable(getattr(module, one, None))]:
+        raise TypeError(f"{name} has no function {lacking[0]}, which its text file names")
+    if {*texts.get("kinds", ())} != {*getattr(module, "KINDS", ())}:
+        raise TypeError(f"KINDS of {name} are not the kinds of its text file")
+    for kind in texts.get("kinds", ()):
+        if VERBS.place(home(kind)) != name:
+            raise ValueError(f"mdnum or another package has folders of kind {kind!r}")
+
+
+#: Modules by the command that they are of, and what they are about where a command has several.
+VERBS: Registry[Any] = Registry("verb", "mdnum.verbs", check=_check)
+for _name in ("run", "ball", "grad", "flips", "audit", "conform", "fork"):
+    VERBS.add(_name, f"mdnum.verbs.{_name}")
+VERBS.add("ball demos", "mdnum.verbs.demos")
+VERBS.add("flips compare", "mdnum.verbs.flips_compare")
+VERBS.add("fork map", "mdnum.verbs.fork_map")
+VERBS.add("fork certify", "mdnum.verbs.fork_certify")
+
+
+def declared(name: str) -> Mapping[str, Any]:
+    """The text file of an entry of `VERBS`.
+
+    Raises:
+        InputError: the package that adds it has none.
+    """
+    return beside(_file(name))
+
+
+def of_command(command: str) -> Iterator[str]:
+    """Entries of `VERBS` that are of one command of the command line."""
+    return (name for name in VERBS if name.split()[0] == command)
+
+
+@functools.cache
+def home(kind: str) -> str:
+    """The entry of `VERBS` that declares a kind of folder.
+
+    Raises:
+        InputError: no verb of this installation does.
+    """
+    # a text file without that heading need not be parsed
+    heading = re.compile(rf"^\[kinds\.{re.escape(kind)}[].]", re.MULTILINE)
+    for name in VERBS:
+        # a package that is broken is not the one that is looked for
+        with contextlib.suppress(InputError):
+            if heading.search(Path(_file(name)).with_suffix(".toml").read_text(encoding="utf-8")):
+                return name
+    raise InputError(
+        f"no verb of this installation makes folders of kind {kind!r}",
+        remedy="Install the package that made it",
+    )
+
+
+@functools.cache
+def _file(name: str) -> str:
+    """The file of a module, found without importing it or a package that it is in."""
+    first, *rest = VERBS.place(name).split(".")
+    spec = importlib.util.find_spec(first)
+    places = [] if spec is None else spec.submodule_search_locations or [str(Path(str(spec.origin)).parent)]
+    parts = rest or [first]
+    files = [Path(place, *parts).with_suffix(".py") for place in places]
+    found = next((file for file in files if file.with_suffix(".toml").is_file()), None)
+    if found is None:
+        seen = f"{VERBS.noun} {name!r} of package {VERBS.package(name)} has no text file"
+        raise InputError(seen, remedy=f"Put {parts[-1]}.toml beside {parts[-1]}.py")
+    return str(found)

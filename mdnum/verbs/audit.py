@@ -113,10 +113,10 @@ def audit(
                 f"an audit is resumed as it was asked for, and {names[0]} is given",
                 remedy=f"Leave out {', '.join(names)}, or begin another audit",
             )
-        with closing(take(resume, "audit")) as folder:
+        with closing(take(resume, frame.layout("audit"))) as folder:
             state = kept(folder)
             loaded = _same(calculator, state, folder.path)
-            folder.write_anew(_TABLES)
+            folder.write_anew()
             for file in (folder.path / "structures").glob("failed-*.extxyz"):
                 if re.fullmatch(r"failed-\d+\.extxyz", file.name) and file.name not in state.failed:
                     remove(file)
@@ -586,4 +586,4 @@ def _subject(summary: Mapping[str, Any], given: units.Units) -> list[tuple[str, 
     return TEXTS.rows("subject", **{**summary, **vars(given), "periodic": periodic, "structure": origin})
 
 
-VERBS = {"audit": Verb(_judge, _page, AuditView)}
+KINDS = {"audit": Verb(_judge, _page, AuditView)}

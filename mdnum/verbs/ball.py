@@ -68,6 +68,35 @@ def bounce(
     return answer.outcome
 
 
+def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | frame.Listing:
+    """`mdnum ball`: a ball, a demonstration, or what there is of both for somebody who named nothing.
+
+    Raises:
+        InputError: a demonstration and something about a ball.
+    """
+    from mdnum import systems
+    from mdnum.verbs import demos
+
+    if demo is not None:
+        foreign = {"system": system, "--steps": given.get("steps"), "--set": given.get("overrides"),
+                   "--against": given.get("against")}  # fmt: skip
+        if first := next((name for name, value in foreign.items() if value), None):
+            seen = f"a demonstration has its own balls, so it takes no {first}"
+            raise InputError(seen, remedy="Leave one of them out", where="--demo")
+        return demos.demonstrate(demo, **given)
+    if system is not None:
+        return bounce(system, **given)
+    balls = [systems.load(name, world="ball") for name in systems.names("ball")]
+    rows = [{"name": one.name, "balls": one.balls, "about": one.spec.about} for one in balls]
+    scripts = [{"name": name, "about": demos.about(name)} for name in demos.names()]
+    lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
+    title = "\ndemonstrations: `mdnum ball --demo NAME`, or all"
+    return frame.Listing({"systems": rows, "demos": scripts}, [
+        ("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines),
+        (title, ("name", "about"), [(row["name"], row["about"]) for row in scripts]),
+    ])  # fmt: skip
+
+
 def _loaded(
     system: BallSystem | str | Path,
     overrides: Mapping[str, Any] | None,
@@ -417,4 +446,4 @@ def _resting(view: BallView) -> Iterator[Finding]:
         yield TEXTS.finding("RESTING", "floor", step=since)
 
 
-VERBS = {"ball": Verb(judge, page, BallView)}
+KINDS = {"ball": Verb(judge, page, BallView)}

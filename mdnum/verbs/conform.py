@@ -22,7 +22,7 @@ from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count, listed
-from mdnum.store import COLUMNS, RunFolder, answers, files
+from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Outcome, Progress, Verb, View
@@ -145,7 +145,7 @@ def conform(
         frame.end_on_sigterm(stack)
         folder = state = None
         if resume is not None:
-            folder = answers.take(resume, "conform")
+            folder = answers.take(resume, frame.layout("conform"))
             stack.callback(folder.close)
             state = answers.restored(folder, Examination)
             pairs = pairs or state.word
@@ -177,7 +177,7 @@ def conform(
             slug = f"conform-{tested.name.replace(':', '-')}"
             folder = stack.enter_context(frame.new_folder("conform", slug, out))
         else:
-            folder.write_anew(("areas", "failures"))
+            folder.write_anew()
         state = state or Examination(word=tested.word, tested=name, options=options)
         found, kept = examiner.report, answers.Answers(folder, state)
         kept.save()
@@ -210,14 +210,38 @@ def conform(
         if interrupted:
             summary |= {"status": "stopped", "interrupted": True}
         tables = {
-            name: [{column: row[column] for column in COLUMNS[name]} for row in summary[name]]
-            for name in ("areas", "failures")
+            name: [{column: row[column] for column in folder.layout.columns(name)} for row in summary[name]]
+            for name in folder.layout.always
         }
         frame.store(folder, summary, tables)
         outcome = frame.finish(folder, report=report, result=found, progress=progress)
         if interrupted:
             raise frame.Interrupted(outcome)
         return outcome
+
+
+def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | frame.Listing:
+    """`mdnum conform`: without a list those that have a name."""
+    from mdnum.references.conformance.peers import known
+
+    if pairs is not None or resume is not None:
+        return conform(pairs, resume=resume, **given)
+    rows = [
+        {
+            "list": one.name,
+            "version": one.version,
+            "lacks": one.lacks,
+            "kept": one.kept,
+            "what": one.description,
+        }
+        for one in known()
+    ]
+    lines = [
+        (row["list"], f"install {' '.join(row['lacks'])}" if row["lacks"] else row["version"], row["what"])
+        for row in rows
+    ]
+    table = ("neighbor lists that have a name here", ("list", "version", "what"), lines)
+    return frame.Listing({"lists": rows}, [table], TEXTS("own_lists").split("\n"))
 
 
 def _script(code: str) -> str:
@@ -517,4 +541,4 @@ def _conventions(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     })  # fmt: skip
 
 
-VERBS = {"conform": Verb(judge, page)}
+KINDS = {"conform": Verb(judge, page)}

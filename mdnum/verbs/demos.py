@@ -291,4 +291,4 @@ def shown(value: Any, digits: int = 10) -> str:
     return "–" if value is None else typeset(str(value))
 
 
-VERBS = {"demos": Verb(judge, page)}
+KINDS = {"demos": Verb(judge, page)}

@@ -154,7 +154,7 @@ def flips(
     return answer.outcome
 
 
-VERBS = {"flips": Verb(judge, page, FlipsView)}
+KINDS = {"flips": Verb(judge, page, FlipsView)}
 
 
 # ---- what is asked for
@@ -307,7 +307,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     """
     from mdnum.trajectories.history import History
 
-    streams = {name: TableStream(folder.path, name, folder.world) for name in ("members", "flips")}
+    streams = {name: TableStream(folder.path, name, folder.layout) for name in ("members", "flips")}
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
     def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:

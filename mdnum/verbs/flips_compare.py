@@ -447,4 +447,4 @@ def _input(view: ComparisonView, size: str) -> list[tuple[str, str]]:
     return TEXTS.rows("input", **{**view.summary, **kept, "size": size, "between": view.between})
 
 
-VERBS = {"flips-compare": Verb(judge, page, ComparisonView)}
+KINDS = {"flips-compare": Verb(judge, page, ComparisonView)}

@@ -253,11 +253,26 @@ def fork_benign(
     return answer.outcome
 
 
+def listed() -> frame.Listing:
+    """`mdnum fork choices`: what can be varied."""
+    from mdnum.forks.choices import shipped
+
+    document, tables = {}, []
+    for key, whose, world in (("choices", "", "md"), ("ball_choices", " of a ball", "ball")):
+        document[key] = [
+            {"name": name, "about": choice.describe(world), "must_hold": choice.must_hold}
+            for name, choice in shipped(world).items()
+        ]
+        rows = [(row["name"], "must hold" * row["must_hold"], row["about"]) for row in document[key]]
+        tables.append((f"choices{whose}: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), rows))
+    return frame.Listing(document, tables, [TEXTS("other_programs")])
+
+
 # -- pages ---------------------------------------------------------------------------------------------
 
 
 def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: list[Section]) -> Page:
-    rows, kind = [*size(view), view.took], view.folder.world
+    rows, kind = [*size(view), view.took], view.folder.kind
     sections = [*sections, Section("What was run", [pairs(rows)])]
     keyed = TEXTS.keys(f"keys_{kind}", **{**view.summary, **keys})
     return view.page(f"{view.name}: {what}", about, keyed, sections)
@@ -343,7 +358,7 @@ def page_benign(view: View, verdict: Verdict) -> Page:
     ])  # fmt: skip
 
 
-VERBS = {
+KINDS = {
     "fork": frame.Verb(judge, page),
     "screen": frame.Verb(judge_screen, page_screen),
     "compare": frame.Verb(judge_compare, page_compare),

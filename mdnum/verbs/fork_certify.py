@@ -381,7 +381,7 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     ])  # fmt: skip
 
 
-VERBS = {
+KINDS = {
     "certify": frame.Verb(judge_certify, page_certify),
     "processes": frame.Verb(judge_processes, page_processes),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -25,12 +26,39 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 
+_INTERVAL = re.compile(r"^\s*([^=\s]+)\s*=\s*([^:\s]+)\s*:\s*([^:\s]+)\s*$")
 #: Flips that are listed of each kind.
 _LISTED = 10
 #: Jumps that are a smaller share of the range of the loss are shown once more, without its trend: a cubic.
 _VISIBLE, _TREND = 0.05, 3
 #: Boundaries closer than this share of the interval are numbered in the figure.
 _ROOM = 0.03
+
+
+def command(system: str, along: str, **given: Any) -> Outcome:
+    """`mdnum fork map SYSTEM KEY=LOW:HIGH`.
+
+    Raises:
+        InputError: the interval is not of that form.
+    """
+    return fork_map(system, *interval(along), **given)
+
+
+def interval(text: str) -> tuple[str, float, float]:
+    """The words of KEY=LOW:HIGH.
+
+    Raises:
+        InputError: not of that form.
+    """
+    found = _INTERVAL.match(text)
+    try:
+        if found is None:
+            raise ValueError
+        return found[1], float(found[2]), float(found[3])
+    except ValueError:
+        raise InputError(
+            f"{text!r} is not of the form KEY=LOW:HIGH", remedy="Write for example potential.sigma=3.40:3.41"
+        ) from None
 
 
 @frame.keywords_checked
@@ -390,7 +418,7 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
     ])  # fmt: skip
 
 
-VERBS = {
+KINDS = {
     "map": frame.Verb(judge_map, page_map),
     "forecast": frame.Verb(judge_forecast, page_forecast),
 }

@@ -3,16 +3,16 @@
 A verb is a file that reads top to bottom: its function (options → a filled folder), `judge` (view → findings
 and a headline) and `page` (view → sections), with its sentences in a text file beside it. It says so once:
 
-    VERBS = {"flips": Verb(judge, page)}
+    KINDS = {"flips": Verb(judge, page)}
 
-by the kind of its folders; `KINDS` names the module, so that `mdnum report DIR` finds it. What is computed
-goes into the folder first: judge and page read the folder alone, so a page can be written again from disk.
+by the kind of its folders, which its text file declares under [kinds.flips] (see `mdnum.verbs`). What is
+computed goes into the folder first: judge and page read the folder alone, so a page can be written again
+from disk.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
 import inspect
 import signal
 import threading
@@ -33,9 +33,10 @@ from mdnum.registry import nearest
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
-from mdnum.store import RunFolder
+from mdnum.store import Layout, RunFolder
 from mdnum.store.files import default_folder, read_text
 from mdnum.systems import code
+from mdnum.verbs import VERBS, declared, home
 
 if TYPE_CHECKING:
     from mdnum.units import Units
@@ -51,21 +52,6 @@ PARTIAL, UNDECIDED = "partial", "undecided"
 
 #: Lines of log.txt for a phase of a run that is followed step by step.
 STEPWISE = 50
-
-#: The module whose VERBS judge and show a kind of folder.
-KINDS: dict[str, str] = {
-    "md": "mdnum.verbs.run",
-    "ball": "mdnum.verbs.ball",
-    "demos": "mdnum.verbs.demos",
-    "grad": "mdnum.verbs.grad",
-    "flips": "mdnum.verbs.flips",
-    "flips-compare": "mdnum.verbs.flips_compare",
-    "audit": "mdnum.verbs.audit",
-    "conform": "mdnum.verbs.conform",
-    **dict.fromkeys(("fork", "screen", "compare", "benign"), "mdnum.verbs.fork"),
-    **dict.fromkeys(("map", "forecast"), "mdnum.verbs.fork_map"),
-    **dict.fromkeys(("certify", "processes"), "mdnum.verbs.fork_certify"),
-}
 
 
 @dataclass(frozen=True)
@@ -135,6 +121,17 @@ class Outcome:
     verdict: Verdict
     page: Page  # what report.html and the terminal show
     result: Any = None  # what the verb computed, as Python has it; None where a folder was only read
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What there is to name, of a command that lists it: nothing is computed, and no folder made."""
+
+    document: Mapping[str, Any]  # for JSON
+    tables: Sequence[
+        tuple[str, Sequence[str], Sequence[Sequence[Any]]]
+    ]  # for people: title, columns and rows
+    lines: Sequence[str] = ()  # below them
 
 
 class Interrupted(KeyboardInterrupt):
@@ -271,6 +268,15 @@ def answering(
     answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
 
 
+def layout(kind: str) -> Layout:
+    """What the folders of a kind hold, as the verb declares it that makes them.
+
+    Raises:
+        InputError: no verb of this installation does.
+    """
+    return Layout(kind, **declared(home(kind))["kinds"][kind])
+
+
 @contextmanager
 def new_folder(
     kind: str, name: str, out: str | Path | None = None, *, system: Any = None
@@ -278,7 +284,7 @@ def new_folder(
     """An empty folder to be filled, with the system and its provenance; closed if filling it fails.
 
     Args:
-        kind: of the folder.
+        kind: of the folder, which a verb declares.
         name: runs/<name>-<n> is the folder where out is None.
         system: what is simulated, with `write(path)`; None for a verb without a system.
 
@@ -287,7 +293,8 @@ def new_folder(
     """
     from mdnum.provenance import collect, surroundings
 
-    folder = RunFolder.create(default_folder(name) if out is None else out, world=kind)
+    held = layout(kind)
+    folder = RunFolder.create(default_folder(name) if out is None else out, held)
     try:
         if system is not None:
             system.write(folder.path)
@@ -316,13 +323,14 @@ def finish(
         FolderError: it holds no answer, is damaged or cannot be written.
     """
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
-    verb = importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
+    folder.read_as(layout(folder.kind))
+    verb = VERBS[home(folder.kind)].KINDS[folder.kind]
     say(progress, "report" if report else "check")
     with folder.explained():
         summary = folder.summary if view is None else view.summary
         if not summary and not verb.unfinished:
             raise FolderError(
-                f"holds no answer: `mdnum {folder.verb}` was stopped before it had one",
+                f"holds no answer: `mdnum {folder.layout.command}` was stopped before it had one",
                 remedy=folder.again, where=str(folder.path),
             )  # fmt: skip
         view = verb.view(folder, summary) if view is None else view

@@ -631,4 +631,4 @@ def _of_the_motion(view: View) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-VERBS = {"grad": Verb(judge, grad_page.page)}
+KINDS = {"grad": Verb(judge, grad_page.page)}

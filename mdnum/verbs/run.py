@@ -22,7 +22,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.check import temperature_findings
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, keywords_checked, say
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, keywords_checked, layout, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
 if TYPE_CHECKING:
@@ -96,11 +96,10 @@ def run(
 
     if isinstance(system, BallSystem):
         raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
-    if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).world != "md":
+    if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).kind != "md":
         remedy = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
-        raise InputError(
-            f"is the folder of `mdnum {folder.verb}`, and no run", where=str(resume), remedy=remedy
-        )
+        seen = f"is the folder of `mdnum {folder.layout.command}`, and no run"
+        raise InputError(seen, where=str(resume), remedy=remedy)
     frames: SimpleQueue[np.ndarray | None] = SimpleQueue()
     compared: list[Future[tuple[EnergyReport | None, float | None]]] = []
     with ThreadPoolExecutor(1) as thread:
@@ -112,8 +111,8 @@ def run(
 
         try:
             result = roll_out(
-                system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
-                progress=progress, shown=shown,
+                system, layout("md"), out=out, steps=steps, save_every=save_every, overrides=overrides,
+                resume=resume, progress=progress, shown=shown,
             )  # fmt: skip
         except BaseException as error:
             frames.put(None)
@@ -439,4 +438,4 @@ def _evidence(run: RunView) -> Iterator[str]:
         yield TEXTS("beyond_cutoff" if share else "beyond_cutoff_alone", **said)
 
 
-VERBS = {"md": Verb(judge, page, RunView, unfinished=True)}
+KINDS = {"md": Verb(judge, page, RunView, unfinished=True)}

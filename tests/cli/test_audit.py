@@ -12,6 +12,7 @@ from command_line import call, printed
 
 from mdnum.store import RunFolder
 from mdnum.store.files import write_text
+from mdnum.verbs.frame import layout
 
 EMT = "ase.calculators.emt:EMT"
 
@@ -59,20 +60,20 @@ def test_a_calculator_that_is_not_fine(copper, capsys):
 
 
 @pytest.mark.parametrize(
-    ("world", "kept", "remedy"),
+    ("kind", "kept", "remedy"),
     [
         ("conform", "answers.json", "Resume it with `mdnum conform --resume conform`"),
         ("md", "checkpoint.npz", "Resume it with `mdnum run --resume md`"),
         ("grad", "gradients.npz", "Begin a new `mdnum audit`"),
     ],
 )
-def test_what_is_no_audit_names_the_verb_that_resumes_it(world, kept, remedy, copper, capsys):
-    folder = RunFolder.create(copper / world, world=world)
-    folder.checkpoint({"step": 1}, force=True) if world == "md" else write_text(folder.path / kept, "{}")
+def test_what_is_no_audit_names_the_verb_that_resumes_it(kind, kept, remedy, copper, capsys):
+    folder = RunFolder.create(copper / kind, layout(kind))
+    folder.checkpoint({"step": 1}, force=True) if kind == "md" else write_text(folder.path / kept, "{}")
     folder.close()
-    assert call("audit", "--resume", world) == 2
+    assert call("audit", "--resume", kind) == 2
     line = capsys.readouterr().err
-    assert line.startswith(f"mdnum: {world}: ") and line.endswith(f" {remedy}.\n") and line.count("\n") == 1
+    assert line.startswith(f"mdnum: {kind}: ") and line.endswith(f" {remedy}.\n") and line.count("\n") == 1
     assert "holds no `mdnum audit`" in line
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from command_line import Recorder, call, printed
 
-import mdnum
 from mdnum.cli.output import ProgressBar
 from mdnum.errors import InputError
 from mdnum.verbs import demos
@@ -20,7 +19,7 @@ from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, table
 def bounce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum ball` in an empty folder with the run replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum, "bounce", recorder)
+    monkeypatch.setattr("mdnum.verbs.ball.bounce", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

@@ -9,22 +9,27 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from command_line import Recorder, call, printed
 
-import mdnum
+from mdnum import bounce, conform, fork_map, verbs
 from mdnum.cli import main, output
 from mdnum.cli.output import ProgressBar, describe
-from mdnum.cli.verbs import app, check, fork, systems
+from mdnum.cli.verbs import app
 from mdnum.errors import InputError, NumericalError
-from mdnum.plain import plain
+from mdnum.plain import beside, plain
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
+from mdnum.verbs import VERBS, declared
+from mdnum.verbs.fork_pair import PairQuestion
+from mdnum.verbs.frame import Keep, layout
 
 SUMMARY: dict[str, Any] = {
     "flips_entered": 1_234, "steps_per_second": np.float64(512.0), "findings": [], "status": "complete",
@@ -36,7 +41,7 @@ SUMMARY: dict[str, Any] = {
 def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
     recorder = Recorder(dict(SUMMARY))
-    monkeypatch.setattr(mdnum, "run", recorder)
+    monkeypatch.setattr("mdnum.verbs.run.run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 
@@ -59,7 +64,7 @@ def test_run_passes_on_what_was_asked(rollout: Recorder):
     ((system, options),) = rollout.calls
     assert code == 0 and system == "argon/crystal-108" and isinstance(options.pop("progress"), ProgressBar)
     assert options == {
-        "out": Path("here"), "steps": 200, "save_every": 5, "resume": None, "check": False, "report": False,
+        "out": Path("here"), "steps": 200, "save_every": 5, "check": False, "report": False,
         "overrides": {"cutoff.kind": "switched", "dynamics.seed": "3"},
     }  # fmt: skip
 
@@ -116,7 +121,9 @@ def test_time_that_is_up_before_a_verdict_is_neither_fine_nor_a_finding(
 def test_resume_needs_only_the_folder(rollout: Recorder):
     assert call("run", "--resume", "runs/x-1") == 0
     ((system, options),) = rollout.calls
-    assert system is options["out"] is None and options["resume"] == Path("runs/x-1")
+    options.pop("progress")
+    # nothing is passed on that was not given
+    assert system is None and options == {"resume": Path("runs/x-1")}
 
 
 @pytest.mark.parametrize(
@@ -173,7 +180,7 @@ def test_a_bug_keeps_its_traceback(rollout: Recorder):
 
 def test_a_run_that_is_stopped_names_the_folder_that_it_chose(tmp_path: Path, monkeypatch, capsys):
     def stopped(system: str, **options: Any) -> None:
-        folder = RunFolder.create(default_folder(system))
+        folder = RunFolder.create(default_folder(system), layout("md"))
         folder.checkpoint({}, force=True)
         options["progress"](3, 10, {"phase": "run", "folder": folder.path})
         options["progress"](0, 0, {"phase": "report"})
@@ -181,7 +188,7 @@ def test_a_run_that_is_stopped_names_the_folder_that_it_chose(tmp_path: Path, mo
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mdnum, "run", stopped, raising=False)
+    monkeypatch.setattr("mdnum.verbs.run.run", stopped)
     assert call("run", "argon/crystal-108") == 130
     assert "Continue it with `mdnum run --resume runs/argon-crystal-108-1`" in capsys.readouterr().err
 
@@ -204,16 +211,40 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]):
     assert "Usage: mdnum" in capsys.readouterr().out
 
 
+def commands(group: Any) -> Iterator[Any]:
+    """The commands below a group of the command line."""
+    for name in group.list_commands(None):
+        found = group.get_command(None, name)
+        yield from commands(found) if hasattr(found, "list_commands") else [found]
+
+
 def test_every_option_says_what_it_is():
-    """A name that is misspelled in options.toml would leave an option without a word."""
-    named = set()
-    for group in (app, fork, systems, check):
-        for one in group.registered_commands:
-            assert one.callback is not None
-            for name, parameter in inspect.signature(one.callback).parameters.items():
-                assert parameter.default.help, (one.callback.__name__, name)
-                named.add(name)
-    assert {name for texts in output._TEXTS.values() for name in texts} <= named
+    found = list(commands(typer.main.get_command(app)))
+    assert len(found) > 20
+    for one in found:
+        assert one.help and all(parameter.help for parameter in one.params), one.name
+
+
+def test_every_option_is_a_parameter_of_what_is_called():
+    """A name that is misspelled in a text file would be an option that no function takes."""
+    passed_on = {*Keep.__annotations__, *PairQuestion.__annotations__}
+    examined = 0
+    for entry in VERBS:
+        text = declared(entry)
+        shared = beside(verbs.__file__)["shared"] | declared(entry.split()[0]).get("shared", {})
+        for said in [*text.get("commands", {}).values(), *filter(None, [text.get("command")])]:
+            parts = [said, *(shared[one] for one in said.get("shares", ()))]
+            options = {name.removeprefix("no_") for part in parts for name in part.get("options", ())}
+            called = inspect.unwrap(getattr(VERBS[entry], said["calls"]))
+            if called.__name__ == "command":
+                # which passes on what it does not need
+                called = inspect.unwrap({"ball": bounce, "conform": conform, "fork map": fork_map}[entry])
+                options -= {"demo"}
+            parameters = inspect.signature(called).parameters
+            more = passed_on if any(one.kind is one.VAR_KEYWORD for one in parameters.values()) else set()
+            assert options - {"settings", "potential"} <= {*parameters, *more}, (entry, said["help"])
+            examined += len(options)
+    assert examined > 100
 
 
 @pytest.mark.usefixtures("strangers_folder")
@@ -282,8 +313,7 @@ def test_help_says_when_a_check_exits_with_1(capsys: pytest.CaptureFixture[str])
     assert call("systems", "check", "--help") == 0
     assert "a warning exits with 1" in " ".join(capsys.readouterr().out.split())
     assert call("flips", "--help") == 0
-    path = Path(output.__file__).with_name("options.toml")
-    text = tomllib.loads(path.read_text(encoding="utf-8"))["flips"]["drop_repeats"]
+    text = declared("flips")["command"]["options"]["drop_repeats"]["help"]
     assert f"--drop-repeats {text}" in " ".join(capsys.readouterr().out.split())
 
 

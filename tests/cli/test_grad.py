@@ -116,7 +116,7 @@ def test_the_folder_holds_the_derivative_of_the_closed_form(tmp_path):
     assert call("grad", WELL, "--of", "msd", "--wrt", "r_cut,initial.velocities", *options) == 0
     folder = RunFolder.open(out)
     summary = folder.summary
-    assert folder.world == "grad" and summary["status"] == "complete"
+    assert folder.kind == "grad" and summary["status"] == "complete"
     made = {one["method"]: one["gradient"] for one in summary["methods"]}
     # a reduced mass of 1 and a relative speed of 1 at 1.8; beyond 2.5 nothing acts
     u, slope = [4 * (r**-12 - r**-6) for r in (1.8, 2.5)], 4 * (-12 * 2.5**-13 + 6 * 2.5**-7)
@@ -230,7 +230,7 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 def write(path: Path, report: bool = False, **changes: Any) -> frame.Outcome:
     """A finished gradient folder, judged."""
-    folder = RunFolder.create(path, world="grad")
+    folder = RunFolder.create(path, frame.layout("grad"))
     write_text(
         folder.path / "system.toml", 'name = "argon/synthetic"\nunits = "lj"\n\n[dynamics]\ntimestep = 0.01\n'
     )

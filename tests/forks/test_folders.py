@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,18 +9,23 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rollout.harness import run
 
-from mdnum.errors import InputError
+from mdnum.errors import FolderError, InputError
 from mdnum.forks import fork
 from mdnum.forks.folders import compare_folders, twin_of
-from mdnum.rollout.run import run
+from mdnum.store import RunFolder
+from mdnum.store import files as manifest
+from mdnum.verbs.frame import layout
 
 STEPS = 260
 
 
 def copied(folder: Path, to: Path) -> Path:
-    """A copy that may be edited: its manifest, which would tell, is left out."""
-    return Path(shutil.copytree(folder, to, ignore=shutil.ignore_patterns("manifest.json")))
+    """A copy that may be edited: its manifest, which would tell, lists no file."""
+    shutil.copytree(folder, to)
+    manifest.save(to, manifest.Manifest(RunFolder.open(folder).layout))
+    return to
 
 
 @pytest.fixture(scope="module")
@@ -131,11 +135,13 @@ def test_other_systems_are_refused_by_what_differs(folders, tmp_path):
 
 def test_fork_folders_are_told_from_runs(folders, tmp_path):
     answered = tmp_path / "answered"
-    answered.mkdir()
-    (answered / "summary.json").write_text(json.dumps({"world": "fork", "question": "along"}))
+    RunFolder.create(answered, layout("map")).close()
     for pair in ((folders["plain"], answered), (answered, folders["plain"])):
         with pytest.raises(InputError, match=r"answered: .*fork folder.* `mdnum run`"):
             compare_folders(*pair)
+    (answered / "manifest.json").rename(answered / "summary.json")
+    with pytest.raises(FolderError, match=r"manifest\.json: is missing"):
+        compare_folders(folders["plain"], answered)
 
 
 def test_a_planted_flip_is_found(folders, tmp_path):

@@ -7,12 +7,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from ase import Atoms
-from rollout.harness import frames_of, go, tables_equal, write_system
+from rollout.harness import frames_of, go, run, tables_equal, write_system
 
 from mdnum.forks import Twin, fork
 from mdnum.forks.certified import certified, certified_horizon, protection
 from mdnum.rollout.program import MdProgram
-from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems.build import build
 from mdnum.systems.load import load

@@ -18,7 +18,7 @@ import pytest
 from ase.stress import full_3x3_to_voigt_6_stress
 from gradient_problems import everything
 from moving_box import Drifting, Flat, Forgetful, Pressed, Strained
-from rollout.harness import liquid
+from rollout.harness import liquid, run
 from rollout.test_resume import assert_goes_on, assert_same
 from small_systems import LENNARD_JONES, crystal, make
 
@@ -34,7 +34,6 @@ from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine, Start, first_state, resume_point, unwrapped
 from mdnum.rollout.flips import PairRecorder, decided_pairs, true_pairs
 from mdnum.rollout.lockstep import lockstep
-from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems.build import build
 from mdnum.systems.simulation import Simulation
@@ -265,7 +264,7 @@ def test_a_run_that_was_stopped_goes_on_in_its_box(tmp_path, monkeypatch):
 _KILLED = """
 import os, signal
 from rollout.test_moving_cell import moving
-from mdnum.rollout.run import run
+from rollout.harness import run
 from mdnum.store import RunFolder
 RunFolder.checkpoint_due = lambda self: True
 def progress(step, steps, info):

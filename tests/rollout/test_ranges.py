@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ase import Atoms
-from rollout.harness import go, liquid, write_system
+from rollout.harness import go, liquid, run, write_system
 from small_systems import KOB_ANDERSEN, make, mixture
 
 from mdnum.errors import NumericalError
-from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.build import build

@@ -12,11 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ase import Atoms
-from rollout.harness import assert_ledger_is_complete, frames_of, go, liquid, tables_equal, write_system
+from rollout.harness import (
+    assert_ledger_is_complete,
+    frames_of,
+    go,
+    liquid,
+    run,
+    tables_equal,
+    write_system,
+)
 
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.rollout.engine import Start, first_state
-from mdnum.rollout.run import RunResult, run
+from mdnum.rollout.run import RunResult
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.build import build
@@ -27,7 +35,7 @@ STEPS = 120
 CHILD = """
 import os, signal, sys
 from mdnum.store import RunFolder
-from mdnum.rollout.run import run
+from rollout.harness import run
 from mdnum.systems import load
 RunFolder.checkpoint_due = lambda self: True
 def progress(step, steps, info):

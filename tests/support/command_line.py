@@ -47,5 +47,5 @@ class Recorder:
         verdict = conclude(map(restore, self.summary["findings"]), headline="2,464 flips, none ambiguous.")
         keys = [Key("Flips", "2,464", "1,234 entered, 1,230 left")]
         page = Page("argon/crystal-108", "108 atoms", keys, [SHOWN, HIDDEN])
-        folder = options["out"] or options["resume"] or "runs/argon-crystal-108-1"
+        folder = options.get("out") or options.get("resume") or "runs/argon-crystal-108-1"
         return Outcome(Path(folder), self.summary, verdict, page)

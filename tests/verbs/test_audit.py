@@ -63,7 +63,7 @@ def test_what_is_right_is_safe_and_in_the_folder(good):
     assert "9 checks found nothing" in summary["headline"] and good.verdict.tone == "good"
     assert list(good.result) == CHECKS and summary["kT"] == pytest.approx(120 * 8.617333e-5, rel=1e-6)
     folder = RunFolder.open(good.folder)
-    assert folder.world == "audit" and folder.summary == plain(summary)
+    assert folder.kind == "audit" and folder.summary == plain(summary)
     energies = folder.read("energies")
     mine = energies["run"] == "run"
     assert mine.sum() == 41 and (~mine).sum() == 81

@@ -14,12 +14,12 @@ import pytest
 from mdnum import bounce, run
 from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
-from mdnum.store import TABLES, RunFolder
+from mdnum.store import RunFolder
 from mdnum.systems import build_ball, load
 from mdnum.verbs import ball_record, frame
-from mdnum.verbs.ball import VERBS, differs, judge
+from mdnum.verbs.ball import KINDS, differs, judge
 from mdnum.verbs.ball_page import TEXTS, BallView, page
-from mdnum.verbs.frame import Outcome
+from mdnum.verbs.frame import Outcome, layout
 
 PROJECTION = """\
 world = "ball"
@@ -114,8 +114,8 @@ def test_tables_and_summary_are_those_of_the_run(three: Outcome):
 def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     names = {path.name for path in three.folder.iterdir()}
     assert {"system.toml", "provenance.json", "summary.json"} <= names
-    assert {f"{name}.parquet" for name in TABLES["ball"]} <= names
-    assert not {f"{name}.parquet" for name in TABLES["md"]} & names
+    assert {f"{name}.parquet" for name in layout("ball").always} <= names
+    assert not {f"{name}.parquet" for name in layout("md").always} & names
     assert list(load(three.folder).variants) == ["stop.rule=per-instance"]
     with pytest.raises(FolderError, match="already holds a run"):
         bounce("ball/drop", out=three.folder)
@@ -367,7 +367,7 @@ def test_the_page_shows_what_the_folder_holds(
     rows = next(one for one in page(view, judge(view)).sections if one.title == "Gradient").parts[1].rows
     assert [row[0] for row in rows] == ["unrolled", "implicit", "smoothed"]
     assert rows[1][2] == "0 (does not depend)" and rows[2][2] == "does not apply"
-    assert VERBS["ball"].judge is judge
+    assert KINDS["ball"].judge is judge
 
 
 def test_a_page_says_at_which_step_a_narrower_format_would_not_do(tmp_path: Path):

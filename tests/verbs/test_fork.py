@@ -288,7 +288,7 @@ def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, fil
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):
         mdnum.fork("pair/at-cutoff", "precision", steps=3, out=tmp_path)
-    unfinished = RunFolder.create(tmp_path / "unfinished", world="fork")
+    unfinished = RunFolder.create(tmp_path / "unfinished", frame.layout("fork"))
     unfinished.finalize()
     with pytest.raises(FolderError, match="holds no answer"):
         frame.finish(unfinished)
@@ -301,7 +301,7 @@ def test_a_run_that_stops_leaves_the_folder_free(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         mdnum.fork("pair/at-cutoff", "start", steps=PAIR_STEPS, out=tmp_path / "here", progress=stop, **BARE)
-    RunFolder.create(tmp_path / "here", overwrite=True).close()
+    RunFolder.create(tmp_path / "here", frame.layout("md"), overwrite=True).close()
 
 
 def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, monkeypatch):

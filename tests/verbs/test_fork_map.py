@@ -49,7 +49,7 @@ def displacement(timestep: float) -> float:
 @pytest.mark.slow
 def test_the_folder_holds_the_piecewise_map(mapped):
     folder = RunFolder.open(mapped.folder)
-    assert folder.world == "map" and folder.summary == mapped.summary
+    assert folder.kind == "map" and folder.summary == mapped.summary
     summary = mapped.summary
     assert summary["key"] == "dynamics.timestep"
     assert (summary["low"], summary["high"], summary["value"]) == (0.06, 0.105, 0.07)
@@ -121,7 +121,7 @@ def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
         "loss_unit": "", "jump_largest": None, "separation_largest": None, "seconds": 1.0, "timestep": 0.1,
         "atoms": 2,
     }  # fmt: skip
-    folder = RunFolder.create(tmp_path / "map", world="map")
+    folder = RunFolder.create(tmp_path / "map", frame.layout("map"))
     folder.finalize()
     far = judged(folder, summary)
     assert page_map(View(folder, summary), far).sections

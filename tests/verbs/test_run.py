@@ -101,7 +101,7 @@ def make_run(
         "build_ms": rng.gamma(30.0, 0.2, len(start)), "first_lost_step": np.full(len(start), -1),
         **{name: np.zeros(len(start), int) for name in ("lost_pairs", "lost_pair_steps")},
     }  # fmt: skip
-    folder = RunFolder.create(path)
+    folder = RunFolder.create(path, frame.layout("md"))
     write_text(folder.path / "system.toml", toml)
     for last in (steps // 2, steps)[: 1 + finish]:
         begun = 0 if last < steps else steps // 2 + 1
@@ -314,7 +314,7 @@ def test_a_killed_run_is_judged_up_to_its_checkpoint_and_none_without_a_step(tmp
     verdict = frame.finish(folder).verdict
     assert (verdict.headline, verdict.findings[0].values["steps"]) == (TEXTS("partial"), 30)
     assert RunFolder.open(folder.path).resume() == {"step": 30}
-    empty = RunFolder.create(tmp_path / "empty")
+    empty = RunFolder.create(tmp_path / "empty", frame.layout("md"))
     write_text(empty.path / "system.toml", 'units = "lj"')
     with pytest.raises(FolderError, match="empty: holds no step"):
         frame.finish(empty)

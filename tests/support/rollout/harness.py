@@ -21,12 +21,20 @@ from mdnum.numerics.reductions import Exact
 from mdnum.numerics.sums import Reduction
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs
-from mdnum.rollout.run import RunResult, run
+from mdnum.rollout.run import RunResult
+from mdnum.rollout.run import run as roll_out
 from mdnum.store import RunFolder
 from mdnum.systems.load import System, load
 from mdnum.systems.simulation import Simulation
+from mdnum.verbs.frame import layout
 
 CRYSTAL = "argon/crystal-108"
+
+
+def run(system: Any, **options: Any) -> RunResult:
+    """A rollout into a folder of `mdnum run`, without its comparisons and page."""
+    return roll_out(system, layout("md"), **options)
+
 
 # tables of a system file; a test changes what it is about
 BASE: dict[str, dict[str, Any]] = {

@@ -1,0 +1,270 @@
+"""The commands of verbs, made from their text files; nothing of a verb is imported before it is called.
+
+`[command]` declares the command of a verb, `[group]` and `[commands.NAME]` those of one with several:
+
+    help        what `--help` says of it
+    calls       the function of the verb's module that is called, with the arguments in order (None where one
+                was left out) and the options that were given: `--save-every 5` as `save_every=5`,
+                `--no-check` as `check=False`. It returns an outcome, or a `Listing`.
+    shares      arguments and options that several commands have, from `[shared.NAME]` of the verb's or of
+                mdnum's text file: "a system", "changed" (its keys), "of a folder"
+    resumes     what `--resume` resumes, where options of a new one (`new = true`) are refused beside it
+    missing     what is wrong, and the remedy, where neither an argument nor `--resume` is given
+    lists       whether it lists something, and makes no folder
+    arguments, options   tables of what is typed, by name:
+
+        type        text, int, float, path, folder (of a run, which is compared with its manifest) or
+                    flag; two words for two values
+        flags       where they are others than --name
+        metavar, help, min, default, optional (an argument), repeatable (an option)
+        of          "module:NAME", a list of what there is, for `{of}` in help
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from mdnum import verbs
+from mdnum.cli import output
+from mdnum.errors import InputError, MdnumError
+from mdnum.plain import beside
+from mdnum.verbs import VERBS, declared
+
+# rich's help formatting costs more than the whole of --help may take
+PLAIN: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
+_TYPES = {"text": str, "int": int, "float": float, "path": Path, "folder": Path, "flag": bool}
+_Words = Mapping[str, Mapping[str, Any]]
+_SHARED: Mapping[str, Mapping[str, _Words]] = beside(verbs.__file__)["shared"]
+
+
+class Verbs(TyperGroup):
+    """The command line: verbs, those of other packages included, and the commands that it was made with."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(dict.fromkeys([*(name.split()[0] for name in VERBS), *self.commands]))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name in self.commands or cmd_name not in self.list_commands(ctx):
+            return self.commands.get(cmd_name)
+        try:
+            return _of_verb(cmd_name)
+        except InputError as error:
+            # a package that is broken; other verbs can be used
+            broken = error
+
+        def refuse() -> None:
+            raise broken
+
+        return _made(cmd_name, str(broken), refuse)
+
+
+class _Questions(TyperGroup):
+    """The questions of one verb; a first word that is none of them is what the usual one is asked of."""
+
+    group: Mapping[str, Any]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        group, first = self.group, args[0] if args else "--json"
+        if "alone" in group and set(args) <= {"--json"}:
+            args = [group["alone"], *args]
+        elif "usual" in group and first not in self.commands and first != "--help":
+            once = group.get("once", {})
+            if (
+                word := next((one for one in args if one.partition("=")[0] in once), "").partition("=")[0]
+            ) != "":
+                seen = f"{word} is no option of `mdnum {self.name}`, but a question"
+                raise InputError(seen, remedy=f"Ask `mdnum {self.name} {once[word]}`")
+            if "two" in group and len(args) > 1 and not args[1].startswith("-"):
+                both, folders = " ".join(args[:2]), all(map(os.path.isdir, args[:2]))
+                remedy = f"Ask `mdnum {group['two'][0 if folders else 1]} {both}`"
+                raise InputError(f"{both}: expected one system", remedy=remedy)
+            args = [group["usual"], *args]
+        return super().parse_args(ctx, args)
+
+
+def _of_verb(verb: str) -> Any:
+    """The command of a verb, or the group of its commands."""
+    texts = {name: declared(name) for name in verbs.of_command(verb)}
+    shared = {**_SHARED, **texts[verb].get("shared", {})}
+    if "group" not in texts[verb]:
+        return _command(_Declared.of(verb, texts[verb]["command"], shared), verb)
+    made = _Questions(
+        name=verb,
+        commands={
+            question: _command(_Declared.of(entry, said, shared), question)
+            for entry, text in texts.items()
+            for question, said in text.get("commands", {}).items()
+        },
+        help=texts[verb]["group"]["help"],
+        rich_markup_mode=None,
+    )
+    made.group = texts[verb]["group"]
+    return made
+
+
+@dataclass(frozen=True)
+class _Declared:
+    """A command as its text file declares it."""
+
+    entry: str  # of `VERBS`
+    said: Mapping[str, Any]
+    # arguments, options: by name, those included that it shares with others
+    arguments: _Words
+    options: _Words
+
+    @classmethod
+    def of(cls, entry: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> _Declared:
+        parts = [shared[name] for name in said.get("shares", ())]
+        # a system comes first among arguments, and a command's own options before those of others
+        arguments = {name: one for part in (*parts, said) for name, one in part.get("arguments", {}).items()}
+        options = {name: one for part in (said, *parts) for name, one in part.get("options", {}).items()}
+        return cls(entry, said, arguments, options)
+
+    @property
+    def typed(self) -> _Words:
+        """Arguments and options."""
+        return {**self.arguments, **self.options}
+
+
+def _command(declared: _Declared, name: str) -> Any:
+    """A command as the parser has it."""
+
+    def command(ctx: typer.Context, as_json: bool, **values: Any) -> int:
+        sources: dict[str, Any] = {name: ctx.get_parameter_source(name) for name in values}
+        return _called(declared, {k: v for k, v in values.items() if sources[k].name != "DEFAULT"}, as_json)
+
+    words = {name: parameter(name, one, typer.Argument) for name, one in declared.arguments.items()}
+    words |= {name: parameter(name, one, typer.Option) for name, one in declared.options.items()}
+    kinds = {"ctx": (typer.Context, inspect.Parameter.empty), **words, "as_json": (bool, output.JSON_OPTION)}
+    function: Any = command
+    function.__signature__ = inspect.Signature([
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+        for name, (kind, default) in kinds.items()
+    ])  # fmt: skip
+    function.__annotations__ = {name: kind for name, (kind, _) in kinds.items()}
+    return _made(name, declared.said["help"], function)
+
+
+def _made(name: str, help: str, function: Callable[..., Any]) -> Any:
+    maker = typer.Typer(**PLAIN)
+    maker.command(name, help=help)(function)
+    return typer.main.get_command(maker)
+
+
+def parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
+    """The type and the default of an argument or option, as typer reads those of a function.
+
+    Args:
+        make: `typer.Argument` or `typer.Option`.
+    """
+    types = [_TYPES[word] for word in said.get("type", "text").split()]
+    kind: Any = types[0] if len(types) == 1 else tuple[tuple(types)]
+    kind = list[kind] if said.get("repeatable") else kind
+    flags = [] if make is typer.Argument else _flags(name, said)
+    # a flag that has another one to turn it off is neither on nor off by default
+    default = said.get("default", False if kind is bool and "/" not in flags[0] else None)
+    if make is typer.Argument and not said.get("optional"):
+        default = ...
+    text, more = said["help"], {key: said[key] for key in ("min", "metavar") if key in said}
+    if "of" in said:
+        module, _, attribute = said["of"].partition(":")
+        text = text.format(of=", ".join(getattr(importlib.import_module(module), attribute)))
+    return kind | None if default is None else kind, make(default, *flags, help=text, **more)
+
+
+def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
+    return said.get("flags", f"--{name.replace('_', '-')}").split()
+
+
+SYSTEM_ARGUMENT = parameter("system", _SHARED["a system"]["arguments"]["system"], typer.Argument)[1]
+SET_OPTION = parameter("settings", _SHARED["changed"]["options"]["settings"], typer.Option)[1]
+
+
+# -- what is done when one is called
+
+
+def _called(declared: _Declared, given: dict[str, Any], as_json: bool) -> int:
+    """Calls the function of a command with what was typed, prints its answer and returns the exit code."""
+    from mdnum.store import RunFolder
+
+    said, typed = declared.said, declared.typed
+    if given.get("resume") == given.get("out"):
+        given.pop("out", None)
+    if "missing" in said and not given.keys() & {*declared.arguments, "resume"}:
+        raise InputError(said["missing"][0], remedy=said["missing"][1])
+    if "resumes" in said and "resume" in given:
+        _refuse_new(declared, given)
+    folders = dict.fromkeys(one for name, one in given.items() if typed[name].get("type") == "folder")
+    # looked at before a folder is listed anew, and said where nothing is worse
+    wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
+    arguments, options = [given.get(name) for name in declared.arguments], _options(declared, given)
+    stopped = False
+
+    def again() -> str | None:
+        """What can be done about the folder of a command that was stopped and has a --resume."""
+        folder = given.get("resume") or given.get("out") or progress.folder
+        with suppress(MdnumError):
+            return RunFolder.open(folder).again if "resume" in typed and folder is not None else None
+        return None  # it was stopped before there was one
+
+    with output.watched(again) as progress:
+        if not said.get("lists"):
+            options["progress"] = progress
+        try:
+            answer: Any = getattr(VERBS[declared.entry], said["calls"])(*arguments, **options)
+        except KeyboardInterrupt as stop:
+            # what was found until then may be an answer
+            if (answer := getattr(stop, "outcome", None)) is None:
+                raise
+            stopped = True
+    if not hasattr(answer, "verdict"):
+        code = output.print_lists(answer.document, as_json, *answer.tables)
+        for line in () if as_json else answer.lines:
+            output.say(line)
+        return code
+    output.print_lines(wrong)
+    code = output.print_outcome(answer, as_json=as_json)
+    return output.EXIT_STOPPED if stopped or answer.summary.get("interrupted") else code
+
+
+def _options(declared: _Declared, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was given as a function takes it; whoever names code on the command line allows it."""
+    options = {}
+    for name in given.keys() & declared.options.keys():
+        off = declared.options[name].get("type") == "flag" and name.startswith("no_")
+        options |= {name.removeprefix("no_"): False} if off else {name: given[name]}
+    if "changed" not in declared.said.get("shares", ()):
+        return options
+    overrides = output.parse_overrides(options.pop("settings", ()))
+    if (potential := options.pop("potential", None)) is not None:
+        file, colon, name = potential.rpartition(":")
+        function = json.dumps(f"{Path(file).resolve()}{colon}{name}")
+        overrides = {"potential.kind": "python", "potential.function": function, **overrides}
+        options["allow_code"] = True
+    return {**options, "overrides": overrides} if overrides else options
+
+
+def _refuse_new(declared: _Declared, given: Mapping[str, Any]) -> None:
+    """Refuses what a folder that is resumed has already.
+
+    Raises:
+        InputError: something of a new one was given.
+    """
+    from mdnum.verbs.frame import refuse
+
+    labels = {name: one["metavar"].strip("[]") for name, one in declared.arguments.items()}
+    labels |= {name: _flags(name, one)[-1].partition("/")[0] for name, one in declared.options.items()}
+    new = {labels[name]: True for name, one in declared.typed.items() if one.get("new") and name in given}
+    what = f"of a new {declared.said['resumes']}"
+    refuse(new, what, "Leave it out beside --resume, or begin in a new folder")

@@ -1,0 +1,107 @@
+"""What a folder holds, as whoever makes it declares it, and as the folder's manifest keeps it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from mdnum.plain import beside
+
+#: Types of columns, and what a value of each is in Python; a `word` is one of a few texts.
+TYPES: Mapping[str, tuple[type, ...]] = MappingProxyType({
+    "int32": (int,), "int64": (int,), "float64": (float, int), "bool": (bool,), "string": (str,),
+    "word": (str,),
+})  # fmt: skip
+_KIND = re.compile(r"[a-z][a-z0-9_-]{0,39}")
+_COMMAND = re.compile(r"[a-z][a-z0-9_-]{0,39}( [a-z0-9_-]{1,40}){0,3}")
+# names of tables become names of files
+_TABLE = re.compile(r"[a-z][a-z_]{0,39}\??")
+_COLUMN = re.compile(rf"([A-Za-z_]\w{{0,63}})(\?)?(?::({'|'.join(TYPES)}))?", re.ASCII)
+_MOST_TABLES, _MOST_COLUMNS = 100, 1000
+
+
+@cache
+def _types() -> Mapping[str, str]:
+    declared = beside(str(Path(__file__).with_name("types")))
+    return {name: kind for kind, names in declared.items() for name in names.split()}
+
+
+def type_of(column: str) -> str:
+    """The type of a column by its name, where its table does not give it another."""
+    return _types().get(column, "float64")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The kind of a folder: what makes it, what it is resumed from, and the columns of its tables.
+
+    Args:
+        kind: its name.
+        command: that makes such folders, without `mdnum`.
+        tables: names of columns by table, with spaces between. `name:type` is a column of a type of `TYPES`;
+            without one it has that of its name in types.toml, or is float64. `name?` may be unknown to
+            who writes the table, and is null then. A folder has every table, with rows or without, but for
+            those whose own name ends in a question mark.
+        usual: values of columns where rows leave them out, by table.
+        resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
+
+    Raises:
+        ValueError: a name, type or value is none that a folder could have.
+    """
+
+    kind: str
+    command: str
+    tables: Mapping[str, str] = field(default_factory=dict)
+    usual: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    resumes_from: str = ""
+
+    def __post_init__(self) -> None:
+        matched = (_KIND.fullmatch(self.kind), _COMMAND.fullmatch(self.command))
+        if not all(matched) or self.resumes_from not in ("", "checkpoint.npz", "answers.json"):
+            raise ValueError(f"no kind of folder: {self.kind!r}, {self.command!r}, {self.resumes_from!r}")
+        if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
+            raise ValueError(f"names of tables: {list(self.tables)[:3]}")
+        _ = self._columns
+        for table, values in self.usual.items():
+            for column, value in values.items():
+                kind, _ = self.columns(table)[column]
+                if type(value) not in TYPES[kind] or (type(value) is int and abs(value) >= 1 << 31):
+                    raise ValueError(f"{table}.{column} is {kind}, and {value!r} is none")
+
+    @cached_property
+    def always(self) -> tuple[str, ...]:
+        """Tables that every folder of the kind has."""
+        return tuple(name for name in self.tables if not name.endswith("?"))
+
+    def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
+        """The type of each column of a table, and whether it may be unknown; empty for one not declared."""
+        return self._columns.get(table, {})
+
+    @cached_property
+    def _columns(self) -> Mapping[str, Mapping[str, tuple[str, bool]]]:
+        found: dict[str, Mapping[str, tuple[str, bool]]] = {}
+        for table, text in self.tables.items():
+            words = text.split()
+            matches = [_COLUMN.fullmatch(word) for word in words]
+            if len(words) > _MOST_COLUMNS or not all(matches):
+                raise ValueError(f"columns of table {table!r}: {text[:100]!r}")
+            found[table.rstrip("?")] = {
+                one[1]: (one[3] or type_of(one[1]), bool(one[2]))
+                for one in matches
+                if one is not None
+            }
+        return found
+
+    @property
+    def spelled(self) -> dict[str, str]:
+        """`tables` with the type of every column, as the manifest keeps them."""
+        spelled = {}
+        for table in self.tables:
+            columns = self.columns(table.rstrip("?")).items()
+            spelled[table] = " ".join(f"{name}{'?' * free}:{kind}" for name, (kind, free) in columns)
+        return spelled
