@@ -66,7 +66,7 @@ class Verbs(TyperGroup):
         def refuse() -> None:
             raise broken
 
-        return _made(cmd_name, str(broken), refuse)
+        return _made(cmd_name, str(broken), refuse, ignore_unknown_options=True, allow_extra_args=True)
 
 
 class _Questions(TyperGroup):
@@ -156,9 +156,9 @@ def _command(declared: _Declared, name: str) -> Any:
     return _made(name, declared.said["help"], function)
 
 
-def _made(name: str, help: str, function: Callable[..., Any]) -> Any:
+def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -> Any:
     maker = typer.Typer(**PLAIN)
-    maker.command(name, help=help)(function)
+    maker.command(name, help=help, context_settings=settings)(function)
     return typer.main.get_command(maker)
 
 

@@ -16,7 +16,6 @@ with the functions that its commands call. Nothing of a verb is imported before 
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.util
 import re
 from collections.abc import Iterator, Mapping
@@ -30,6 +29,8 @@ from mdnum.registry import Registry
 
 def _check(module: Any) -> None:
     """Refuses the module of another package that has not what its text file declares."""
+    from mdnum.store import Layout
+
     texts, name = beside(module.__file__), module.__name__
     commands = [*texts.get("commands", {}).values(), *filter(None, [texts.get("command")])]
     calls = [one["calls"] for one in commands]
@@ -37,7 +38,8 @@ def _check(module: Any) -> None:
         raise TypeError(f"{name} has no function {lacking[0]}, which its text file names")
     if {*texts.get("kinds", ())} != {*getattr(module, "KINDS", ())}:
         raise TypeError(f"KINDS of {name} are not the kinds of its text file")
-    for kind in texts.get("kinds", ()):
+    for kind, said in texts.get("kinds", {}).items():
+        Layout(kind, **said)
         if VERBS.place(home(kind)) != name:
             raise ValueError(f"mdnum or another package has folders of kind {kind!r}")
 
@@ -66,7 +68,6 @@ def of_command(command: str) -> Iterator[str]:
     return (name for name in VERBS if name.split()[0] == command)
 
 
-@functools.cache
 def home(kind: str) -> str:
     """The entry of `VERBS` that declares a kind of folder.
 
@@ -86,7 +87,6 @@ def home(kind: str) -> str:
     )
 
 
-@functools.cache
 def _file(name: str) -> str:
     """The file of a module, found without importing it or a package that it is in."""
     first, *rest = VERBS.place(name).split(".")

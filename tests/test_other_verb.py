@@ -1,0 +1,183 @@
+"""A package outside mdnum adds a verb: a module and its text file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import call, printed
+from other_package import install
+
+from mdnum.errors import FolderError, InputError
+from mdnum.report.section import Table
+from mdnum.safe_path import environment
+from mdnum.store import RunFolder, files
+from mdnum.verbs import frame
+
+MODULE = '''
+"""`mdnum spread`: how far numbers lie apart."""
+
+import numpy as np
+
+from mdnum.report.finding import Texts, conclude
+from mdnum.report.section import Section, table_of
+from mdnum.verbs import frame
+
+TEXTS = Texts(__file__)
+
+
+@frame.keywords_checked
+def spread(path, *, above=1.0, sorted=True, **keep):
+    values = np.loadtxt(path, ndmin=1)
+    with frame.answering("spread", "spread", **keep) as answer:
+        values = np.sort(values) if sorted else values
+        answer.result, answer.summary = values, {"name": str(path), "above": above, "status": "complete"}
+        answer.tables["values"] = {"number": np.arange(len(values)), "value": values, "mark": "mine"}
+    return answer.outcome
+
+
+def judge(view):
+    values, above = view.table("values")["value"], view.summary["above"]
+    far = float(np.ptp(values))
+    found = [TEXTS.finding("FAR_APART", far=far)] if far > above else []
+    return conclude(found, headline=TEXTS("headline", n=len(values), far=far), best="good")
+
+
+def page(view, verdict):
+    rows = [{"number": n, "value": x} for n, x in enumerate(view.table("values")["value"])]
+    table = table_of(rows, {"number": "number", "value": "value"})
+    return view.page("Spread", "", [], [Section("Values", [table], terminal=True)])
+
+
+KINDS = {"spread": frame.Verb(judge, page)}
+'''
+TEXT = """
+[command]
+help = "Say how far numbers lie apart."
+calls = "spread"
+shares = ["of a folder"]
+
+[command.arguments]
+path = { type = "path", metavar = "FILE", help = "A number in each line." }
+
+[command.options]
+above = { type = "float", metavar = "X", help = "Warn above this." }
+no_sorted = { type = "flag", help = "Keep their order." }
+
+[kinds.spread]
+command = "spread"
+tables.values = "number:int64 value mark:word weight?"
+
+[sentences]
+headline = "{n:# number} within {far:3}."
+
+[FAR_APART]
+severity = "warning"
+title = "numbers are {far:3} apart"
+text = "Something is far out."
+"""
+
+
+@pytest.fixture
+def site(request, tmp_path, monkeypatch):
+    """The package on the search path, in an empty folder with three numbers; or one that is broken."""
+    module, text = getattr(request, "param", (MODULE, TEXT))
+    folder = install(
+        tmp_path / "site",
+        "strange-spread",
+        {"strange_spread": module},
+        {"mdnum.verbs": {"spread": "strange_spread"}},
+    )
+    if text is not None:
+        (folder / "strange_spread.toml").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.chdir(tmp_path)
+    Path("numbers.txt").write_text("3.5\n1.25\n2\n")
+    yield folder
+    sys.modules.pop("strange_spread", None)
+
+
+def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
+    assert call("--help") == 0
+    assert "spread   Say how far numbers lie apart." in capsys.readouterr().out
+    assert call("spread", "--help") == 0 and "--no-sorted" in capsys.readouterr().out
+    assert "strange_spread" not in sys.modules
+    assert call("spread", "numbers.txt", "--no-sorted", "-o", "out") == 1
+    lines = printed(capsys)
+    assert lines[0] == "3 numbers within 2.25. Look first: numbers are 2.25 apart."
+    assert "1 1.25" in lines and lines[-1] == "wrote out/report.html"
+    # from Python, and written again from its folder
+    folder = RunFolder.open("out")
+    assert (folder.kind, folder.layout.command) == ("spread", "spread")
+    table = folder.read("values")
+    assert table["value"].tolist() == [3.5, 1.25, 2.0] and set(table["mark"]) == {"mine"}
+    assert list(table) == ["number", "value", "mark"] and folder.damaged() == {}
+    page = Path("out/report.html").read_text(encoding="utf-8")
+    assert "numbers are 2.25 apart" in page and "1.25" in page
+    assert call("report", "out") == 0 and Path("out/report.html").read_text(encoding="utf-8") == page
+    import strange_spread  # pyright: ignore[reportMissingImports]
+
+    outcome = strange_spread.spread("numbers.txt", above=9.0)
+    assert outcome.folder.name == "spread-1" and not outcome.verdict.findings
+    assert isinstance(outcome.page.sections[0].parts[0], Table)
+    assert call("spread", "numbers.txt", "--above", "9", "--json") == 0
+    capsys.readouterr()
+
+
+def test_its_folder_is_one_clear_line_without_the_package(site, capsys):
+    assert call("spread", "numbers.txt", "-o", "out") == 1
+    capsys.readouterr()
+    # another process, which has not the package on its path
+    python = [sys.executable, "-P"]
+    done = subprocess.run([*python, "-m", "mdnum", "report", "out"], env=environment(), stderr=-1, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "no verb of this installation makes folders of kind 'spread'" in done.stderr
+    code = "from mdnum.store import RunFolder; print(RunFolder.open('out').read('values')['value'].tolist())"
+    read = subprocess.run([*python, "-c", code], env=environment(), stdout=-1, text=True)
+    assert read.stdout.strip() == "[1.25, 2.0, 3.5]"
+
+
+@pytest.mark.parametrize(
+    ("site", "said"),
+    [
+        ((MODULE, None), "has no text file"),
+        ((MODULE.replace("def spread", "def sprade"), TEXT), "no function spread"),
+        ((MODULE.replace('KINDS = {"spread"', 'KINDS = {"other"'), TEXT), "KINDS of strange_spread"),
+        ((MODULE.replace('KINDS = {"spread"', 'KINDS = {"grad"'), TEXT.replace("kinds.spread", "kinds.grad")),
+         "folders of kind 'grad'"),
+        ((MODULE, TEXT.replace("mark:word", "mark:colour")), "columns of table 'values'"),
+        (("raise ImportError('nothing')", TEXT), "ImportError: nothing"),
+    ],
+    indirect=["site"],
+)  # fmt: skip
+def test_a_verb_that_is_not_what_it_declares_names_its_package(site, capsys, said):
+    assert call("spread", "numbers.txt", "--json") == 2
+    error = json.loads(capsys.readouterr().out)["error"]["message"]
+    assert "strange-spread" in error and said in error
+    # and the others are there
+    assert call("--help") == 0 and "Simulate a system" in capsys.readouterr().out
+
+
+def test_a_folder_of_before_is_one_clear_line_and_its_tables_can_be_read(site, capsys):
+    assert call("spread", "numbers.txt", "-o", "out") == 1
+    made = files.load(Path("out"))
+    assert made is not None
+    made.layout = None
+    files.save(Path("out"), made)
+    capsys.readouterr()
+    assert call("report", "out") == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "an earlier version of mdnum wrote it" in error
+    assert RunFolder.open("out").read("values")["value"].tolist() == [1.25, 2.0, 3.5]
+    with pytest.raises(FolderError, match="holds no table 'series'"):
+        RunFolder.open("out").read("series")
+
+
+def test_a_kind_that_nobody_declares_is_refused_before_a_folder_is_made(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"no verb .* kind 'nothing'"), frame.answering("nothing", "x"):
+        pass
+    assert not list(tmp_path.iterdir())
