@@ -12,7 +12,9 @@ import pytest
 
 import mdnum
 from mdnum.plain import beside
-from mdnum.store import COLUMNS, TABLES, RunFolder, columns, columns_of
+from mdnum.store import RunFolder, columns
+from mdnum.verbs import VERBS, declared
+from mdnum.verbs.frame import layout
 
 pytest.importorskip("MDAnalysis")
 CRYSTAL = Path(__file__).parents[1] / "systems/argon/crystal-108.toml"
@@ -41,16 +43,15 @@ def of(field):
 
 
 def test_every_declared_column_has_a_description_and_no_other_has_one():
-    declared = beside(columns.__file__)
-    names = {name for world in TABLES for table in TABLES[world] for name in columns_of(world, table)}
-    names |= {name for table in COLUMNS.values() for name in table}
-    assert len(names) > 100
-    for world in TABLES:
-        for table in {*TABLES[world], *COLUMNS}:
-            for name in columns_of(world, table):
-                assert columns.meaning(table, name)[1], f"{table}.{name}"
-    assert set(declared) - {"columns"} <= set(COLUMNS)
-    for table, rows in declared.items():
+    described = beside(columns.__file__)
+    kinds = [layout(kind) for name in VERBS for kind in declared(name).get("kinds", ())]
+    tables = {table.rstrip("?") for kind in kinds for table in kind.tables}
+    names = {(table, name) for table in tables for kind in kinds for name in kind.columns(table)}
+    assert len(names) > 200
+    for table, name in names:
+        assert columns.meaning(table, name)[1], f"{table}.{name}"
+    assert set(described) - {"columns"} <= tables
+    for table, rows in described.items():
         for name, row in rows.items():
             assert len(row) == 2 and row[1] and not row[1].endswith("."), f"{table}.{name}"
             # a quantity is one that folders have, or a word that no quantity is made of
@@ -170,8 +171,8 @@ def test_duckdb_reads_words_flags_and_numbers(folder):
 def test_a_table_without_a_folder_around_it_has_no_metadata(tmp_path):
     from mdnum.store.tables import TableStream
 
-    RunFolder.create(tmp_path / "f", world="conform")
-    stream = TableStream(tmp_path / "f", "areas", "conform")
+    folder = RunFolder.create(tmp_path / "f", layout("conform"))
+    stream = TableStream(tmp_path / "f", "areas", folder.layout)
     stream.merge()
     assert pq.read_schema(tmp_path / "f/areas.parquet").metadata is None
     assert pa.types.is_int64(pq.read_schema(tmp_path / "f/areas.parquet").field("asked").type)

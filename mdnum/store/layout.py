@@ -91,9 +91,7 @@ class Layout:
             if len(words) > _MOST_COLUMNS or not all(matches):
                 raise ValueError(f"columns of table {table!r}: {text[:100]!r}")
             found[table.rstrip("?")] = {
-                one[1]: (one[3] or type_of(one[1]), bool(one[2]))
-                for one in matches
-                if one is not None
+                one[1]: (one[3] or type_of(one[1]), bool(one[2])) for one in matches if one is not None
             }
         return found
 

@@ -48,7 +48,6 @@ class TableStream:
     """
 
     def __init__(
-    def __init__(
         self, root: Path, name: str, layout: Layout | None, check: Callable[[Path], None] | None = None,
         about: Callable[[], Mapping[str, Any]] | None = None,
     ):  # fmt: skip
