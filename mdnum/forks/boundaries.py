@@ -56,6 +56,7 @@ class Boundary:
     step: int  # of it
     # labels of its pair, or of its ball; empty where one decision is the whole batch's
     subject: tuple[int, ...]
+    terms: str  # whose decision it is, where a pair has one for each term of a potential
     bound: float  # on the rounding error of its margin
     also: int  # further decisions that differ first at this step
     separation: float  # largest distance between the two final states, length
@@ -192,8 +193,11 @@ class NumberLine:
         moved = (runs[1].x - runs[0].x).reshape(len(runs[0].x), -1)
         separation = float(np.sqrt(np.max(np.sum(moved**2, axis=1))))
         low, high = sides
-        bound, also = decision.bounds["A"], decision.also
-        return Boundary(low, high, decision.channel, step, decision.subject, bound, also, separation)
+        bound, also, subject, terms = decision.bounds["A"], decision.also, decision.subject, ""
+        if decision.channel == "pair":
+            pair = self.at(below).simulation.pair_of(*subject)
+            subject, terms = (pair["i"], pair["j"]), pair.get("terms", "")
+        return Boundary(low, high, decision.channel, step, subject, terms, bound, also, separation)
 
 
 def boundaries(

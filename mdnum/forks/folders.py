@@ -10,19 +10,24 @@ and may be large.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import ROLES, program_of
+from mdnum.forks.worlds import ROLES, alike, program_of
 from mdnum.program import Twin
 from mdnum.store import RunFolder
+from mdnum.store.files import SIMULATION_FILE
 from mdnum.systems import load, opened
 from mdnum.systems.toml import flat
+
+if TYPE_CHECKING:
+    from mdnum.systems.simulation import Simulation
 
 Difference = tuple[str, Any, Any]
 
@@ -50,6 +55,7 @@ class StoredFlip:
     run: str
     step: int
     subject: tuple[int, ...]  # labels of the atoms of a pair, or of the ball
+    terms: str  # whose decision it is, where a potential has several terms
     entered: bool  # whether the pair enters its cutoff, or the contact begins
     # margin, bound: as stored: of the decision, and on its rounding error
     margin: float
@@ -109,19 +115,37 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         return _compared(first, second, where)
 
 
-def simulation_in(folder: Path) -> Any:
-    """The simulation or the ball's system of a run folder."""
-    return opened(load(folder))
+def simulation_in(folder: Path, objects: Sequence[Simulation] = ()) -> Any:
+    """The simulation or the ball's system of a run folder.
+
+    Args:
+        objects: simulations, one of which ran there; needed where it was made of objects.
+
+    Raises:
+        InputError: none of them did.
+    """
+    if not (folder / SIMULATION_FILE).is_file():
+        return opened(load(folder))
+    if not objects:
+        remedy = "Give it from Python, made by the same code: mdnum.fork_folders(a, b, objects=[...])"
+        message = "was made of objects, and no file says how to make them again"
+        raise InputError(message, where=str(folder), remedy=remedy)
+    from mdnum.systems.describe import again
+
+    for one in objects[:-1]:
+        with suppress(InputError):
+            return again(folder, one)
+    return again(folder, objects[-1])
 
 
-def twin_of(found: FolderFork) -> Twin:
-    """The runs of two folders of molecular dynamics, to be followed again.
+def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
+    """The runs of two folders of molecular dynamics, to be followed again; objects as for `simulation_in`.
 
     A replay has the bits of the stored run where versions and processor are the same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
-    a, b = (program_of(simulation_in(path)) for path in (found.a, found.b))
-    return Twin(a, b, difference or "nothing known")
+    a, b = alike(*(simulation_in(path, objects) for path in (found.a, found.b)))
+    return Twin(program_of(a), program_of(b), difference or "nothing known")
 
 
 def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
@@ -135,7 +159,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     if None not in counts and counts[0] != counts[1]:
         raise InputError(f"the runs have {counts[0]} and {counts[1]} {noun}", where=where, remedy=remedy)
     for key, one, other in programs:
-        if key in _SYSTEM[world]:
+        if key in _SYSTEM[world] or (key.startswith("terms.") and key.endswith(".potential.kind")):
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
@@ -163,10 +187,10 @@ def choices(programs: list[Difference]) -> list[str]:
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
     for key, one, other in programs:
-        table, _, name = key.partition(".")
+        table, _, name = key.rpartition(".")
         if table == "precision" and name in ROLES["md"]:
             out["precision"] = None
-        elif not (table == "cutoff" and "cutoff.kind" in keys and None in (one, other)):
+        elif not (table.endswith("cutoff") and f"{table}.kind" in keys and None in (one, other)):
             out[key] = None
     return list(out)
 
@@ -180,7 +204,8 @@ def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int
 ) -> tuple[int | None, list[StoredFlip]]:
     """The first step at which a flip is in one table alone, and those flips."""
-    names = ("step", *labels, "entered")
+    known = [folder.table(table, rows=1).column_names for folder in (first, second)]
+    names = ("step", *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
     tables = [folder.read(table, [*names, "margin", "bound", *further]) for folder in (first, second)]
     rows = [
@@ -198,8 +223,9 @@ def _alone(
             margin, bound = float(data["margin"][k]), float(data["bound"][k])
             distance = float(data["distance"][k]) if "distance" in data else float("nan")
             ambiguous = bool(data["ambiguous"][k]) if "ambiguous" in data else abs(margin) <= bound
-            subject = tuple(int(label) for label in row[1:-1])
-            flips.append(StoredFlip(run, step, subject, bool(row[-1]), margin, bound, distance, ambiguous))
+            subject, entered = tuple(map(int, row[1 : 1 + len(labels)])), bool(row[1 + len(labels)])
+            term = str(data["terms"][k]) if "terms" in names else ""
+            flips.append(StoredFlip(run, step, subject, term, entered, margin, bound, distance, ambiguous))
     return step, flips
 
 

@@ -69,7 +69,18 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
     """The system, and with other values of some keys of its file."""
     other = varied(system, values, name)
-    return Twin(program_of(system), program_of(other), difference, changes(system, other))
+    a, b = map(program_of, alike(system, other))
+    return Twin(a, b, difference, changes(system, other))
+
+
+def alike(a: Any, b: Any) -> tuple[Any, Any]:
+    """Two systems whose pairs have the same decisions: one for each term where only one shares them."""
+    if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
+        return a, b
+    groups = [[[row[0] for row in part.rows] for part in one.model.parts] for one in (a, b)]
+    if groups[0] == groups[1] or sorted(a.model.terms) != sorted(b.model.terms):
+        return a, b
+    return a.apart, b.apart
 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:

@@ -37,9 +37,9 @@ from mdnum.md.potentials import Channels, of_type
 from mdnum.rollout.epoch import over_rows
 
 #: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
-#: all distances, the forces themselves (for the derivatives by the integrator's numbers).
-MODEL, SCALE, FORCE = "model", "scale", "force"
-ALL = frozenset((MODEL, SCALE, FORCE))
+#: all distances, the forces themselves (for the derivatives by the integrator's numbers), weights of atoms.
+MODEL, SCALE, FORCE, WEIGHT = "model", "scale", "force", "weight"
+ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
 class ForceCotangents(NamedTuple):
@@ -66,7 +66,7 @@ def pull_back(
     Args:
         x: sorted, wrapped positions, length. bits: the decisions that were acted on, packed.
         onto_force, onto_energy, onto_virial: cotangents of the forces, the potential energy and the virial.
-        wanted: of MODEL, SCALE and FORCE; what is not wanted comes back as zeros.
+        wanted: of MODEL, SCALE, FORCE and WEIGHT; what is not wanted comes back as zeros.
 
     Error: a rounding error for each pair, in the dtype of the force; sums slot by slot.
     """
@@ -114,9 +114,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
             return jax.vjp(lambda shared: ended(slots, shared), shared)[1](onto)[0]
         return jax.vjp(lambda slots: ended(slots, shared), slots)[1](onto)[0]
 
+    def onto_weights(r2, along, inside, types, weights, others):
+        """Of each slot, what it adds to its atom: the pair is in a slot of the other one, too."""
+        onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along + virial * r2, 0)
+        by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
+        return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
+
     def terms(d, dw, inside, types) -> list[Array]:
         """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted."""
-        weights = factors(model, dw[3:])
+        weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
         (_, slope), (_, bend) = jax.jvp(
             lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
@@ -137,6 +143,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
                 for leaf in leaves
                 for kind in range(types_of)
             ]
+        if WEIGHT in wanted and weights:
+            made += onto_weights(r2, along, inside, types, weights, dw[3 + several :])
         return made
 
     sums = list(_summed(terms, columns, cell, tables, bits, force.in_one_loop(tables)))
@@ -144,7 +152,11 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
     made = jnp.stack(sums[3:6]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x)
     del sums[: 6 if FORCE in wanted else 3]
     scale = jnp.sum(sums.pop(0)) if SCALE in wanted else jnp.zeros((), dtype)
-    onto_model = jax.tree.map(jnp.zeros_like, model)
+    onto_model, onto_weight = jax.tree.map(jnp.zeros_like, (model, model.weights))
+    if WEIGHT in wanted and onto_weight:
+        places = jax.tree.structure(onto_weight)
+        each = [unsorted(sums.pop(), tables.order) for _ in range(places.num_leaves)]
+        onto_weight = jax.tree.unflatten(places, each[::-1])
     if MODEL in wanted:
         flat = jnp.stack([jnp.sum(total) for total in sums]).reshape(-1, types_of)
         onto_own, onto_at = jax.tree.unflatten(jax.tree.structure((own, at)), list(flat))
@@ -161,13 +173,14 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         (onto_model,) = back_to_model(onto_at)
         direct = jax.tree.map(jnp.add, onto_model.potential, eqx.combine(onto_own, onto_shared))
         onto_model = replace(onto_model, potential=direct)
-    return ForceCotangents(on_x, onto_model, scale, made)
+    return ForceCotangents(on_x, replace(onto_model, weights=onto_weight), scale, made)
 
 
 def _differences(cell, own, other):
-    """Of two vectors of two atoms, the first a position; then products of their weights, if there are any."""
+    """Of two vectors of two atoms, the first a position; then products of their weights, and the other's."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
-    return [*cell.minimum_image(*d[:3]), *d[3:], *(a * b for a, b in zip(own[6:], other[6:], strict=True))]
+    products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
+    return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
@@ -182,7 +195,7 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
     if made is not None:
         return made.sums
     index, types = tables.groups()
-    d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * len(columns)
+    d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * (2 * len(columns) - 6)
     inside = jax.ShapeDtypeStruct(index.shape[1:], np.bool_)
     first = jax.eval_shape(terms, d[:3], d[3:], inside, None if types is None else types[0])
     start = (jnp.zeros_like(columns[0]),) * len(first)
@@ -277,7 +290,7 @@ def reverse(
     """Derivatives of a tape's loss by everything that the run is made of.
 
     Args:
-        wanted: what is wanted beyond the start: of MODEL, SCALE and FORCE (the integrator's numbers).
+        wanted: what is wanted beyond the start: of MODEL, SCALE, FORCE (the integrator's numbers) and WEIGHT.
         saltation: whether to add what every flip does through the time at which it happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
         watch: called with every stretch, last first, and what was carried at its steps.
@@ -427,7 +440,7 @@ def transposed(
         w = (half * onto_kicked + second * onto_v) / mass_row
         made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
         model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
-        if MODEL in wanted:
+        if wanted & {MODEL, WEIGHT}:
             model = jax.tree.map(jnp.add, model, made.model)
         if FORCE in wanted:
             acceleration = made.force / mass_row

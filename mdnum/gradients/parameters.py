@@ -20,10 +20,10 @@ from mdnum.md import manybody
 from mdnum.md.integrators import Integrator, converted
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.systems import parameters
-from mdnum.systems.parameters import by, leaf_of, unit, value, with_values
+from mdnum.systems.parameters import by, is_weight, leaf_of, unit, value, with_values
 from mdnum.systems.simulation import Simulation
 
-__all__ = ["by", "unit", "value", "with_values"]
+__all__ = ["by", "is_weight", "unit", "value", "with_values"]
 
 #: Numbers of a system file that have no derivative, and why.
 _INTEGERS = {
@@ -79,7 +79,11 @@ def names(simulation: Simulation) -> tuple[str, ...]:
     """Parameters that a simulation can be differentiated by."""
     # there is no derivative by a temperature of 0
     cold = () if value(simulation, "dynamics.temperature") else ("dynamics.temperature",)
-    return tuple(name for name in parameters.names(simulation) if name not in ("neighbors.skin", *cold))
+    model = simulation.model
+    return tuple(
+        name for name in parameters.names(simulation)
+        if name not in ("neighbors.skin", *cold) and not parameters.shared_radius(model, name)
+    )  # fmt: skip
 
 
 def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
@@ -94,6 +98,10 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
         whole = next((key for key in _INTEGERS if word in (key, key.rpartition(".")[2])), None)
         if whole is not None and whole not in known:
             raise InputError(f"nothing is differentiable by {whole}: {_INTEGERS[whole]}", where=word)
+        if shared := parameters.shared_radius(simulation.model, word):
+            message = f"one decision of a pair is that of {', '.join(shared)}, which have the same radius"
+            remedy = "Differentiate by cutoff.radius, which moves that of all terms, or let theirs differ"
+            raise InputError(message, where=word, remedy=remedy)
         out += below or [parameters.resolve(simulation, word, known)]
     if not out:
         raise InputError("no parameter to differentiate by", remedy=f"There are {', '.join(known)}")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import FORCE, MODEL, SCALE, AdjointCarry, reverse
+from mdnum.gradients.adjoint import FORCE, MODEL, SCALE, WEIGHT, AdjointCarry, reverse
 from mdnum.gradients.crossings import Crossings
 from mdnum.gradients.parameters import Cotangents, columns_of, gathered
 from mdnum.gradients.problem import (
@@ -318,4 +318,7 @@ def wanted(names: Sequence[str]) -> frozenset[str]:
     """What the reverse pass has to work out for these parameters."""
     parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
     parts |= {"dynamics": {FORCE}, "box": {SCALE, FORCE}}
-    return frozenset(part for name in names for part in parts.get(name.partition(".")[0], ()))
+    return frozenset(
+        part for name in names
+        for part in ((WEIGHT,) if parameters.is_weight(name) else parts.get(name.partition(".")[0], ()))
+    )  # fmt: skip

@@ -307,8 +307,7 @@ class CutPotential(eqx.Module):
     def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential:
         """The sum of terms that have the same radii, by name."""
         parts = list(terms.values())
-        rows = [(one.potential, one.cutoff, one.r_onset, (*one.weights, None)[0]) for one in parts]
-        bare, ends, onsets, weights = zip(*rows, strict=True)
+        _, bare, ends, onsets, weights = zip(*(one.rows[0] for one in parts), strict=True)
         weights = weights if any(one.weights for one in parts) else ()
         return cls(SumPotential(tuple(terms), bare), Together(ends), parts[0].r_cut, onsets, weights)
 
@@ -318,15 +317,22 @@ class CutPotential(eqx.Module):
         return (self,)
 
     @property
+    def rows(self) -> list[tuple[str, PairPotential, Cutoff, Any, Any]]:
+        """Of each term its name ("" of a plain potential), bare potential, end, onset and weights or None."""
+        # eqx.tree_at looks at a tree whose empty tuples are leaves
+        weights = self.weights if isinstance(self.weights, tuple) else ()
+        if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
+            return [("", self.potential, self.cutoff, self.r_onset, (*weights, None)[0])]
+        weights = weights or (None,) * len(self.r_onset)
+        parts = (self.potential.parts, self.cutoff.ends, self.r_onset, weights)
+        return list(zip(self.potential.names, *parts, strict=True))
+
+    @property
     def terms(self) -> dict[str, CutPotential]:
         """Its terms by name, each with its weights; of a plain potential itself, without a name."""
-        if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
-            return {"": self}
-        weights = self.weights or (None,) * len(self.r_onset)
-        parts = (self.potential.parts, self.cutoff.ends, self.r_onset, weights)
         return {
             name: CutPotential(part, end, self.r_cut, onset, () if weight is None else (weight,))
-            for name, part, end, onset, weight in zip(self.potential.names, *parts, strict=True)
+            for name, part, end, onset, weight in self.rows
         }
 
     @property
@@ -372,8 +378,8 @@ class Channels(eqx.Module):
     parts: tuple[CutPotential, ...]
 
     @classmethod
-    def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential | Channels:
-        """The sum of terms by name, those with the same radii in one channel.
+    def of_terms(cls, terms: Mapping[str, CutPotential], *, apart: bool = False) -> CutPotential | Channels:
+        """The sum of terms by name, those with the same radii in one channel; or each in its own, `apart`.
 
         Raises:
             InputError: a name that is no part of a key.
@@ -384,7 +390,7 @@ class Channels(eqx.Module):
                 raise InputError(message, where="terms", remedy="Give it another name")
         groups: dict[bytes, dict[str, CutPotential]] = {}
         for name, term in terms.items():
-            groups.setdefault(np.asarray(term.r_cut).tobytes(), {})[name] = term
+            groups.setdefault(name.encode() if apart else np.asarray(term.r_cut).tobytes(), {})[name] = term
         parts = tuple(CutPotential.of_terms(group) for group in groups.values())
         return parts[0] if len(parts) == 1 else cls(parts)
 

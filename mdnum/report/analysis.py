@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -54,6 +55,12 @@ class PairCounts:
     i: Int[np.ndarray, "pairs"]
     j: Int[np.ndarray, "pairs"]
     flips: Int[np.ndarray, "pairs"]
+    terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
+
+    def rows(self, most: int) -> list[dict[str, Any]]:
+        """The first pairs, in plain values."""
+        columns = {name: values[:most].tolist() for name, values in vars(self).items()}
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 class Scan:
@@ -81,6 +88,8 @@ class Scan:
         # pair, step and side of the flips that came since
         self._recent: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self._ratios: list[np.ndarray] = []
+        # numbers of the terms that decide, by name
+        self._terms: dict[str, int] = {"": 0}
         #: Rows nearest to their threshold in the order of the table, by column.
         self.nearest: dict[str, np.ndarray] = {}
 
@@ -103,7 +112,11 @@ class Scan:
         ratio = margins_in_bounds(flips)
         self._ratios.append(ratio)
         self._keep_nearest(flips, ratio)
-        pair = (flips["i"].astype(np.int64) << 32) | flips["j"].astype(np.int64)
+        pair = (flips["i"].astype(np.int64) << 28) | flips["j"].astype(np.int64)
+        if "terms" in flips:
+            # each term decides by itself
+            names, at = np.unique(flips["terms"].astype(str), return_inverse=True)
+            pair |= np.array([self._terms.setdefault(name, len(self._terms)) for name in names])[at] << 56
         self._recent.append((pair, step, came))
         # sorted with all pairs so far, so not before they are as many
         if sum(len(part[0]) for part in self._recent) > max(_AT_ONCE, len(self._key)):
@@ -143,7 +156,8 @@ class Scan:
         self._follow()
         order = np.argsort(-self._count, kind="stable")
         key = self._key[order]
-        return PairCounts(i=key >> 32, j=key & 0xFFFFFFFF, flips=self._count[order])
+        i, j, terms = key >> 28 & 0xFFFFFFF, key & 0xFFFFFFF, np.array(list(self._terms))[key >> 56]
+        return PairCounts(i, j, self._count[order], terms)
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
         """At each step, whether the table of flips has as many as the series counted there."""

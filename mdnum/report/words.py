@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MINUS = "\N{MINUS SIGN}"
@@ -51,6 +52,11 @@ def plain(value: float | None, digits: int = 4) -> str:
     """As `number`, without zeros that only fill up the digits: for what was chosen rather than measured."""
     text = number(value, digits)
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
+
+
+def pair_name(pair: Mapping[str, Any]) -> str:
+    """A pair of atoms by its labels, and the term of the potential whose decision it is, if there is one."""
+    return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 
 def many(value: float | None, noun: str, plural: str | None = None) -> str:

@@ -27,7 +27,7 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.manybody import leaves_by_path, quantities_of, with_quantities
 from mdnum.md.neighbors import check_radius
-from mdnum.md.potentials import Channels, CutPotential, SumPotential, Together
+from mdnum.md.potentials import Channels, CutPotential
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
 from mdnum.registry import nearest
@@ -124,14 +124,19 @@ def is_positive(simulation: Simulation, name: str) -> bool:
     whole = entry(simulation, name).whole
     if "potential." in whole:
         return _is_typed(simulation, whole) and number(simulation, name) > 0
-    return not whole.startswith("initial.")
+    return not (whole.startswith("initial.") or is_weight(whole))
 
 
 def by(simulation: Simulation, name: str) -> str:
     """What a parameter has an entry for: "pair type" or "atom"; "" where it is one for all."""
-    if name.startswith("initial."):
+    if name.startswith("initial.") or is_weight(name):
         return "atom"
     return "pair type" if _is_typed(simulation, name) and simulation.pair_types > 1 else ""
+
+
+def is_weight(name: str) -> bool:
+    """Whether a path is that of the weights of a term."""
+    return name.startswith("terms.") and name.split(".")[2:] == ["weight"]
 
 
 def _is_typed(simulation: Simulation, name: str) -> bool:
@@ -140,11 +145,13 @@ def _is_typed(simulation: Simulation, name: str) -> bool:
 
 def unit(simulation: Simulation, name: str) -> str:
     """The unit of a parameter: "" for none, its own name in brackets where none is known."""
-    table, last = name.partition(".")[0], entry(simulation, name).whole.rpartition(".")[2]
+    table, whole = name.partition(".")[0], entry(simulation, name).whole
+    last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
     word = last if field is None else field.metadata.get("unit")
     word = "velocity" if table == "velocity" and last == "velocities" else word
-    return _UNITS.get(word, f"[{last}]").format_map(vars(simulation.units))
+    known = "" if is_weight(whole) else _UNITS.get(word, f"[{last}]")
+    return known.format_map(vars(simulation.units))
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
@@ -174,28 +181,33 @@ def leaf_of(model: Any, name: str) -> Any:
 
 
 def pair_leaves(model: CutPotential | Channels, shared: bool = True) -> dict[str, Any]:
-    """The arrays of pair potentials and their ends by path; those that all pairs share where wanted.
+    """The arrays of pair potentials and their ends by path; those without pair types where wanted.
 
-    The radius of terms that share their decisions is one, and among others it has no path.
+    `cutoff.radius` is that of all terms where they agree. Of some that do each has the one that they share.
     """
-    if isinstance(model, Channels):
-        each = [pair_leaves(part, shared) for part in model.parts]
-        return {key: leaf for one in each for key, leaf in one.items() if key != "cutoff.radius"}
-    bare, cutoff = model.potential, model.cutoff
-    if isinstance(bare, SumPotential) and isinstance(cutoff, Together):
-        rows = zip(
-            [f"terms.{name}." for name in bare.names], bare.parts, cutoff.ends, model.r_onset, strict=True
-        )
-        only = f"terms.{bare.names[0]}." if len(bare.names) == 1 else ""
-    else:
-        rows, only = [("", bare, cutoff, model.r_onset)], ""
     found: dict[str, Any] = {}
-    ends = {f"{only}cutoff.radius": model.r_cut}
-    for prefix, potential, end, onset in rows:
-        own = {**potential.leaves, **(leaves_by_path(potential.shared) if shared else {})}
-        found |= {f"{prefix}potential.{key}": leaf for key, leaf in own.items()}
-        ends |= {f"{prefix}cutoff.onset": onset} if end.switches else {}
-    return found | ends
+    for part in model.parts:
+        every = len(model.parts) == 1 < len(part.rows)
+        ends = {"cutoff.radius": part.r_cut} if every else {}
+        for name, potential, end, onset, weight in part.rows:
+            term = f"terms.{name}." if name else ""
+            own = {**potential.leaves, **(leaves_by_path(potential.shared) if shared else {})}
+            found |= {f"{term}potential.{key}": leaf for key, leaf in own.items()}
+            found |= {f"{term}weight": weight} if shared and weight is not None else {}
+            ends |= {f"{term}cutoff.radius": part.r_cut}
+            ends |= {f"{term}cutoff.onset": onset} if end.switches else {}
+        found |= ends
+    return found
+
+
+def shared_radius(model: Any, name: str) -> tuple[str, ...]:
+    """The terms that share their decisions with the one whose radius this is, itself included; else none."""
+    table, term, key = (*name.split(".", 2), "", "")[:3]
+    if table != "terms" or key != "cutoff.radius":
+        return ()
+    each = ([row[0] for row in part.rows] for part in getattr(model, "parts", ()))
+    names = next((names for names in each if term in names), ())
+    return tuple(names) if len(names) > 1 else ()
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
@@ -230,8 +242,11 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
         return replace(simulation, model=model, decider=decider)
     if table in ("potential", "cutoff", "terms"):
         leaf = jnp.asarray(new.reshape(leaf_of(model, name).shape))
+        if shared_radius(model, name):
+            simulation = simulation.apart
+            model = simulation.model
         model = eqx.tree_at(lambda one: leaf_of(one, name), model, leaf)
-        if "potential." in name:
+        if "cutoff." not in name:
             return replace(simulation, model=model)
         if table == "cutoff" and not model.cutoff.switches and "" in model.terms:
             model = eqx.tree_at(lambda one: one.r_onset, model, leaf)
@@ -240,10 +255,8 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
             if term.cutoff.switches and np.any(onset >= radius):
                 seen = f"an onset of {float(np.max(onset))!r} is not below"
                 raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
-        radius = np.asarray(model.r_cut)
-        check_radius(simulation.cell, float(np.max(radius)), simulation.rule.skin)
-        decider = replace(simulation.decider, r_cut=tuple(radius.tolist()))
-        return replace(simulation, model=model, decider=decider)
+        check_radius(simulation.cell, float(np.max(model.r_cut)), simulation.rule.skin)
+        return simulation.with_model(model)
     if table == "dynamics":
         if key in integrator.numbers():
             simulation = replace(simulation, integrator=integrator.with_number(key, new, simulation.units))
@@ -422,7 +435,11 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
         return redrawn(simulation) if simulation.draw.drawn else simulation
     name = resolve(simulation, key, names(simulation))
     one = np.ndim(given) == 0 and _is_number(simulation, name)
-    return with_number(simulation, name, given) if one else with_values(simulation, {name: given})
+    made = with_number(simulation, name, given) if one else with_values(simulation, {name: given})
+    if table != "terms" or "cutoff." not in name:
+        return made
+    # radii that agree now, or no longer
+    return made.with_model(Channels.of_terms(made.model.terms))
 
 
 def redrawn(simulation: Simulation) -> Simulation:

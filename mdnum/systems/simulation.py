@@ -240,7 +240,18 @@ class Simulation:
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
-        return {"i": i, "terms": np.array([part.potential.name for part in self.model.parts])[channel]}
+        return {"i": i, **self.terms_of(channel * self.pair_types)}
+
+    def terms_of(self, kind: Any) -> dict[str, Any]:
+        """The terms that kinds of decisions belong to, as a column; none where there are no channels."""
+        if self.channels == 1:
+            return {}
+        names = np.array([part.potential.name for part in self.model.parts])
+        return {"terms": names[kind // self.pair_types]}
+
+    def pair_of(self, i: int, j: int) -> dict[str, Any]:
+        """The labels of a decision's pair, i as for `type_of`, and its term if there are channels."""
+        return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
         """Energy and radial force that a pair brings when it enters, per kind of decision.
@@ -305,6 +316,16 @@ class Simulation:
             types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
         # not jnp.asarray, which compiles a program for every shape
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
+
+    def with_model(self, model: CutPotential | Channels) -> Simulation:
+        """The same system with other pair terms, and decisions at their radii."""
+        decider = replace(self.decider, r_cut=tuple(np.asarray(model.r_cut).tolist()))
+        return replace(self, model=model, decider=decider)
+
+    @property
+    def apart(self) -> Simulation:
+        """The same terms with a decision of its own for each, radii that agree included."""
+        return self.with_model(Channels.of_terms(self.model.terms, apart=True))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same).

@@ -6,7 +6,7 @@ are compared or followed again (`fork_folders`), or ensembles are (`fork_benign`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from mdnum.report.words import count
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
-from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
+from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen, of_pair
 from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
@@ -168,7 +168,9 @@ def fork_screen(
 
 
 @partial(frame.keywords_checked, more=PairQuestion.__annotations__)
-def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked: Any) -> Outcome:
+def fork_folders(
+    a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
+) -> Outcome:
     """Compare two finished runs of one world: what was different, and where they diverge.
 
     Example:
@@ -179,6 +181,8 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
         replay: follow both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
             summary then says whether the replay diverges where the stored tables do: it has their bits where
             versions and processor are the same. Else nothing is run: dates are those of the stored tables.
+        objects: the simulations that ran there, where they were made of objects; which one is which, and
+            whether they are those, is told by what the folders say of them.
         asked: out, report and progress; of a replay also steps, split, repeats, counterfactual, back,
             lyapunov, minimal and pin of `fork`, and no more steps than both runs have.
 
@@ -194,7 +198,7 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
     keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
     frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
-    system: Any = simulation_in(found.a)
+    system: Any = simulation_in(found.a, objects)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:
@@ -220,7 +224,7 @@ def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked:
 
     labels = {"choice": "replay", "choice_about": TEXTS("replay"), "must_hold": False}
     frame.say(keep.get("progress"), "compile")
-    return followed(system, twin_of(found), labels, replace(question, steps=last), stored, **keep)
+    return followed(system, twin_of(found, objects), labels, replace(question, steps=last), stored, **keep)
 
 
 @frame.keywords_checked
@@ -335,7 +339,7 @@ def page_compare(view: View, verdict: Verdict) -> Page:
     different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
     decisions = table_of(s["decisions"], {
         "only in": "run", s["channel"] if s["channel"] == "pair" else "ball":
-            lambda flip: "–".join(map(str, flip["subject"])),
+of_pair,
         "enters": "entered", "margin": "margin", "bound": "bound", "ambiguous": "ambiguous",
     })  # fmt: skip
     iterations = Table(("in A", "in B"), [s["iterations"]])

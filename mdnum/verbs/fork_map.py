@@ -13,6 +13,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
+from mdnum.report.words import pair_name
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_md
@@ -159,13 +160,14 @@ def _row(edge: Boundary) -> dict[str, Any]:
     side = "above" if above.decided else "below"
     who, way, gradients = f"ball {first}", f"touches {side}", {}
     if edge.channel == "pair":
-        who, way = "–".join(map(str, edge.subject)), f"in {side}"
+        who, way = pair_name({"i": first, "j": second, "terms": edge.terms}), f"in {side}"
     else:
         gradients = {"gradient_below": below.gradient, "gradient_above": above.gradient}
     if edge.channel == "stop":
         who, way = who if edge.subject else "solver", f"{below.decided} → {above.decided}"
     return {
-        "below": below.at, "above": above.at, "step": edge.step, "i": first, "j": second, "who": who,
+        "below": below.at, "above": above.at, "step": edge.step, "i": first, "j": second,
+        **({"terms": edge.terms} if edge.terms else {}), "who": who,
         "way": way, "channel": edge.channel,
         "inside": above.decided < below.decided if edge.channel == "stop" else bool(above.decided),
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,

@@ -23,7 +23,7 @@ from mdnum.report.section import (
     positive,
     table_of,
 )  # fmt: skip
-from mdnum.report.words import count, listed, many, number, plain
+from mdnum.report.words import count, listed, many, number, pair_name, plain
 from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
 
 if TYPE_CHECKING:
@@ -259,7 +259,9 @@ def _pinned(view: View) -> Iterator[Any]:
     if pinned["pairs"] is None:
         yield TEXTS("pinned_none", **pinned)
         return
-    names = listed([f"{i}–{j}" for i, j in pinned["pairs"]])
+    terms = pinned.get("terms") or [""] * len(pinned["pairs"])
+    each = zip(pinned["pairs"], terms, strict=True)
+    names = listed([pair_name({"i": i, "j": j, "terms": term}) for (i, j), term in each])
     kind = "kept" if pinned["split"] is None else "splits"
     yield TEXTS(f"pinned_{kind}", **{**pinned, "pairs": names}, unit=view.units.length)
 
@@ -286,7 +288,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
     if minimal["pairs"]:
         yield table_of(
             minimal["pairs"],
-            {"pair": lambda pair: f"{pair['i']}–{pair['j']}", "decided differently, steps": spells},
+            {"pair": pair_name, "decided differently, steps": spells},
         )
 
 

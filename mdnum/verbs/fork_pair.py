@@ -259,8 +259,7 @@ def _decision(made: Fork) -> dict[str, Any] | None:
             length = decision.margin / (2.0 * run.decider.r_cut[kind])
         root = np.sqrt if space == "r2" else float
         distance, *cutoffs = (float(root(x)) for x in (thresholds[2] - decision.margin, *thresholds[:2]))
-        first = {key: np.asarray(value).item() for key, value in a.first_atoms(i).items()}
-        subject = {**first, "j": j, "distance": distance, "margin_length": length,
+        subject = {**a.pair_of(i, j), "distance": distance, "margin_length": length,
                    "cutoffs": dict(zip("AB", cutoffs, strict=True))}  # fmt: skip
     before = decision.separation
     return {
@@ -288,7 +287,7 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
         tables["neighborhood"] = {"atom": around.atoms}
         for head, vectors in (("", around.positions), ("d", around.moved)):
             tables["neighborhood"] |= {f"{head}{name}": vectors[:, k] for k, name in enumerate("xyz")}
-    sure = certified(made)
+    sure, named = certified(made), made.twin.a.simulation.first_atoms
     doubts = {name: vars(made.doubts[name]) for name in sure.horizon}
     summary: dict[str, Any] = {
         "decision": decision, "r_cut": made.twin.a.simulation.r_cut,
@@ -296,14 +295,14 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
         "ambiguous": {name: one.decisions for name, one in sure.horizon.items()},
         "ambiguous_steps": {name: one.steps for name, one in sure.horizon.items()},
         "ambiguous_first": {
-            name: {key: values[0] for key, values in rows.items()} if len(rows["step"]) else None
+            name: {key: values[0] for key, values in (rows | named(rows["i"])).items()}
+            if len(rows["step"]) else None
             for name, rows in doubts.items()
         },
         "lists_complete": {name: one.complete for name, one in sure.horizon.items()},
         "protected_until": sure.protected, "shadow": sure.shadow, "shadow_horizon": sure.shadow_step,
     }  # fmt: skip
     names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
-    named = made.twin.a.simulation.first_atoms
     columns = {name: [getattr(flip, name) for flip in made.flips] for name in names}
     tables["cross_flips"] = {**columns, **named(columns["i"])}
     tables["ambiguous_pairs"] = {
@@ -391,6 +390,9 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
     separation["pinned"] = found.separation
     seen = found.separation[np.isfinite(found.separation)]
     row = {name: getattr(found, name) for name in ("pairs", "first", "last", "split", "free")}
+    named = [made.twin.a.simulation.pair_of(*pair) for pair in found.pairs]
+    row["pairs"] = [(pair["i"], pair["j"]) for pair in named]
+    row |= {"terms": [pair["terms"] for pair in named]} if "terms" in named[0] else {}
     return {"pin": pin, **row, "until": len(seen) - 1, "largest": seen.max(), "reason": None}
 
 
@@ -405,7 +407,8 @@ def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
     except InputError as error:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
     pairs = found.pairs and [
-        {"i": i % made.twin.a.size, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs
+        {**made.twin.a.simulation.pair_of(*pair), "differs": disagreements(made, *pair)}
+        for pair in found.pairs
     ]
     row = {**vars(found), "proven": found.proven, "fork_alone": found.code == "alone", "pairs": pairs}
     return row | {"reason": TEXTS(f"minimal_{found.code}", **row, n=len(pairs or ()))}

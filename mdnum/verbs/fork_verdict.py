@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mdnum.numerics.verdicts import REPEATS
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.words import listed
+from mdnum.report.words import listed, pair_name
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
@@ -30,7 +30,14 @@ def subject(s: Mapping[str, Any]) -> str:
     if d is None:
         return ""
     shared = d["channel"] == "stop" and d["ball"] is None
-    return TEXTS("subject_stop_all" if shared else f"subject_{d['channel']}", **d)
+    kind = f"{d['channel']}{'_all' * shared}{'_term' * bool(d.get('terms'))}"
+    return TEXTS(f"subject_{kind}", **d)
+
+
+def of_pair(flip: Mapping[str, Any]) -> str:
+    """Whose decision a stored flip is: a pair's, of a term where there are several, or a ball's."""
+    i, *j = flip["subject"]
+    return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
 
 def judge(view: View) -> Verdict:
@@ -178,7 +185,7 @@ def judge_compare(view: View) -> Verdict:
         evidence.append(TEXTS("folders_start"))
     if summary["decisions"]:
         flip = summary["decisions"][0]
-        which = "–".join(str(label) for label in flip["subject"])
+        which = of_pair(flip)
         yes = "entered" if flip["entered"] else "left"
         evidence.append(TEXTS(f"folders_{summary['channel']}_{yes}", **values, which=which, **flip))
     elif summary["iterations"]:

@@ -257,7 +257,7 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
         trust["half"] = {name: brief(one[0] if len(one) == 1 else one) for name, one in half.items()}
         trust["near"] = None if turns is None else {
             "turns": len(turns), "within": int(turns.within.sum()),
-            "heaviest": turns.heaviest(found.trust.columns),
+            "heaviest": turns.heaviest(found.trust.columns, simulation.terms_of),
         }  # fmt: skip
     return basics(simulation, problem.steps) | {
         "world": "grad",

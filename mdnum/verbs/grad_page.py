@@ -12,7 +12,7 @@ import numpy as np
 from mdnum.report.browse import Browse
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import ROLES, Code, Key, Page, Section, Series, Table, curves, pairs, table_of
-from mdnum.report.words import count, heading, listed, many, number, percent
+from mdnum.report.words import count, heading, listed, many, number, pair_name, percent
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
@@ -293,7 +293,7 @@ def _trust(view: View) -> Iterator[Any]:
     if near:
         yield TEXTS("near_table")
         yield table_of([one | {f"by {name}": term for name, term in one["term"].items()} for one in near], {
-            "pair": lambda one: f"{one['i']}–{one['j']}", "before step": "step", f"gap ({unit})": "gap",
+            "pair": pair_name, "before step": "step", f"gap ({unit})": "gap",
             f"reach ({unit})": "reach", **{f"by {name}": f"by {name}" for name in near[0]["term"]},
         }, "Pairs that nearly flipped, or nearly did not")  # fmt: skip
     table = view.table("trust")
@@ -378,7 +378,7 @@ def _edges(view: View) -> Iterator[Any]:
         for side in (one["below"], one["above"]):
             rows.append([one["name"], side["side"], "none within reach", *[None] * 4])
             if side["found"]:
-                decision = f"pair {side['i']}–{side['j']} at step {count(side['step'])}"
+                decision = f"pair {pair_name(side)} at step {count(side['step'])}"
                 slopes = [resolved(view.summary, one["name"], side[f"gradient_{where}"].get("event-aware"), 6)
                           for where in ("inside", "beyond")]  # fmt: skip
                 rows[-1][2:] = [repr(side["inside"]), repr(side["beyond"]), decision, *slopes]

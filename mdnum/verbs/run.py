@@ -19,6 +19,7 @@ from mdnum.plain import plain
 from mdnum.provenance import cores
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.report.words import pair_name
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.check import temperature_findings
@@ -343,12 +344,12 @@ def _decisions(run: RunView) -> Iterator[Finding]:
     undone = run.flips.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if run.flips.total >= 20 and undone >= CHATTER_SHARE * run.flips.total:
-        busiest = run.flips.busiest
+        (busiest,) = run.flips.busiest.rows(1)
         smooth = not run.jump and not run.cutoff.get("force_jump")
         yield TEXTS.finding(
             "CHATTER", *own, *["smooth"] * smooth, key=key, undone=undone,
             flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
-            pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
+            pair=pair_name(busiest), times=busiest["flips"],
         )  # fmt: skip
 
 

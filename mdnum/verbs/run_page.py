@@ -14,8 +14,8 @@ from mdnum.ranges import columns
 from mdnum.report import analysis
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
-from mdnum.report.section import Figure, Page, Plot, Section, Series, Table, curves, pairs, positive
-from mdnum.report.words import count, many, number, plain
+from mdnum.report.section import Figure, Page, Plot, Section, Series, Table, curves, pairs, positive, table_of
+from mdnum.report.words import count, many, number, pair_name, plain
 from mdnum.store.tables import as_numpy
 from mdnum.verbs.frame import View
 
@@ -57,10 +57,12 @@ class RunView(View):
     def flips(self) -> analysis.Scan:
         """What the table of flips says, which may be larger than memory."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
-        for batch in self.folder.batches("flips", _COLUMNS):
-            flips.take({name: as_numpy(batch[name]) for name in _COLUMNS})
+        known = self.folder.table("flips", rows=1).column_names
+        columns = [*_COLUMNS, *(name for name in ("terms",) if name in known)]
+        for batch in self.folder.batches("flips", columns):
+            flips.take({name: as_numpy(batch[name]) for name in columns})
         if not flips.nearest:
-            flips.take(self.folder.read("flips", _COLUMNS, rows=1))
+            flips.take(self.folder.read("flips", columns, rows=1))
         return flips
 
     @property
@@ -356,13 +358,9 @@ def _chatter(run: RunView) -> Iterator[Any]:
         "chatter", undone=undone, share=undone / run.flips.total, within=CHATTER_STEPS,
         inside=analysis.median(stays.inside), outside=analysis.median(stays.outside),
     )  # fmt: skip
-    rows = [
-        (f"{i}–{j}", int(flips), run.steps / int(flips))
-        for i, j, flips in zip(
-            busiest.i[:_BUSIEST], busiest.j[:_BUSIEST], busiest.flips[:_BUSIEST], strict=True
-        )
-    ]
-    yield Table(("pair", "flips", "one in … steps"), rows, "Pairs that flip most")
+    yield table_of(busiest.rows(_BUSIEST), {
+        "pair": pair_name, "flips": "flips", "one in … steps": lambda one: run.steps / one["flips"],
+    }, "Pairs that flip most")  # fmt: skip
 
 
 def _lists(run: RunView) -> Iterator[Any]:

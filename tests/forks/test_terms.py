@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from forks.harness import crystal, pair
 from rollout.harness import history, moved, nearest
@@ -12,6 +16,7 @@ from rollout.harness import history, moved, nearest
 import mdnum
 from mdnum import Cut, LennardJones, Term
 from mdnum.forks import fork
+from mdnum.forks.folders import compare_folders
 from mdnum.forks.replays import neighborhood, pinned
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import Pin, Pins
@@ -107,3 +112,113 @@ def test_a_lost_pair_is_lost_in_the_term_that_it_belongs_to():
             key = (*divmod(i, hot.atoms), j)
             assert (key in members) != entered
             (members.add if entered else members.discard)(key)
+
+
+def equal_terms(radius=RADII["core"]):
+    """Both ends at one radius, so that a pair has one decision."""
+    terms = {
+        "core": Term(LennardJones(sigma=1.0, epsilon=1.0), Cut("hard", RADII["core"])),
+        "tail": Term(LennardJones(sigma=1.0, epsilon=0.02), Cut("hard", radius)),
+    }
+    return mdnum.simulation(
+        crystal().structure, terms, units="lj", timestep=0.004, temperature=1.2, seed=4, skin=0.3, drawn=True
+    )
+
+
+def test_twins_of_which_one_shares_decisions():
+    """Another radius of one of the terms: both programs are followed with a decision for each."""
+    made = mdnum.forks.worlds.twin(equal_terms(), {"terms.tail.cutoff.radius": 1.6}, "wider", "")
+    assert [one.simulation.channels for one in (made.a, made.b)] == [2, 2]
+    found = fork(made, 40, repeats=0, split=0.5)
+    assert found.dates.fork is not None and found.decision is not None
+    pair_of = made.a.simulation.pair_of(*found.decision.subject)
+    assert pair_of["terms"] == "tail" and pair_of["i"] < made.a.simulation.atoms
+    # the same decisions apart and together
+    together, apart = (history(one, 20)[0] for one in (equal_terms(), equal_terms().apart))
+    np.testing.assert_allclose(together, apart, rtol=0, atol=1e-9)
+
+
+def test_a_map_names_the_term_of_a_boundary(tmp_path):
+    made = mdnum.fork_map(
+        two_terms(), "terms.tail.potential.epsilon", 0.02, 0.02002, steps=150, confirm=False,
+        out=tmp_path / "map",
+    )  # fmt: skip
+    assert made.summary["boundaries"]
+    for edge in made.summary["boundaries"]:
+        assert edge["i"] < 108 and edge["terms"] in RADII and f"({edge['terms']})" in edge["who"]
+
+
+def hot():
+    """A liquid, in which pairs cross both radii one after the other."""
+    terms = {key: Term(LennardJones(sigma=1.0, epsilon=0.1), Cut("hard", r)) for key, r in RADII.items()}
+    return mdnum.simulation(
+        crystal().structure, terms, units="lj", timestep=0.005, skin=0.3, temperature=2.5, seed=1, drawn=True
+    )
+
+
+@pytest.fixture(scope="module")
+def liquid(tmp_path_factory):
+    return mdnum.run(hot(), steps=300, out=tmp_path_factory.mktemp("terms") / "liquid")
+
+
+def test_flips_of_a_pair_are_followed_term_by_term(liquid):
+    flips = mdnum.store.RunFolder(liquid.folder).read("flips")
+    keys = list(zip(flips["i"].tolist(), flips["j"].tolist(), strict=True))
+    entered = dict.fromkeys(keys, ())
+    for key, now in zip(keys, flips["entered"].tolist(), strict=True):
+        entered[key] = (*entered[key], now)
+    # a pair enters twice in a row
+    assert any(first and now for row in entered.values() for first, now in pairwise(row))
+    assert "LEDGER_INCOMPLETE" not in {one["code"] for one in liquid.summary["findings"]}
+    text = (liquid.folder / "report.html").read_text()
+    assert all(f"({name})</td>" in text for name in RADII) and ">term<" in text
+
+
+def test_folders_compare_decisions_term_by_term(liquid, tmp_path):
+    copy = tmp_path / "planted"
+    shutil.copytree(liquid.folder, copy, ignore=shutil.ignore_patterns("manifest.json"))
+    table = pq.ParquetFile(copy / "flips.parquet").read()
+    row = len(table) // 2
+    # the same flip, said of the other term
+    terms = table["terms"].to_pylist()
+    terms[row] = "core" if terms[row] == "tail" else "tail"
+    at = table.column_names.index("terms")
+    pq.write_table(table.set_column(at, "terms", pa.array(terms)), copy / "flips.parquet")
+    found = compare_folders(liquid.folder, copy)
+    subject = (table["i"][row].as_py(), table["j"][row].as_py())
+    assert found.fork == table["step"][row].as_py()
+    assert {(one.run, one.subject, one.terms) for one in found.decisions} == {
+        ("A", subject, table["terms"][row].as_py()), ("B", subject, terms[row])
+    }  # fmt: skip
+    with pytest.raises(mdnum.InputError, match=r"objects=\["):
+        mdnum.fork_folders(liquid.folder, copy, out=tmp_path / "compared")
+    with pytest.raises(mdnum.InputError, match="is not the simulation that ran there"):
+        mdnum.fork_folders(liquid.folder, copy, objects=[two_terms()], out=tmp_path / "compared")
+    objects = [two_terms(), hot()]
+    shown = mdnum.fork_folders(liquid.folder, copy, objects=objects, out=tmp_path / "compared")
+    assert f"{subject[0]}–{subject[1]} ({terms[row]})" in (shown.folder / "report.html").read_text()
+
+
+def test_folders_of_objects_are_replayed(liquid, tmp_path):
+    other = mdnum.changed(hot(), {"terms.tail.potential.epsilon": 0.11})
+    ran = mdnum.run(other, steps=60, out=tmp_path / "other")
+    made = mdnum.fork_folders(
+        liquid.folder, ran.folder, replay=True, objects=[other, hot()], steps=60, repeats=0, lyapunov=False,
+        out=tmp_path / "replay",
+    )  # fmt: skip
+    assert made.summary["reproduced"] and made.summary["stored"]["steps"] == 60
+    decision = made.summary["decision"]
+    assert decision["terms"] in RADII and f"in the term {decision['terms']}" in str(made.verdict)
+
+
+def test_folders_of_shared_and_separate_decisions(tmp_path):
+    """Another radius of one of the terms, which share their decisions in the first run alone."""
+    runs = [mdnum.run(equal_terms(*r), steps=20, out=tmp_path / f"{len(r)}").folder for r in ((), (1.62,))]
+    found = compare_folders(*runs)
+    assert found.fork == 0 and found.causes == ("terms.tail.cutoff.radius",)
+    # other terms are another system
+    text = (runs[1] / "simulation.json").read_text()
+    (runs[1] / "simulation.json").write_text(text.replace('"lennard-jones"', '"morse"', 1))
+    (runs[1] / "manifest.json").unlink()
+    with pytest.raises(mdnum.InputError, match=r"terms\.core\.potential\.kind"):
+        compare_folders(*runs)

@@ -75,6 +75,9 @@ def test_leaving_two_wells_has_the_derivatives_of_the_closed_form():
         assert float(made.gradient[name]) == pytest.approx(true[symbol], abs=2e-4), name
     x = made.gradient["initial.positions"]
     assert (x[1, axis] - x[0, axis]) / 2 == pytest.approx(true["r0"], abs=2e-4)
+    # a pair's energy goes with the product of the weights of its atoms, 1 and -0.5, and with the strength
+    weights = method("event-aware")(problem, ("terms.tail.weight",)).gradient["terms.tail.weight"]
+    np.testing.assert_allclose(weights, 0.9 * true["strength"] / np.array([1.0, -0.5]), atol=2e-4)
     # without the flips it is wrong, and no radius seems to matter
     plain = method("symmetric")(problem, tuple(NAMES))
     assert float(plain.gradient["terms.core.cutoff.radius"]) == 0.0
@@ -140,15 +143,37 @@ def test_differences_agree_on_terms(mixed):
         assert float(np.sum(by_hand.gradient[name])) == pytest.approx(expected, rel=2e-5), name
 
 
+def test_derivatives_by_weights(mixed):
+    """In a sum of three terms whose middle one has weights, and in one whose terms share a decision."""
+    names, shared = ("terms.tail.weight", "terms.core.potential.epsilon"), {"terms.core.cutoff.radius": 9.2}
+    every = mixed.simulation, mdnum.changed(mixed.simulation, {**shared, "terms.core.cutoff.onset": 8.0})
+    assert [one.channels for one in every] == [2, 1]
+    for simulation in every:
+        problem = replace(mixed, simulation=simulation, steps=6)
+        by_hand = method("symmetric")(problem, names).gradient
+        unrolled = method("unrolled")(problem, names).gradient
+        for name in names:
+            scale = np.abs(unrolled[name]).max()
+            np.testing.assert_allclose(by_hand[name], unrolled[name], rtol=0, atol=1e-9 * scale)
+        atom = int(np.argmax(np.abs(by_hand[names[0]])))
+        entry, here = f"{names[0]}.{atom}", value(simulation, names[0])[atom]
+        ends = [problem.at({entry: here + shift}).value() for shift in (1e-4, -1e-4)]
+        expected = (ends[0] - ends[1]) / 2e-4
+        assert by_hand[names[0]][atom] == pytest.approx(expected, rel=2e-5)
+        tangent = method("forward")(problem, (entry,)).gradient[entry]
+        assert float(tangent) == pytest.approx(by_hand[names[0]][atom], rel=1e-9)
+
+
 def test_paths_of_terms(mixed):
     simulation = mixed.simulation
     found = mdnum.parameters(simulation)
     terms = {key: found[key] for key in found if key.startswith(("terms.", "potential.", "cutoff."))}
-    # the radius of two terms that share a decision beside another has no path
+    # two terms that share a decision beside another have one radius each, and all three none
     assert list(terms) == [
         "terms.core.potential.sigma", "terms.core.potential.epsilon", "terms.core.cutoff.radius",
         "terms.core.cutoff.onset", "terms.tail.potential.strength", "terms.tail.potential.kappa",
-        "terms.more.potential.strength", "terms.more.potential.kappa",
+        "terms.tail.weight", "terms.more.potential.strength", "terms.more.potential.kappa",
+        "terms.tail.cutoff.radius", "terms.more.cutoff.radius",
     ]  # fmt: skip
     assert terms["terms.core.potential.sigma"].by == "pair type"
     assert terms["terms.core.cutoff.radius"].unit == "Å"
@@ -159,6 +184,9 @@ def test_paths_of_terms(mixed):
     assert mdnum.parameters(other)["terms.more.potential.kappa"].value.tolist() == [0.3] * 3
     with pytest.raises(mdnum.InputError, match="onset"):
         mdnum.changed(simulation, {"terms.core.cutoff.radius": 6.0})
+    for name in ("terms.tail.cutoff.radius", "terms.more.cutoff.radius"):
+        with pytest.raises(mdnum.InputError, match="tail, more"):
+            method("symmetric")(mixed, (name,))
     # of terms that all share their decisions it is one
     terms = {name: Term(LennardJones(sigma=3.4, epsilon=0.01), Cut("hard", 7.0)) for name in "ab"}
     shared = mdnum.simulation(bulk("Ar", "fcc", a=5.5, cubic=True).repeat(4), terms, timestep=0.004)

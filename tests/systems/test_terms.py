@@ -13,6 +13,7 @@ from mdnum.forks.exact.program import unsupported
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.describe import program
+from mdnum.systems.parameters import is_positive
 
 FILE = """
 name = "two"
@@ -59,7 +60,12 @@ def of_objects(atoms, **tail):
     terms = {
         "core": Term(LennardJones(sigma=1.0, epsilon=1.0), Cut("switched", 2.0)),
         "tail": Term(
-            Morse(depth=0.1, alpha=1.0, r0=2.0), Cut("hard", 2.4), **{"weight": {"Ar": 0.5}, **tail}
+            **{
+                "potential": Morse(depth=0.1, alpha=1.0, r0=2.0),
+                "cutoff": Cut("hard", 2.4),
+                "weight": {"Ar": 0.5},
+                **tail,
+            }
         ),
     }
     return mdnum.simulation(
@@ -146,3 +152,40 @@ def test_a_calculator_of_terms(file):
 
 def test_a_certificate_refuses_terms(file):
     assert "Lennard-Jones potentials, not 'core + tail'" in unsupported(mdnum.build(file)).message
+
+
+def test_one_of_several_equal_radii(file):
+    equal = mdnum.build(file, {"terms.tail.cutoff.radius": 2.0})
+    assert equal.channels == 1
+    for made in (equal, of_objects(equal.structure, cutoff=Cut("hard", 2.0))):
+        found = mdnum.parameters(made)
+        # all of them, and each by itself
+        for name in ("cutoff.radius", "terms.core.cutoff.radius", "terms.tail.cutoff.radius"):
+            assert (found[name].value, found[name].unit) == (2.0, "σ")
+        apart = mdnum.changed(made, {"terms.tail.cutoff.radius": 2.1})
+        assert apart.channels == 2 and apart.decider.r_cut == (2.0, 2.1)
+        assert "cutoff.radius" not in mdnum.parameters(apart)
+        # with equal radii they share a decision again, with its bits
+        again = mdnum.changed(apart, {"terms.tail.cutoff.radius": 2.0})
+        assert again.channels == 1 and again.evaluate().energy == made.evaluate().energy
+        assert mdnum.changed(made, {"cutoff.radius": 2.2}).decider.r_cut == (2.2,)
+        with pytest.raises(InputError, match="onset"):
+            mdnum.changed(made, {"terms.core.cutoff.radius": 1.7})
+    wider = of_objects(equal.structure, cutoff=Cut("hard", 2.1))
+    np.testing.assert_allclose(
+        mdnum.changed(equal, {"terms.tail.cutoff.radius": 2.1}).evaluate().energy, wider.evaluate().energy
+    )
+
+
+def test_weights_are_parameters(file):
+    for made in (mdnum.build(file), of_objects(mdnum.build(file).structure)):
+        found = mdnum.parameters(made)["terms.tail.weight"]
+        assert (found.by, found.unit, found.value.shape) == ("atom", "", (256,))
+        assert "terms.core.weight" not in mdnum.parameters(made)
+        other = mdnum.changed(made, {"terms.tail.weight": np.full(256, 0.7)})
+        expected = of_objects(made.structure, weight={"Ar": 0.7})
+        assert other.evaluate().energy == expected.evaluate().energy != made.evaluate().energy
+        single = mdnum.changed(made, {"terms.tail.weight.17": 0.7})
+        assert np.flatnonzero(mdnum.parameters(single)["terms.tail.weight"].value != 0.5).tolist() == [17]
+        # a charge may have either sign
+        assert not is_positive(made, "terms.tail.weight.17")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from typing_extensions import dataclass_transform
 
 from mdnum.errors import InputError
-from mdnum.forks.worlds import changes, varied
+from mdnum.forks.worlds import alike, changes, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry, nearest
@@ -262,7 +262,8 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
     """The twin of two simulations of molecular dynamics."""
     from mdnum.rollout.program import MdProgram
 
-    return Twin(MdProgram(a), MdProgram(b, frame=frame), difference, changes(a, b))
+    one, other = alike(a, b)
+    return Twin(MdProgram(one), MdProgram(other, frame=frame), difference, changes(a, b))
 
 
 @choice(None)

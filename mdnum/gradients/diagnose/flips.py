@@ -109,7 +109,7 @@ def flips(
     sums = np.abs(each).sum(axis=0)
     order = np.argsort(-np.max(np.abs(each) / np.where(sums > 0, sums, 1), axis=1), kind="stable")
     table = {
-        **known,
+        **known, **simulation.terms_of(joined(met, "kind")),
         "radial_speed": np.where(np.isinf(speed), 0.0, speed), "weight": weight, "grazing": grazing,
     }  # fmt: skip
     table |= {f"contribution.{number}": each[:, k] for k, number in enumerate(numbers)}
@@ -146,6 +146,7 @@ class DecisionEdge:
     step: int = -1
     i: int = -1
     j: int = -1
+    terms: str = ""  # whose decision it is, where a potential has several terms
     # value_inside, value_beyond: the loss on either side
     value_inside: float = float("nan")
     value_beyond: float = float("nan")
@@ -273,8 +274,8 @@ def _edge(
     value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
     value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
     return DecisionEdge(
-        side, len(line.known) - before, True, near, far, abs(near - value), found.step, i, j, value_near,
-        value_far, gradient_near, gradient_far,
+        side, len(line.known) - before, True, near, far, abs(near - value), found.step, i, j, found.terms,
+        value_near, value_far, gradient_near, gradient_far,
     )  # fmt: skip
 
 

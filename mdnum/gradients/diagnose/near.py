@@ -12,6 +12,7 @@ at unit speed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -110,8 +111,14 @@ class Turns:
         # what is not known weighs, but not where nothing is to be known
         return np.where(times[:, None] == 0, 0.0, terms * times[:, None])
 
-    def heaviest(self, words: tuple[str, ...], most: int = 10) -> list[dict[str, Any]]:
-        """Those with a term as plain rows, terms by word, those with the largest first."""
+    def heaviest(
+        self, words: tuple[str, ...], named: Callable[[Any], dict[str, Any]], most: int = 10
+    ) -> list[dict[str, Any]]:
+        """Those with a term as plain rows, terms by word, those with the largest first.
+
+        Args:
+            named: gives what else is said of a kind of decisions.
+        """
         kept = np.flatnonzero(self.term.any(axis=1))
         term, reach, table, gap = self.term, self.reach, self.table, self.gap
         share = term[kept] / np.maximum(term.max(axis=0, initial=0.0), 1e-300)
@@ -119,7 +126,7 @@ class Turns:
         return [
             {
                 "step": int(table["step"][k]), "i": int(table["i"][k]), "j": int(table["j"][k]),
-                "gap": float(gap[k]), "reach": float(reach[k]),
+                **named(table["kind"][k]), "gap": float(gap[k]), "reach": float(reach[k]),
                 "term": {word: float(value) for word, value in zip(words, term[k], strict=True)},
             }
             for k in order

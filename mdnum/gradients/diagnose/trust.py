@@ -560,7 +560,7 @@ def ambiguity(problem: Problem) -> Limit:
         close = recorder.doubtful(segment)
         if len(close.step):
             values = {
-                "step": int(close.step[0]), "i": int(close.i[0]), "j": int(close.j[0]),
+                "step": int(close.step[0]), **problem.simulation.pair_of(close.i[0], close.j[0]),
                 "margin": float(abs(close.margin[0])), "bound": float(close.bound[0]),
             }  # fmt: skip
             return Limit(AMBIGUOUS, max(values["step"] - 1, 0), True, "within rounding", values)
