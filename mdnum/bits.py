@@ -5,37 +5,14 @@ Trajectories use it too, so it stands outside of `mdnum.numerics`, which imports
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Int, UInt8
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from mdnum.compiled import njit
+from mdnum.vectors import lowest_bit
 
 # Decisions are packed eight slots to a byte. A step of a list with W*8 slots for each of C columns leaves a
 # (W, C) array of bytes; slot k of column c is bit k % 8 of byte [k // 8, c].
-
-# typed as Any: numba's decorator hides the signature
-_intrinsic: Any = intrinsic
-
-
-@_intrinsic
-def lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Number of the lowest of 64 bits that is set, unsigned; there is one."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.uint64(types.uint64), generate
-
-
-@_intrinsic
-def bits_set(typingctx: Any, word: Any) -> Any:
-    """How many of 64 bits are set, unsigned."""
-    return types.uint64(types.uint64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 @njit

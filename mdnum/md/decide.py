@@ -17,7 +17,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from mdnum.bits import bits_set, lowest_bit
 from mdnum.compiled import cfunc, njit
 from mdnum.errors import InputError
 from mdnum.md import foreign
@@ -28,6 +27,7 @@ from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
 from mdnum.numerics.exact import root, squared_norm
 from mdnum.numerics.rounding import unit_roundoff
+from mdnum.vectors import bits_set, lowest_bit
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
 # ms a force: 1.4 for N = 4,000 and 59 for 108,000; with 8 at a time 2.2 and 78 (the compiler then gives up

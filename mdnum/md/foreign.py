@@ -13,9 +13,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from mdnum.compiled import njit
+from mdnum.vectors import intrinsic
 
 # of the foreign-function interface, whose layout in memory the loop relies on
 VERSION = (0, 3)
@@ -43,10 +43,9 @@ def registered(name: str, function: Any, *held: Any) -> str:
 
 
 carray: Any = numba.carray  # pyright: ignore
-_intrinsic: Any = intrinsic
 
 
-@_intrinsic
+@intrinsic
 def pointer(typingctx: Any, address: Any) -> Any:
     """A number as the address of memory."""
 
@@ -56,7 +55,7 @@ def pointer(typingctx: Any, address: Any) -> Any:
     return types.voidptr(types.intp), generate
 
 
-@_intrinsic
+@intrinsic
 def call(typingctx: Any, address: Any, arguments: Any) -> Any:
     """What a C function at an address makes of a tuple of 64-bit arguments."""
 
@@ -69,7 +68,7 @@ def call(typingctx: Any, address: Any, arguments: Any) -> Any:
     return types.intp(types.intp, arguments), generate
 
 
-@_intrinsic
+@intrinsic
 def added(typingctx: Any, address: Any, amount: Any) -> Any:
     """Add to the 64-bit number at an address, in one step for all threads; the number before."""
 
@@ -90,7 +89,7 @@ def _place(builder: Any, address: Any, k: Any) -> Any:
 
 
 # not arrays and functions of numba's, each of which takes a tenth of a second to compile
-@_intrinsic
+@intrinsic
 def peek(typingctx: Any, address: Any, k: Any) -> Any:
     """The k-th of the 64-bit numbers at an address."""
 
@@ -100,7 +99,7 @@ def peek(typingctx: Any, address: Any, k: Any) -> Any:
     return types.intp(types.intp, types.intp), generate
 
 
-@_intrinsic
+@intrinsic
 def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
     """Make the k-th of the 64-bit numbers at an address a value."""
 
@@ -111,7 +110,7 @@ def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
     return types.void(types.intp, types.intp, types.intp), generate
 
 
-@_intrinsic
+@intrinsic
 def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
     """Where the data of the k-th of a frame's operands or results begin, and its first two dimensions."""
     made = types.UniTuple(types.intp, 3)

@@ -9,19 +9,14 @@ from __future__ import annotations
 
 import sys
 import threading
-from typing import Any
 
-import llvmlite.binding as llvm
 import numpy as np
 from jaxtyping import Float, Int
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from mdnum.compiled import njit
 from mdnum.md.cell import Cell
 from mdnum.provenance import cores
+from mdnum.vectors import EIGHT, kept, moved, turned
 
 # atoms whose slots are written together: 16 of four bytes are a cache line
 _TOGETHER = 16
@@ -35,96 +30,6 @@ _SHARED = 2000
 
 # along an axis, before a dilute system gets fewer: a radius may be many orders smaller than the box
 _MOST_BINS = 1e9
-
-
-# --- what numba does not make vectors of by itself: eight atoms at a time ------------------------------
-
-# arrays have room for as many behind what they hold
-_WIDE = 8
-# what a processor does in one go is a known operation of LLVM 19 and later
-_COMPRESSES = llvm.llvm_version_info >= (19,) and llvm.get_host_cpu_features().get("avx512f", False)
-_intrinsic: Any = intrinsic
-
-
-def _at(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> Any:
-    """The address of eight numbers of an array, from a place on."""
-    data = context.make_array(kind)(context, builder, array).data
-    several = ir.VectorType(context.get_value_type(kind.dtype), _WIDE)
-    return builder.bitcast(builder.gep(data, [place]), several.as_pointer())
-
-
-def _aligned(made: Any) -> Any:
-    """A load or store of any address."""
-    made.align = 1
-    return made
-
-
-@_intrinsic
-def _moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any) -> Any:
-    """Copy eight numbers, and add one to each."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        numbers = _aligned(builder.load(_at(context, builder, source, *args[:2])))
-        one = builder.insert_element(ir.Constant(numbers.type, ir.Undefined), args[2], ir.IntType(32)(0))
-        same = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), _WIDE), None))
-        add = builder.fadd if isinstance(source.dtype, types.Float) else builder.add
-        _aligned(builder.store(add(numbers, same), _at(context, builder, out, *args[3:])))
-        return context.get_dummy_value()
-
-    return types.void(source, types.intp, source.dtype, out, types.intp), generate
-
-
-@_intrinsic
-def _kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Of eight labels write those that a mask keeps; the place behind them."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = _aligned(builder.load(_at(context, builder, mask, *args[:2])))
-        given = _aligned(builder.load(_at(context, builder, labels, *args[2:4])))
-        keep = builder.trunc(bits, ir.VectorType(ir.IntType(1), _WIDE))
-        if _COMPRESSES:
-            kind = ir.FunctionType(given.type, [given.type, keep.type, given.type])
-            name = f"llvm.experimental.vector.compress.v{_WIDE}i32"
-            compress = cgutils.get_or_insert_function(builder.module, kind, name)
-            given = builder.call(compress, [given, keep, ir.Constant(given.type, ir.Undefined)])
-            _aligned(builder.store(given, _at(context, builder, out, *args[4:])))
-            found = builder.ctpop(builder.bitcast(keep, ir.IntType(_WIDE)))
-            return builder.add(args[5], builder.zext(found, args[5].type))
-        # one by one, without a branch: over the one before unless that is kept
-        data, at = context.make_array(out)(context, builder, args[4]).data, args[5]
-        for k in map(ir.IntType(32), range(_WIDE)):
-            builder.store(builder.extract_element(given, k), builder.gep(data, [at]))
-            at = builder.add(at, builder.zext(builder.extract_element(keep, k), at.type))
-        return at
-
-    return types.intp(mask, types.intp, labels, types.intp, out, types.intp), generate
-
-
-@_intrinsic
-def _turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any, across: Any) -> Any:
-    """Write eight numbers each of eight rows as columns.
-
-    Args:
-        place, apart: of the first row, and from one to the next. at, across: of the first column, likewise.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def places(first: Any, step: Any) -> list:
-            return [builder.add(first, builder.mul(step, step.type(k))) for k in range(_WIDE)]
-
-        turned = [
-            _aligned(builder.load(_at(context, builder, rows, args[0], k))) for k in places(args[1], args[2])
-        ]
-        # three times the first half between the second: of rows and columns each three bits change places
-        for _ in range(3):
-            halves = [[k // 2 + 4 * part + 8 * (k % 2) for k in range(_WIDE)] for part in range(2)]
-            which = [ir.Constant(ir.VectorType(ir.IntType(32), _WIDE), half) for half in halves]
-            turned = [builder.shuffle_vector(turned[k], turned[k + 4], w) for k in range(4) for w in which]
-        for column, k in zip(turned, places(args[4], args[5]), strict=True):
-            _aligned(builder.store(column, _at(context, builder, out, args[3], k)))
-        return context.get_dummy_value()
-
-    return types.void(rows, types.intp, types.intp, out, types.intp, types.intp), generate
 
 
 @njit
@@ -157,7 +62,7 @@ def _layered(x, start, bins):
         positions, labels, and where each bin begins, and the end.
     """
     n = x.shape[1]
-    layered, label = np.empty((3, n + _WIDE)), np.empty(n + _WIDE, np.int32)
+    layered, label = np.empty((3, n + EIGHT)), np.empty(n + EIGHT, np.int32)
     begin = np.empty_like(start)
     count = place = 0
     for b0 in range(bins[0]):
@@ -230,7 +135,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
         for q in range(runs):
             row = (run[q, 0] * bins[2] + b2) * bins[1]
             first, last = start[row + run[q, 1]], start[row + run[q, 2] + 1]
-            if count + last - first > wide - _WIDE:
+            if count + last - first > wide - EIGHT:
                 return False
             if q == middle:
                 home[layer] = count + start[row + b1] - first
@@ -238,12 +143,12 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
             x1 = shift[q, 1] + n2 * matrix[2, 1]
             x2 = shift[q, 2] + n2 * matrix[2, 2]
             # eight at a time: what is behind the last is written over
-            for j in range(first, last, _WIDE):
+            for j in range(first, last, EIGHT):
                 at = count + j - first
-                _moved(x, j, x0, near, at)
-                _moved(x, apart + j, x1, near, wide + at)
-                _moved(x, 2 * apart + j, x2, near, 2 * wide + at)
-                _moved(own, j, np.int32(0), label, at)
+                moved(x, j, x0, near, at)
+                moved(x, apart + j, x1, near, wide + at)
+                moved(x, 2 * apart + j, x2, near, 2 * wide + at)
+                moved(own, j, np.int32(0), label, at)
             count += last - first
     begin[layers] = count
     return True
@@ -279,8 +184,8 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 def _compressed(mask, label, first, atoms, out, place):
     """Write the labels that the mask keeps, of so many atoms from the first on; how many."""
     filled = place
-    for k in range(0, atoms, _WIDE):
-        filled = _kept(mask, k, label, first + k, out, filled)
+    for k in range(0, atoms, EIGHT):
+        filled = kept(mask, k, label, first + k, out, filled)
     return filled - place
 
 
@@ -288,10 +193,10 @@ def _compressed(mask, label, first, atoms, out, place):
 def _transposed(rows, table, first, begin, end):
     """The slots of consecutive atoms, which share cache lines: written together."""
     room, n = table.shape
-    if end - begin == _TOGETHER and room % _WIDE == 0:
-        for k in range(0, room, _WIDE):
-            for i in range(0, _TOGETHER, _WIDE):
-                _turned(rows, i * rows.shape[1] + k, rows.shape[1], table, k * n + first + i, n)
+    if end - begin == _TOGETHER and room % EIGHT == 0:
+        for k in range(0, room, EIGHT):
+            for i in range(0, _TOGETHER, EIGHT):
+                turned(rows, i * rows.shape[1] + k, rows.shape[1], table, k * n + first + i, n)
         return
     for k in range(room):
         for i in range(begin, end):
@@ -315,7 +220,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
     layers = bins[2] + 2 * reach[2]
     begin, home = np.empty(layers + 1, np.int64), np.empty(layers, np.int64)
     capacity = 0
-    near, label, mask = np.empty((3, _WIDE)), np.empty(_WIDE, np.int32), np.empty(_WIDE, np.uint8)
+    near, label, mask = np.empty((3, EIGHT)), np.empty(EIGHT, np.int32), np.empty(EIGHT, np.uint8)
     rows = np.empty((_TOGETHER, room + _TOGETHER), np.int32)
     for column in range(columns[0] * bins[2], columns[1] * bins[2], bins[2]):
         b0, b1 = column // bins[2] // bins[1], column // bins[2] % bins[1]
@@ -324,8 +229,8 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
         found = _runs(b0, b1, box, run, shift)
         while not _gather(layered, b1, run, shift, found, box, near, label, begin, home):
             capacity = 2 * capacity + 1024
-            near, label = np.empty((3, capacity + _WIDE)), np.empty(capacity + _WIDE, np.int32)
-            mask = np.empty(capacity + _WIDE, np.uint8)
+            near, label = np.empty((3, capacity + EIGHT)), np.empty(capacity + EIGHT, np.int32)
+            mask = np.empty(capacity + EIGHT, np.uint8)
             # rows a cache line further than a power of two apart: those share their places in a cache
             narrow, rows = rows, np.empty((_TOGETHER, max(capacity, room) + _TOGETHER), np.int32)
             for k in range(_TOGETHER):
@@ -335,7 +240,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
             here = column + b2
             low, high = begin[b2], begin[b2 + 2 * reach[2] + 1]
             px, py, pz = near[0, low:high], near[1, low:high], near[2, low:high]
-            mask[high - low : high - low + _WIDE] = 0
+            mask[high - low : high - low + EIGHT] = 0
             for i in range(start[here], start[here + 1]):
                 if by_pair:
                     _images_within(px, py, pz, x[0, i], x[1, i], x[2, i], matrix, inverse, r2_list, mask)

@@ -14,21 +14,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8, UInt16
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
-from mdnum.bits import lowest_bit
 from mdnum.compiled import njit
 from mdnum.trajectories.lattice import Participants, Placed, wrap
 from mdnum.trajectories.search import Changed, exact_square
+from mdnum.vectors import SIXTEEN, lowest_bit, near_atom, near_box
 
-#: atoms of a cluster: as many float32 numbers as the widest vectors have
-CLUSTER = 16
+#: atoms of a cluster
+CLUSTER = SIXTEEN
 #: tiles are to serve while atoms move so many times their root mean square displacement of one frame
 FRAMES, FEWEST = 60.0, 5.0
 #: largest margin around a cluster's box, and largest such displacement, as shares of the radius
@@ -434,97 +431,6 @@ def _stays(boxes, around, drift):
     return out == 0
 
 
-# --- sixteen numbers at once --------------------------------------------------------------------------------
-
-_FLOAT, _BITS = ir.FloatType(), ir.IntType(16)
-_LANES = ir.VectorType(_FLOAT, CLUSTER)
-# typed as Any: numba's decorator hides the signature
-_intrinsic: Any = intrinsic
-
-
-class _Vectors:
-    """Writes instructions on vectors of sixteen."""
-
-    def __init__(self, context: Any, builder: Any):
-        self.builder, self.whole = builder, context.get_value_type(types.intp)
-
-    def _at(self, address: Any, offset: int, kind: Any) -> Any:
-        moved = self.builder.add(address, ir.Constant(self.whole, offset))
-        return self.builder.inttoptr(moved, kind.as_pointer())
-
-    def load(self, address: Any, number: int) -> Any:
-        """Sixteen numbers."""
-        return self.builder.load(self._at(address, 4 * number, _LANES), align=4)
-
-    def store(self, value: Any, address: Any, number: int) -> None:
-        """Sixteen numbers."""
-        self.builder.store(value, self._at(address, 4 * number, _LANES), align=4)
-
-    def spread(self, value: Any) -> Any:
-        """One number in all places."""
-        one = self.builder.insert_element(
-            ir.Constant(_LANES, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
-        )
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), CLUSTER), None)
-        return self.builder.shuffle_vector(one, ir.Constant(_LANES, ir.Undefined), zeros)
-
-    def one(self, address: Any, number: int) -> Any:
-        """A number of memory in all places."""
-        return self.spread(self.builder.load(self._at(address, 4 * number, _FLOAT), align=4))
-
-    def larger(self, a: Any, b: Any) -> Any:
-        """The larger of each two; b where one is not a number."""
-        return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
-
-    def squares(self, parts: list[Any]) -> Any:
-        """Sum of the squares."""
-        kind = ir.FunctionType(_LANES, [_LANES] * 3)
-        fused = self.builder.module.declare_intrinsic("llvm.fmuladd.v16f32", (), kind)
-        total = self.builder.fmul(parts[0], parts[0])
-        for part in parts[1:]:
-            total = self.builder.call(fused, [part, part, total])
-        return total
-
-    def bits(self, decisions: Any) -> Any:
-        """A bit for each decision, as a number."""
-        return self.builder.zext(self.builder.bitcast(decisions, _BITS), self.whole)
-
-
-@_intrinsic
-def _rows(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Bits of the atoms of a cluster, less a shift, whose squared distance to a box is within reach.
-
-    The shifted coordinates are stored.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        atoms, shift, box, reach, out = args
-        to, gaps = _Vectors(context, builder), []
-        for c in range(3):
-            x = builder.fsub(to.load(atoms, CLUSTER * c), to.one(shift, c))
-            to.store(x, out, CLUSTER * c)
-            gap = to.larger(builder.fsub(to.one(box, c), x), builder.fsub(x, to.one(box, 3 + c)))
-            gaps.append(to.larger(gap, ir.Constant(_LANES, [0.0] * CLUSTER)))
-        return to.bits(builder.fcmp_ordered("<=", to.squares(gaps), to.spread(reach)))
-
-    return types.uintp(types.uintp, types.uintp, types.uintp, types.float32, types.uintp), generate
-
-
-@_intrinsic
-def _lanes(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Bits of the atoms of a cluster within two squared distances of an atom: those of the second above."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        atom, atoms, low, high = args
-        to = _Vectors(context, builder)
-        parts = [builder.fsub(to.load(atoms, CLUSTER * c), to.one(atom, CLUSTER * c)) for c in range(3)]
-        found = to.squares(parts)
-        sure, perhaps = (to.bits(builder.fcmp_ordered("<", found, to.spread(one))) for one in (low, high))
-        return builder.or_(sure, builder.shl(perhaps, ir.Constant(to.whole, CLUSTER)))
-
-    return types.uintp(types.uintp, types.uintp, types.float32, types.float32), generate
-
-
 @njit
 def _box(columns, boxes):
     """The box around each cluster, leaving out empty slots."""
@@ -552,7 +458,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         tile = np.uintp(at)
         i, j, code = np.uintp(first[tile]), np.uintp(second[tile]), np.uintp(vector[tile])
         j_at = columns_at + np.uintp(192) * j
-        left = np.uintp(rows[tile]) | _rows(
+        left = np.uintp(rows[tile]) | near_box(
             columns_at + np.uintp(192) * i, shifts_at + np.uintp(12) * code, boxes_at + np.uintp(24) * j,
             limits.reach, scratch_at,
         )  # fmt: skip
@@ -561,7 +467,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
         while left != np.uintp(0):
             row = lowest_bit(left)
             atom, left = order[np.uintp(CLUSTER) * i + row], left & (left - np.uintp(1))
-            bits = _lanes(scratch_at + np.uintp(4) * row, j_at, low, high)
+            bits = near_atom(scratch_at + np.uintp(4) * row, j_at, low, high)
             if alone:
                 bits &= ((np.uintp(0xFFFE) << row) & np.uintp(0xFFFF)) * np.uintp(0x10001)
             now = bits & np.uintp(0xFFFF)
