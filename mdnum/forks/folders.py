@@ -130,7 +130,7 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = ()) -> Any:
         remedy = "Give it from Python, made by the same code: mdnum.fork_folders(a, b, objects=[...])"
         message = "was made of objects, and no file says how to make them again"
         raise InputError(message, where=str(folder), remedy=remedy)
-    from mdnum.systems.describe import again
+    from mdnum.systems.build import again
 
     for one in objects[:-1]:
         with suppress(InputError):
