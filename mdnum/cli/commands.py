@@ -1,23 +1,6 @@
-"""The commands of verbs, made from their text files; nothing of a verb is imported before it is called.
+"""The commands of verbs, made from their text files (`mdnum/verbs/__init__.toml` says what these have).
 
-`[command]` declares the command of a verb, `[group]` and `[commands.NAME]` those of one with several:
-
-    help        what `--help` says of it
-    calls       the function of the verb's module that is called, with the arguments in order (None where one
-                was left out) and the options that were given: `--save-every 5` as `save_every=5`,
-                `--no-check` as `check=False`. It returns an outcome, or a `Listing`.
-    shares      arguments and options that several commands have, from `[shared.NAME]` of the verb's or of
-                mdnum's text file: "a system", "changed" (its keys), "of a folder"
-    resumes     what `--resume` resumes, where options of a new one (`new = true`) are refused beside it
-    missing     what is wrong, and the remedy, where neither an argument nor `--resume` is given
-    lists       whether it lists something, and makes no folder
-    arguments, options   tables of what is typed, by name:
-
-        type        text, int, float, path, folder (of a run, which is compared with its manifest) or
-                    flag; two words for two values
-        flags       where they are others than --name
-        metavar, help, min, default, optional (an argument), repeatable (an option)
-        of          "module:NAME", a list of what there is, for `{of}` in help
+Nothing of a verb is imported before it is called.
 """
 
 from __future__ import annotations
@@ -28,7 +11,6 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +26,7 @@ from mdnum.verbs import VERBS, declared
 # rich's help formatting costs more than the whole of --help may take
 PLAIN: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 _TYPES = {"text": str, "int": int, "float": float, "path": Path, "folder": Path, "flag": bool}
-_Words = Mapping[str, Mapping[str, Any]]
-_SHARED: Mapping[str, Mapping[str, _Words]] = beside(verbs.__file__)["shared"]
+_SHARED: Mapping[str, Mapping[str, Any]] = beside(verbs.__file__)["shared"]
 
 
 class Verbs(TyperGroup):
@@ -80,9 +61,7 @@ class _Questions(TyperGroup):
             args = [group["alone"], *args]
         elif "usual" in group and first not in self.commands and first != "--help":
             once = group.get("once", {})
-            if (
-                word := next((one for one in args if one.partition("=")[0] in once), "").partition("=")[0]
-            ) != "":
+            if word := next((one for arg in args if (one := arg.partition("=")[0]) in once), ""):
                 seen = f"{word} is no option of `mdnum {self.name}`, but a question"
                 raise InputError(seen, remedy=f"Ask `mdnum {self.name} {once[word]}`")
             if "two" in group and len(args) > 1 and not args[1].startswith("-"):
@@ -98,62 +77,40 @@ def _of_verb(verb: str) -> Any:
     texts = {name: declared(name) for name in verbs.of_command(verb)}
     shared = {**_SHARED, **texts[verb].get("shared", {})}
     if "group" not in texts[verb]:
-        return _command(_Declared.of(verb, texts[verb]["command"], shared), verb)
-    made = _Questions(
-        name=verb,
-        commands={
-            question: _command(_Declared.of(entry, said, shared), question)
-            for entry, text in texts.items()
-            for question, said in text.get("commands", {}).items()
-        },
-        help=texts[verb]["group"]["help"],
-        rich_markup_mode=None,
-    )
-    made.group = texts[verb]["group"]
+        return _command(verb, verb, texts[verb]["command"], shared)
+    commands = {
+        question: _command(entry, question, said, shared)
+        for entry, text in texts.items()
+        for question, said in text.get("commands", {}).items()
+    }
+    group = texts[verb]["group"]
+    made = _Questions(name=verb, commands=commands, help=group["help"], rich_markup_mode=None)
+    made.group = group
     return made
 
 
-@dataclass(frozen=True)
-class _Declared:
-    """A command as its text file declares it."""
-
-    entry: str  # of `VERBS`
-    said: Mapping[str, Any]
-    # arguments, options: by name, those included that it shares with others
-    arguments: _Words
-    options: _Words
-
-    @classmethod
-    def of(cls, entry: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> _Declared:
-        parts = [shared[name] for name in said.get("shares", ())]
-        # a system comes first among arguments, and a command's own options before those of others
-        arguments = {name: one for part in (*parts, said) for name, one in part.get("arguments", {}).items()}
-        options = {name: one for part in (said, *parts) for name, one in part.get("options", {}).items()}
-        return cls(entry, said, arguments, options)
-
-    @property
-    def typed(self) -> _Words:
-        """Arguments and options."""
-        return {**self.arguments, **self.options}
-
-
-def _command(declared: _Declared, name: str) -> Any:
-    """A command as the parser has it."""
+def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> Any:
+    """A command as the parser has it, from what the text file of an entry of `VERBS` says."""
+    parts = [shared[one] for one in said.get("shares", ())]
+    # a system comes first among arguments, and a command's own options before those of others
+    arguments = {key: one for part in (*parts, said) for key, one in part.get("arguments", {}).items()}
+    options = {key: one for part in (said, *parts) for key, one in part.get("options", {}).items()}
+    whole = {**said, "entry": entry, "arguments": arguments, "options": options}
 
     def command(ctx: typer.Context, as_json: bool, **values: Any) -> int:
-        sources: dict[str, Any] = {name: ctx.get_parameter_source(name) for name in values}
-        return _called(declared, {k: v for k, v in values.items() if sources[k].name != "DEFAULT"}, as_json)
+        sources: dict[str, Any] = {key: ctx.get_parameter_source(key) for key in values}
+        return _called(whole, {key: values[key] for key in values if sources[key].name != "DEFAULT"}, as_json)
 
-    words = {name: parameter(name, one, typer.Argument) for name, one in declared.arguments.items()}
-    words |= {name: parameter(name, one, typer.Option) for name, one in declared.options.items()}
+    words = {key: parameter(key, one, typer.Argument) for key, one in arguments.items()}
+    words |= {key: parameter(key, one, typer.Option) for key, one in options.items()}
     kinds = {"ctx": (typer.Context, inspect.Parameter.empty), **words, "as_json": (bool, output.JSON_OPTION)}
     function: Any = command
     function.__signature__ = inspect.Signature([
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in kinds.items()
+        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+        for key, (kind, default) in kinds.items()
     ])  # fmt: skip
-    function.__annotations__ = {name: kind for name, (kind, _) in kinds.items()}
-    return _made(name, declared.said["help"], function)
+    function.__annotations__ = {key: kind for key, (kind, _) in kinds.items()}
+    return _made(name, said["help"], function)
 
 
 def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -> Any:
@@ -194,21 +151,21 @@ SET_OPTION = parameter("settings", _SHARED["changed"]["options"]["settings"], ty
 # -- what is done when one is called
 
 
-def _called(declared: _Declared, given: dict[str, Any], as_json: bool) -> int:
+def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
     """Calls the function of a command with what was typed, prints its answer and returns the exit code."""
     from mdnum.store import RunFolder
 
-    said, typed = declared.said, declared.typed
+    typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
-    if "missing" in said and not given.keys() & {*declared.arguments, "resume"}:
+    if "missing" in said and not given.keys() & {*said["arguments"], "resume"}:
         raise InputError(said["missing"][0], remedy=said["missing"][1])
     if "resumes" in said and "resume" in given:
-        _refuse_new(declared, given)
+        _refuse_new(said, given)
     folders = dict.fromkeys(one for name, one in given.items() if typed[name].get("type") == "folder")
     # looked at before a folder is listed anew, and said where nothing is worse
     wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
-    arguments, options = [given.get(name) for name in declared.arguments], _options(declared, given)
+    arguments, options = [given.get(name) for name in said["arguments"]], _options(said, given)
     stopped = False
 
     def again() -> str | None:
@@ -222,7 +179,7 @@ def _called(declared: _Declared, given: dict[str, Any], as_json: bool) -> int:
         if not said.get("lists"):
             options["progress"] = progress
         try:
-            answer: Any = getattr(VERBS[declared.entry], said["calls"])(*arguments, **options)
+            answer: Any = getattr(VERBS[said["entry"]], said["calls"])(*arguments, **options)
         except KeyboardInterrupt as stop:
             # what was found until then may be an answer
             if (answer := getattr(stop, "outcome", None)) is None:
@@ -238,13 +195,13 @@ def _called(declared: _Declared, given: dict[str, Any], as_json: bool) -> int:
     return output.EXIT_STOPPED if stopped or answer.summary.get("interrupted") else code
 
 
-def _options(declared: _Declared, given: Mapping[str, Any]) -> dict[str, Any]:
+def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """What was given as a function takes it; whoever names code on the command line allows it."""
     options = {}
-    for name in given.keys() & declared.options.keys():
-        off = declared.options[name].get("type") == "flag" and name.startswith("no_")
+    for name in given.keys() & said["options"].keys():
+        off = said["options"][name].get("type") == "flag" and name.startswith("no_")
         options |= {name.removeprefix("no_"): False} if off else {name: given[name]}
-    if "changed" not in declared.said.get("shares", ()):
+    if "changed" not in said.get("shares", ()):
         return options
     overrides = output.parse_overrides(options.pop("settings", ()))
     if (potential := options.pop("potential", None)) is not None:
@@ -255,7 +212,7 @@ def _options(declared: _Declared, given: Mapping[str, Any]) -> dict[str, Any]:
     return {**options, "overrides": overrides} if overrides else options
 
 
-def _refuse_new(declared: _Declared, given: Mapping[str, Any]) -> None:
+def _refuse_new(said: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     """Refuses what a folder that is resumed has already.
 
     Raises:
@@ -263,8 +220,8 @@ def _refuse_new(declared: _Declared, given: Mapping[str, Any]) -> None:
     """
     from mdnum.verbs.frame import refuse
 
-    labels = {name: one["metavar"].strip("[]") for name, one in declared.arguments.items()}
-    labels |= {name: _flags(name, one)[-1].partition("/")[0] for name, one in declared.options.items()}
-    new = {labels[name]: True for name, one in declared.typed.items() if one.get("new") and name in given}
-    what = f"of a new {declared.said['resumes']}"
-    refuse(new, what, "Leave it out beside --resume, or begin in a new folder")
+    labels = {name: one["metavar"].strip("[]") for name, one in said["arguments"].items() if "new" in one}
+    options = {name: one for name, one in said["options"].items() if "new" in one}
+    labels |= {name: _flags(name, one)[-1].partition("/")[0] for name, one in options.items()}
+    new = {label: True for name, label in labels.items() if name in given}
+    refuse(new, f"of a new {said['resumes']}", "Leave it out beside --resume, or begin in a new folder")

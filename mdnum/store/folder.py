@@ -12,9 +12,9 @@ import sys
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -126,13 +126,12 @@ class RunFolder:
         self.told: dict[str, Any] = {}
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], layout: Layout, overwrite: bool = False) -> RunFolder:
+    def create(cls, path: str | os.PathLike[str], layout: Layout) -> RunFolder:
         """A new, empty run folder.
 
         Args:
             path: made if missing, parents included.
             layout: what it is to hold.
-            overwrite: remove the run that is there. Files that are not a run's are left alone.
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
@@ -140,7 +139,7 @@ class RunFolder:
         folder = cls(Path(path), layout)
         if folder.path.exists() and not folder.path.is_dir():
             raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
-        folder._usable(overwrite)
+        folder._usable()
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -150,16 +149,12 @@ class RunFolder:
         with disk_errors(folder.path):
             folder._take_lock()
             # once more: another process may have begun a run there meanwhile, and have finished it
-            present = folder._usable(overwrite)
+            present = folder._usable()
             for name in SUBFOLDERS:
                 # through a link, the files of somebody else would be removed
                 refuse_link(folder.path / name / "any")
-            listed: Iterable[str] = ()
-            with suppress(FolderError):
-                listed = getattr(manifest.load(folder.path), "files", ()) if present else ()
-            if overwrite:
-                listed = [name for name in listed if name.endswith(".parquet")]
-            for name in (*_FILES, manifest.NAME, *listed):
+            made = manifest.load(folder.path) if present else None
+            for name in (*_FILES, manifest.NAME, *(made.files if made is not None else ())):
                 if (folder.path / name).parent == folder.path:
                     (folder.path / name).unlink(missing_ok=True)
             folder._sweep("parts/*.parquet", "figures/*.svg", "structures/*.extxyz")
@@ -595,11 +590,11 @@ class RunFolder:
 
     # -- inside ----------------------------------------------------------------------------------
 
-    def _usable(self, overwrite: bool) -> list[str]:
+    def _usable(self) -> list[str]:
         """Names in a folder in which a run may begin; none where it is not there."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
-        if present and not overwrite and not _came_to_nothing(self.path, present):
+        if present and not _came_to_nothing(self.path, present):
             _refuse_to_overwrite(self.path, present)
         return present
 

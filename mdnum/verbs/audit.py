@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 _SCRIPT = "reproduce.py"
-_TABLES = ("curves", "energies", "crossings")
 #: k_B, eV/K (CODATA 2018, exact).
 _BOLTZMANN = 8.617333262e-5
 #: A unit of a system with dimensions where text has one: not in the name of a file.

@@ -226,16 +226,8 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
     if pairs is not None or resume is not None:
         return conform(pairs, resume=resume, **given)
-    rows = [
-        {
-            "list": one.name,
-            "version": one.version,
-            "lacks": one.lacks,
-            "kept": one.kept,
-            "what": one.description,
-        }
-        for one in known()
-    ]
+    keys = {"list": "name", "version": "version", "lacks": "lacks", "kept": "kept", "what": "description"}
+    rows = [{key: getattr(one, name) for key, name in keys.items()} for one in known()]
     lines = [
         (row["list"], f"install {' '.join(row['lacks'])}" if row["lacks"] else row["version"], row["what"])
         for row in rows

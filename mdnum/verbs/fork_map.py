@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -51,15 +52,11 @@ def interval(text: str) -> tuple[str, float, float]:
     Raises:
         InputError: not of that form.
     """
-    found = _INTERVAL.match(text)
-    try:
-        if found is None:
-            raise ValueError
-        return found[1], float(found[2]), float(found[3])
-    except ValueError:
-        raise InputError(
-            f"{text!r} is not of the form KEY=LOW:HIGH", remedy="Write for example potential.sigma=3.40:3.41"
-        ) from None
+    with suppress(ValueError):
+        for key, low, high in _INTERVAL.findall(text):
+            return key, float(low), float(high)
+    seen = f"{text!r} is not of the form KEY=LOW:HIGH"
+    raise InputError(seen, remedy="Write for example potential.sigma=3.40:3.41")
 
 
 @frame.keywords_checked

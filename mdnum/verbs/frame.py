@@ -128,9 +128,7 @@ class Listing:
     """What there is to name, of a command that lists it: nothing is computed, and no folder made."""
 
     document: Mapping[str, Any]  # for JSON
-    tables: Sequence[
-        tuple[str, Sequence[str], Sequence[Sequence[Any]]]
-    ]  # for people: title, columns and rows
+    tables: Sequence[Any]  # for people: a title, names of columns, and rows, of each
     lines: Sequence[str] = ()  # below them
 
 

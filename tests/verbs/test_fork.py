@@ -301,7 +301,7 @@ def test_a_run_that_stops_leaves_the_folder_free(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         mdnum.fork("pair/at-cutoff", "start", steps=PAIR_STEPS, out=tmp_path / "here", progress=stop, **BARE)
-    RunFolder.create(tmp_path / "here", frame.layout("md"), overwrite=True).close()
+    RunFolder.create(tmp_path / "here", frame.layout("md")).close()
 
 
 def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, monkeypatch):
