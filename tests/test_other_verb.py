@@ -127,6 +127,21 @@ def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
     capsys.readouterr()
 
 
+DOCUMENTED = (
+    (Path(__file__).parents[1] / "docs/extending.md").read_text(encoding="utf-8").split("## A verb")[1]
+)
+BLOCKS = [DOCUMENTED.split(f"```{language}\n")[1].split("```")[0] for language in ("python", "toml")]
+
+
+@pytest.mark.parametrize("site", [BLOCKS], indirect=True)
+def test_the_documented_verb_works(site, capsys):
+    assert call("spread", "numbers.txt", "--above", "2", "-o", "out") == 1
+    assert printed(capsys)[-1] == "wrote out/report.html"
+    assert RunFolder.open("out").read("values")["value"].tolist() == [3.5, 1.25, 2.0]
+    assert call("spread", "numbers.txt", "--above", "3", "--no-report", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["above"] == 3.0
+
+
 def test_its_folder_is_one_clear_line_without_the_package(site, capsys):
     assert call("spread", "numbers.txt", "-o", "out") == 1
     capsys.readouterr()

@@ -221,6 +221,45 @@ def test_the_manifest_is_told_when_it_is_damaged_and_lists_nothing_elsewhere(fin
     assert "manifest.json" in RunFolder.open(finished).noted()[0]
 
 
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"tables": {"../precious": "step"}}, {"tables": {"a" * 50: "step"}},
+        {"tables": {"series": "step:object"}},
+        {"tables": {"series": "st/ep"}}, {"tables": ["series"]}, {"tables": {"series": ["step"]}},
+        {"tables": {f"t{'a' * n}": "x" for n in range(39)} | {f"u{'a' * n}": "x" for n in range(39)}
+         | {f"v{'a' * n}": "x" for n in range(39)}},
+        {"tables": {"series": " ".join(f"c{n}" for n in range(2_000))}},
+        {"usual": {"flips": {"rule": "many"}}}, {"usual": {"flips": {"rule": 10**20}}},
+        {"usual": {"flips": {"nothing": 0}}}, {"usual": {"nothing": {"rule": 0}}}, {"usual": 5},
+        {"usual": {"flips": {"rule": True}}}, {"usual": {"flips": {"rule": [0]}}},
+        {"kind": "\x1b[31mmd"}, {"kind": "../md"}, {"kind": 5}, {"command": "run\n; rm"}, {"command": ""},
+        {"resumes_from": "../precious"}, {"resumes_from": 0}, {"tables": None},
+    ],
+    ids=lambda odd: str(odd)[:40],
+)  # fmt: skip
+def test_an_odd_layout_with_a_right_digest_is_one_line(finished, odd):
+    path = finished / "manifest.json"
+    held = json.loads(path.read_text()) | odd
+    held.pop("digest")
+    text = json.dumps(held, sort_keys=True, separators=(",", ":"))
+    path.write_text(json.dumps({**held, "digest": manifest.digest_of(text.encode())}))
+    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+        RunFolder.open(finished)
+    code, _, err = called("report", str(finished))
+    assert code == 2 and err.count("\n") == 1 and "manifest.json" in err
+
+
+def test_what_is_sound_in_that_form_is_read(finished):
+    """The same as above without the odd part: it is the layout that was refused, and not the form."""
+    path = finished / "manifest.json"
+    held = json.loads(path.read_text())
+    held.pop("digest")
+    text = json.dumps(held, sort_keys=True, separators=(",", ":"))
+    path.write_text(json.dumps({**held, "digest": manifest.digest_of(text.encode())}))
+    assert RunFolder.open(finished).layout.columns("flips") == MD.columns("flips")
+
+
 def test_a_log_that_somebody_wrote_into_is_said_and_no_reason_to_refuse(finished):
     with open(finished / "log.txt", "a") as log:
         log.write("my note\n")
