@@ -24,6 +24,7 @@ import numpy as np
 
 from mdnum.report.finding import Texts, conclude
 from mdnum.report.section import Section, table_of
+from mdnum.store.files import write_text
 from mdnum.verbs import frame
 
 TEXTS = Texts(__file__)
@@ -36,6 +37,7 @@ def spread(path, *, above=1.0, sorted=True, **keep):
         values = np.sort(values) if sorted else values
         answer.result, answer.summary = values, {"name": str(path), "above": above, "status": "complete"}
         answer.tables["values"] = {"number": np.arange(len(values)), "value": values, "mark": "mine"}
+        write_text(answer.folder.path / "notes.txt", "of mine")
     return answer.outcome
 
 
@@ -69,6 +71,7 @@ no_sorted = { type = "flag", help = "Keep their order." }
 
 [kinds.spread]
 command = "spread"
+further = "notes*.txt"
 tables.values = "number:int64 value mark:word weight?"
 
 [sentences]
@@ -118,6 +121,8 @@ def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
     page = Path("out/report.html").read_text(encoding="utf-8")
     assert "numbers are 2.25 apart" in page and "1.25" in page
     assert call("report", "out") == 0 and Path("out/report.html").read_text(encoding="utf-8") == page
+    Path("out/notes.txt").write_text("of somebody else")
+    assert list(RunFolder.open("out").damaged()) == ["notes.txt"]
     import strange_spread  # pyright: ignore[reportMissingImports]
 
     outcome = strange_spread.spread("numbers.txt", above=9.0)

@@ -192,8 +192,6 @@ def _linked(path: Path) -> FolderError:
 NAME = "manifest.json"
 #: May be missing.
 ABSENT = ""
-# listed from their first write on; scripts and structures among them, which a page or a person goes by
-_FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 
@@ -304,7 +302,8 @@ def foretell(path: Path, new: str) -> None:
     if name == NAME or not (root / NAME).exists():
         return
     made = load(root)
-    if made is None or (name not in made.files and not _FROM_THE_FIRST.fullmatch(name)):
+    # those of its kind are listed from their first write on
+    if made is None or not (name in made.files or (made.layout is not None and made.layout.keeps(name))):
         return
     known = made.files.get(name, [ABSENT])
     now = digest(path)

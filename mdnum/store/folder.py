@@ -46,14 +46,12 @@ if TYPE_CHECKING:
 
 _FILES = (
     SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "summary.json", "log.txt",
-    "checkpoint.npz", "trajectory.traj", "report.html", "gradients.npz", "answers.json",
+    "checkpoint.npz", "trajectory.traj", "report.html", "answers.json",
 )  # fmt: skip
 _SYSTEM = (SYSTEM_FILE, SIMULATION_FILE)
 _LOCK = ".lock"
 # of those, what nothing is read from: each report writes it anew
 _WRITTEN_ANEW = "report.html"
-# further files that numbers are read from, or that a page shows
-_FURTHER = re.compile(r"reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 # what may be in a folder whose writing came to nothing
 _NOTHING_YET = (
     SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK,
@@ -576,7 +574,7 @@ class RunFolder:
         """
         for name in self._listed():
             written = name in _FILES or name.endswith(".parquet")
-            further = not written and "/" not in name and not _FURTHER.fullmatch(name)
+            further = not written and "/" not in name and not self.layout.keeps(name)
             if further or name in (*_SYSTEM, "structure.extxyz"):
                 self.check(name)
 
@@ -659,7 +657,7 @@ class RunFolder:
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
         fixed = {*_FILES} - {_WRITTEN_ANEW}
-        new = [name for name in there if name not in listed and (name in fixed or _FURTHER.fullmatch(name))]
+        new = [name for name in there if name not in listed and (name in fixed or self.layout.keeps(name))]
         now = manifest.listed_files(self.path, {*new, *({"log.txt", "trajectory.traj"} & set(there))})
         for name, allowed in listed.items():
             # what was about to be replaced has been

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from functools import cache, cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -49,6 +50,7 @@ class Layout:
             those whose own name ends in a question mark.
         usual: values of columns where rows leave them out, by table.
         resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
+        further: files beside tables that something is read from or shown from, as patterns with spaces between.
 
     Raises:
         ValueError: a name, type or value is none that a folder could have.
@@ -59,11 +61,14 @@ class Layout:
     tables: Mapping[str, str] = field(default_factory=dict)
     usual: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     resumes_from: str = ""
+    further: str = ""
 
     def __post_init__(self) -> None:
         matched = (_KIND.fullmatch(self.kind), _COMMAND.fullmatch(self.command))
         if not all(matched) or self.resumes_from not in ("", "checkpoint.npz", "answers.json"):
             raise ValueError(f"no kind of folder: {self.kind!r}, {self.command!r}, {self.resumes_from!r}")
+        if len(self.further) > _MOST_COLUMNS:
+            raise ValueError(f"names of files: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
             raise ValueError(f"names of tables: {list(self.tables)[:3]}")
         _ = self._columns
@@ -77,6 +82,11 @@ class Layout:
     def always(self) -> tuple[str, ...]:
         """Tables that every folder of the kind has."""
         return tuple(name for name in self.tables if not name.endswith("?"))
+
+    def keeps(self, name: str) -> bool:
+        """Whether a file beside the tables is one of the kind, so that it is compared with its digest."""
+        fixed = ("summary.json", self.resumes_from)
+        return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 
     def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
         """The type of each column of a table, and whether it may be unknown; empty for one not declared."""
