@@ -6,6 +6,7 @@ import importlib
 import json
 import tomllib
 from dataclasses import replace
+from itertools import count
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,14 +20,15 @@ from mdnum.forks import Twin, choices
 from mdnum.forks.linearized import Lyapunov
 from mdnum.forks.pair import Screened
 from mdnum.forks.worlds import program_of
-from mdnum.numerics.verdicts import Dates, Delay, Growth
+from mdnum.numerics.verdicts import Delay, Growth
 from mdnum.provenance import hashes
+from mdnum.report.finding import Texts
 from mdnum.report.section import Plot, Table
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.load import copy
-from mdnum.verbs import fork_pair, fork_verdict, frame
+from mdnum.verbs import fork_verdict, frame
 from mdnum.verbs.fork_page import page
 from mdnum.verbs.frame import View
 
@@ -328,12 +330,26 @@ def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, mo
             load(path, setting)
 
 
+@pytest.fixture
+def summary_of(monkeypatch, tmp_path):
+    """The summary of a pair that was followed, as `mdnum.fork` writes it, with an exponent of this rate."""
+
+    def summary(made, rate=None, chaotic=True, number=count()):
+        if rate is not None:
+            size = rate * np.arange(401.0)
+            exponent = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
+            monkeypatch.setattr("mdnum.forks.linearized.lyapunov", lambda *given: exponent)
+        monkeypatch.setattr("mdnum.forks.fork", lambda *given, **options: made)
+        options: dict[str, Any] = {"overrides": {"dynamics.seed": 4}, "report": False}
+        out, asked = tmp_path / f"{next(number)}", rate is not None
+        return mdnum.fork("argon/crystal-108", out=out, lyapunov=asked, **options).summary
+
+    return summary
+
+
 @pytest.mark.parametrize(("rate", "chaotic"), [(0.02, True), (1e-4, False), (0.006, False)])
-def test_an_exponent_that_is_none_says_why(crystal, monkeypatch, rate, chaotic):
-    size = rate * np.arange(401.0)
-    lyapunov = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
-    monkeypatch.setattr("mdnum.forks.linearized.lyapunov", lambda *given: lyapunov)
-    found = fork_pair._exponent(crystal.result)
+def test_an_exponent_that_is_none_says_why(crystal, summary_of, rate, chaotic):
+    found = summary_of(crystal.result, rate, chaotic)
     assert (found["lyapunov_reason"] is None) == chaotic
     ratio = crystal.result.growth["B"].rate / rate
     assert found["lyapunov"]["ratio"] == (pytest.approx(ratio) if chaotic else None)
@@ -344,8 +360,9 @@ def test_an_exponent_that_is_none_says_why(crystal, monkeypatch, rate, chaotic):
     assert split == pytest.approx(expected, abs=1) if chaotic else split is None
 
 
-def test_a_prediction_says_what_it_comes_from(crystal):
-    steady, power = 1e-12 * np.exp(0.02 * np.arange(900.0)), 1e-9 * np.arange(61.0) ** 2
+def test_a_prediction_says_what_it_comes_from(crystal, summary_of):
+    steps = np.arange(STEPS + 1.0)
+    steady, power = 1e-12 * np.exp(0.02 * steps), 1e-9 * steps**2
     for free, split, rate, by in (
         (steady, None, 0.5, "growth"),
         (steady, 9, None, None),
@@ -353,17 +370,20 @@ def test_a_prediction_says_what_it_comes_from(crystal):
         (power, None, None, None),
         (power, None, 0.0036, "exponent"),
     ):
-        made: Any = SimpleNamespace(
-            dates=Dates(0, 5, split), series={"B": free}, tolerance=0.1, steps=len(free) - 1
+        made = replace(
+            crystal.result,
+            dates=replace(crystal.result.dates, split=split),
+            series={**crystal.result.series, "B": free},
+            tolerance=0.1,
         )
-        found = fork_pair._predicted(made, {"lyapunov": {"rate": rate, "chaotic": True}} if rate else {})
+        found = summary_of(made, rate)
         assert found["predicted_by"] == by and (found["predicted_split"] is None) == (by is None)
     # repeats that did not split are kept, and a fit that is none has no line
     delays = (Delay(12, 40, 99, 99), Delay(None, 30, 99, 99))
     made = replace(
         crystal.result, repeats=(delays, delays[1:]), growth={"B": Growth(float("nan"), float("nan"), -1, -1)}
     )
-    found = fork_pair._numbers(made)
+    found = summary_of(made)
     assert found["repeated"] == [{"free": 12, "imposed": 40}, {"free": None, "imposed": 30}]
     assert found["repeated_other"] == [{"free": None, "imposed": 30}]
     assert found["growth"]["B"]["intercept"] is None
@@ -592,10 +612,18 @@ def test_the_figure_shows_the_separations_and_the_dates(crystal):
         ({"must_hold": True}, "error", "cause"),
     ],
 )  # fmt: skip
-def test_every_verdict_has_its_sentence(crystal, entries, tone, name):
-    view = cause(crystal, **entries)
+def test_every_verdict_has_its_sentence(crystal, monkeypatch, entries, tone, name):
+    view, said, texts = cause(crystal, **entries), {}, fork_verdict.TEXTS
+
+    class Noted(Texts):
+        entries = texts.entries
+
+        def __call__(self, name, /, **values):
+            return said.setdefault(name, texts(name, **values))
+
+    monkeypatch.setattr(fork_verdict, "TEXTS", Noted.__new__(Noted))
     verdict = fork_verdict.judge(view)
-    assert fork_verdict._headline(view)[0] == name and verdict.tone == tone
+    assert verdict.headline == said[name] and verdict.tone == tone
     pair = "{i}–{j}".format(**crystal.summary["decision"])
     assert "–" not in verdict.headline.replace(pair, "") and not verdict.headline.endswith("..")
 
