@@ -145,3 +145,34 @@ def test_names_and_numbers_are_no_words():
     assert words("`mdnum run` of 'float64' has MISSING rows, InputError: Ar in ase.io") == [
         "of", "has", "rows", "in",
     ]  # fmt: skip
+
+
+def private_names(tree: ast.AST) -> Iterator[str]:
+    """Names with a leading underscore that are imported from `mdnum.verbs` or read off a module of it."""
+    modules: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mdnum.verbs"):
+            modules |= {one.asname or one.name for one in node.names}
+            yield from (one.name for one in node.names if one.name.startswith("_"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            yield from [node.attr] * (node.attr.startswith("_") and not node.attr.startswith("__"))
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from mdnum.verbs.fork import _numbers", ["_numbers"]),
+        ("from mdnum.verbs import fork as f\nf._numbers(f.judge)", ["_numbers"]),
+        ("from mdnum.verbs import frame\nfrom mdnum.md import kernel\nkernel._BLOCK, frame.finish", []),
+    ],
+)
+def test_a_private_name_is_found(source: str, found: list[str]):
+    assert list(private_names(ast.parse(source))) == found
+
+
+def test_verbs_are_tested_by_what_they_offer():
+    """A verb is its function, its judge, its page and its summary: what is inside may be written anew."""
+    paths = sorted(TESTS.rglob("*.py"))
+    found = {str(path.relative_to(TESTS)): [*private_names(ast.parse(path.read_text()))] for path in paths}
+    assert len(found) > 150 and {path: names for path, names in found.items() if names} == {}

@@ -13,8 +13,10 @@ import shutil
 import sys
 import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import planted_lists
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -25,6 +27,7 @@ from test_store import COLUMNS, MD, frame, no_waiting, series_rows, state_at, wr
 import mdnum
 from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
+from mdnum.references.conformance.questions import plan
 from mdnum.store import RunFolder, checkpoint, tables
 from mdnum.store import files as atomic
 from mdnum.store import files as manifest
@@ -488,20 +491,23 @@ def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tm
         RunFolder.create(folder.path, MD)
 
 
-def test_scripts_of_a_person_stay(tmp_path):
-    from types import SimpleNamespace
-
-    from mdnum.verbs.conform import _write_scripts
-
-    folder = RunFolder.create(tmp_path / "run", layout("conform"))
-    stale = folder.path / "reproduce-3-missing.py"
+def test_scripts_of_a_person_stay(tmp_path, monkeypatch):
+    """A script of mdnum that stands for no failure is removed by the examination that goes on."""
+    first = lambda *given, **named: plan(*given, **named)[:1]  # noqa: E731
+    monkeypatch.setattr("mdnum.references.conformance.suite.plan", first)
+    home = str(Path(planted_lists.__file__).parent)
+    lines = f"import sys\nsys.path.append({home!r})\nfrom planted_lists import planted\npairs = planted('')\n"
+    (tmp_path / "right.py").write_text(lines)
+    options: dict[str, Any] = {"cases": 0, "large": False, "report": False}
+    folder = mdnum.conform(f"{tmp_path / 'right.py'}:pairs", out=tmp_path / "run", **options).folder
+    stale = folder / "reproduce-3-missing.py"
     atomic.write_text(stale, "of mdnum")
     names = ("reproduce-mine.py", "reproduce-1-mine.py", "reproduce-1-extra.py")
     for name in names:
-        (folder.path / name).write_text("mine")
-    assert _write_scripts(folder, SimpleNamespace(failed=[])) == []  # pyright: ignore[reportArgumentType]
-    assert not stale.exists() and all((folder.path / name).read_text() == "mine" for name in names)
-    assert folder.damaged() == {}
+        (folder / name).write_text("mine")
+    mdnum.conform(resume=folder, report=False)
+    assert not stale.exists() and all((folder / name).read_text() == "mine" for name in names)
+    assert RunFolder.open(folder).damaged() == {}
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,7 @@ def _ask_all(
         try:
             others = [one for one in state.shown if one.name != name]
             with interrupting(deadline):
-                result = _ask(check, subject, log, others)
+                result = answer_of(check, subject, log, others)
         except KeyboardInterrupt:
             if not state.shown:
                 raise
@@ -220,7 +220,7 @@ def _ask_all(
     return outcome
 
 
-def _ask(
+def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding.

@@ -185,7 +185,7 @@ def conform(
 
         def summarized() -> dict[str, Any]:
             found.seconds = state.seconds
-            return _summary(found, _write_scripts(folder, found), options.seed)
+            return summary_of(found, _write_scripts(folder, found), options.seed)
 
         def saved(urgent: bool) -> None:
             """Keeps an answer; scripts and summary follow now and then."""
@@ -262,8 +262,8 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
     return scripts
 
 
-def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """The content of summary.json, without headline and findings."""
+def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
+    """The content of summary.json but what is judged; `scripts` are names, one for each failure."""
     tested = found.tested
     own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip

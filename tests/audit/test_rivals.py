@@ -16,7 +16,7 @@ from mdnum.audit.checks import CHECKS
 from mdnum.audit.checks.dynamics import DynamicsCheck
 from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.subject import CalculatorSubject
-from mdnum.verbs.audit import _ask
+from mdnum.verbs.audit import answer_of
 
 #: Without the nightly ones: one of each kind of mistake.
 QUICK = (
@@ -34,7 +34,7 @@ def audited(make: Any, atoms: Any, neighbors: int = 40) -> list[CheckResult]:
         check = DynamicsCheck(steps=60) if name == "dynamics" else CHECKS[name]()
         if isinstance(check, SmoothnessCheck):
             check.neighbors = neighbors
-        results.append(_ask(check, subject, lambda *_: None, results))
+        results.append(answer_of(check, subject, lambda *_: None, results))
     return results
 
 

@@ -29,7 +29,7 @@ from mdnum.references.conformance.questions import plan
 from mdnum.references.conformance.suite import examine
 from mdnum.report.finding import Finding, Verdict
 from mdnum.store import RunFolder
-from mdnum.verbs.conform import _summary, judge
+from mdnum.verbs.conform import judge, summary_of
 
 _MINE = """
 import numpy as np
@@ -139,7 +139,7 @@ def test_mistakes_are_one_line(mine: Path, arguments, part: str, capsys: pytest.
 def _verdict(found: Report) -> Verdict:
     names = [f"{n}.py" for n in range(len(found.failed))]
     folder = SimpleNamespace(path=Path("it"))
-    return judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0), folder=folder)))
+    return judge(cast(Any, SimpleNamespace(name="it", summary=summary_of(found, names, 0), folder=folder)))
 
 
 def _judged(function, cases, **options) -> tuple[Verdict, dict[str, Finding]]:

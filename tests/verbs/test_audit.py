@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from mdnum.report.words import listed
 from mdnum.store import RunFolder
 from mdnum.units import LJ
 from mdnum.verbs import frame
-from mdnum.verbs.audit import TEXTS, _headline, _in_units
+from mdnum.verbs.audit import TEXTS, VERBS, AuditView
 
 QUICK = "invariance,forces"
 CHECKS = in_order(list(checks.CHECKS))
@@ -214,13 +215,11 @@ def part(name: str, *found: tuple[str, str], asked: int = 1, possible: int = 1) 
 
 
 def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[str, str, str]:
-    from mdnum.verbs.audit import _finding
-
     names = wanted or [one.name for one in parts]
     state = AuditState("x", True, encoded(Atoms("Ar")), 1.0, "metal", names, None, None, None, parts)
-    found = [_finding(one, "", "") for each in parts for one in each.findings]
     told = answers(parts, names)
-    return told["run"], told["differentiate"], _headline(state, found)
+    headline = VERBS["audit"].judge(AuditView(cast(Any, None), {}, given=state)).headline
+    return told["run"], told["differentiate"], headline
 
 
 NO, CARE = (TEXTS(f"same_{answer}", name="x on Ar") for answer in ("no", "with_care"))
@@ -445,8 +444,6 @@ def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
     seen = re.sub(r"<(style|script)\b.*?</\1>|<(?!!--)[^>]*>", " ", page, flags=re.DOTALL)
     for text in (seen, (tmp_path / "a/summary.json").read_text()):
         assert not [text[one.start() - 40 : one.end() + 20] for one in DIMENSIONS.finditer(text)]
-    told = _in_units(["0.1 eV/Å", "1 meV", {"curl (eV/Å²)": "eV.py in SteveV failed at 3 eV."}], LJ)
-    assert told == ["0.1 ε/σ", "1 mε", {"curl (ε/σ²)": "eV.py in SteveV failed at 3 ε."}]
 
 
 def test_another_package_adds_a_check(tmp_path, monkeypatch):
