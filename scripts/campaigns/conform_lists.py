@@ -1,5 +1,9 @@
 """Which neighbor lists list the right pairs? Every installed one through the conformance suite, in one table.
 
+Answer. Those of ASE, scipy, freud, mdnum and MDAnalysis's brute force do wherever they answer; vesin 0.6,
+jax-md 0.2.29, matscipy 1.3, pymatgen and MDAnalysis's nsgrid each have cases that are wrong, or end them
+(docs/conform.md). It takes minutes, with --all --large more.
+
     python scripts/campaigns/conform_lists.py                      the lists that take seconds
     python scripts/campaigns/conform_lists.py vesin matscipy       these
     python scripts/campaigns/conform_lists.py --all --large        also jax-md's (minutes), and 100,000 atoms

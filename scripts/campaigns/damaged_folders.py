@@ -1,5 +1,8 @@
 """What does mdnum make of a damaged folder? Random damages, each read again, and what came of it in a table.
 
+Answer. Of 280 damages 160 are refused in one line, 11 are reported while the rest is read, and 109 change
+nothing that is read; none goes unnoticed (docs/hostile-input.md). It takes minutes.
+
     python scripts/campaigns/damaged_folders.py                      300 damages, some minutes
     python scripts/campaigns/damaged_folders.py --damages 30 --kinds finished,killed
 

@@ -1,5 +1,9 @@
 """What does mdnum make of files that nobody here wrote? Data files of some packages, each read in three ways.
 
+Answer. Of 692 files, each read in three ways, 801 of 2,076 cases are read, 6 in part, and 1,269 are refused
+in one line; none ends in a traceback, hangs, crashes or leaves a file behind (docs/foreign-files.md). It
+takes many minutes.
+
     python scripts/campaigns/foreign_files.py                          the packages that are installed
     python scripts/campaigns/foreign_files.py --packages ase --damage  whole, cut, and with bytes overwritten
     python scripts/campaigns/foreign_files.py --folders ~/data --patience 120

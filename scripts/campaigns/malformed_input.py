@@ -1,4 +1,7 @@
-"""What mdnum does with system files that no careful person would write, and with words that are none.
+"""What does mdnum make of system files that no careful person would write, and of words that are none?
+
+Answer. Of 345 cases 298 are refused in one line, 46 run, and 1 ends in such a line; none ends otherwise
+(docs/hostile-input.md). It takes minutes.
 
     python scripts/campaigns/malformed_input.py [--cases 300] [--seed 1]
 

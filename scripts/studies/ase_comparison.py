@@ -1,5 +1,10 @@
 """Are energies, forces and stresses right, and does every library mean the same by "inside the cutoff"?
 
+Answer. Yes. 16 systems and cutoffs agree with ASE or numpy: energies to 3e-14 of their size, forces and
+stresses to 1e-13. All searches installed here (ASE, vesin, scipy, pymatgen, MDAnalysis, jax-md) find the
+same pairs; where they stop counting differs by ulps of r_cut, and by 1e-8 for MDAnalysis, which works in
+float32. It takes 50 s.
+
 First, every shipped system with its own cutoff, and one of them with every kind of cutoff, against
 ASE (or, where ASE has no such potential, against plain numpy on ASE's neighbor list; the table says
 which). Structures are also compared after a random displacement of every atom, because a perfect

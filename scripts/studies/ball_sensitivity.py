@@ -1,5 +1,9 @@
 """How do a bouncing ball's decisions, loss and gradient answer to h, k, tol and eps?
 
+Answer. The step moves the first contact by whole steps, and the loss by up to 8 %. Derivatives through a
+spring floor are noise (d/dy0 between -430 and 63); a softplus floor has smooth ones (1.3 to 2.6). A
+tolerance changes nothing until it changes a number of iterations. It takes 17 s.
+
 One ball is dropped on a spring floor (k: stiffness), on a softplus floor of width eps, and on a floor
 that is found by iteration (k: gain, tol: when to stop). One knob at a time is turned around its value,
 and the table says for each setting:

@@ -1,5 +1,10 @@
 """What does the treatment of the cutoff do to energy, drift and flips?
 
+Answer. In argon/liquid-864 the energy with a hard cutoff at 8.5 Å fluctuates 290 times as much as with a
+shifted one (6.3e-6 and 2.2e-8 eV an atom), at the same flips; smoother cutoffs gain at most another
+quarter. The number of flips grows with the radius (0.022 per atom and step at 6.8 Å, 0.025 at 8.5 Å) and
+hardly depends on the treatment. It takes 35 s.
+
 The same start is run with every kind of cutoff at several radii (multiples of the system's own),
 and the table says for each:
 

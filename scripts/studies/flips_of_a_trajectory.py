@@ -1,5 +1,9 @@
 """How often, and with how many digits, must a trajectory be written for its flips to be seen?
 
+Answer. Of argon at 2 fs a step, a frame every 32 fs shows 99.8 % of the flips and one every 128 fs 96 %,
+and the loss estimated from those frames alone is right. Three decimals of an Ångström hide a tenth of the
+flips and make up as many; two decimals, more than half. It takes 27 s.
+
 Takes a trajectory (or makes one with mdnum, every step of it) and looks at it again as if fewer frames had
 been written, and as if positions had been rounded to so many decimals:
 

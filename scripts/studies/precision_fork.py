@@ -1,5 +1,9 @@
 """Which role of a number, made narrower, changes a run, when, and was it through a flip?
 
+Answer. In argon/crystal-108 every role but the sums does, and each split is caused by flips: forces or
+state in float32 fork at step 303, decisions at step 2,672, all but the state at step 1,863. Sums in float32
+cause no fork within 5,000 steps. It takes 30 s.
+
 A run's positions and velocities (state), pair terms (force), compared distances (decision) and sums
 (accumulate) are float64. Here one role at a time is float32, and then all but the state. Each run is
 followed beside the float64 one, with a third that has the narrow arithmetic and is told the float64

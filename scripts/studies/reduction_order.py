@@ -1,5 +1,9 @@
 """Does the order in which an atom's forces are summed matter, and which sums have no order?
 
+Answer. It does: of the melted crystal, runs with another order or sum fork within 1,000 to 1,080 steps and
+split 160 to 200 steps later, the exact sum included. Shuffled neighbors change no bit of neumaier, sorted,
+exact and fixed-point sums. It takes 100 s.
+
 The pair terms are the same; only the way they are added differs. Every reduction that ships is run
 beside the system's own and, to see whether it minds an order, beside itself with the neighbors of
 each atom shuffled. The table says:

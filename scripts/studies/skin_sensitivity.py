@@ -1,5 +1,9 @@
 """How much skin does a neighbor list need, and what does rebuilding it blindly cost?
 
+Answer. In argon/liquid-864 no pair is lost with any skin as long as displacements are checked, and 1 Å is
+the fastest of three. Rebuilt blindly every 80 steps, the list loses 665 pairs with 0.33 Å, 2 with 1 Å and
+none with 1.5 Å; no build was "dangerous". It takes 25 s.
+
 A Verlet list holds pairs out to r_cut + skin. Rebuilt when some atom has moved by half the skin
 ("check"), it never misses a pair; rebuilt blindly every k steps, it may. The same start is run with
 every skin under every rule, each step whose skin was overdrawn is audited against a fresh search,

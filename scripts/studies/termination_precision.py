@@ -1,5 +1,9 @@
 """Which precision of a stopping residual changes what a solver does?
 
+Answer. Only a sequential sum in bfloat16 does: it stops early in 13 of 200 steps, and the derivative
+changes by 1.4 %. A pairwise or exact sum in bfloat16, and any sum in float16 and float32, runs the program
+of float64. It takes 31 s.
+
 Balls lie on a floor and are shaken; each step a projection iterates until the penetrations of the whole batch
 sum to less than a tolerance. The state stays in one dtype. Only the sum is made in others and in several
 orders, and compared with the sum in float64:

@@ -1,5 +1,7 @@
 """Which time step is too long, and does mdnum's warning say so?
 
+Answer. Of 55 rows one is a missed warning and one a false one (docs/time-steps.md). It takes minutes.
+
 Every shipped system of atoms runs for the same time at its own time step and at 1/2 to 16 times that. A
 step is too long where halving it changes what an experiment would see: the mean potential energy or the
 temperature of the run's second half, by more than three standard errors and by more than 3 % of k_B T an
