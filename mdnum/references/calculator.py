@@ -51,7 +51,7 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
     """From objects, or from the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
-        end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path(), "MdnumCalculator")
+        end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
         said = {name: table and table.model_dump(exclude_none=True) for name, table in made._asdict().items()}
     else:
         if isinstance(potential, PairPotential) != isinstance(cutoff, Cut):

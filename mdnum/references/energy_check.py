@@ -14,7 +14,8 @@ from numpy import ndarray
 from mdnum.md.integrators import VelocityVerlet as OwnVerlet
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
-from mdnum.references.ase_models import Reference, evaluate, independent, reference
+from mdnum.references.adapted import evaluate
+from mdnum.references.ase_models import Reference, independent, reference
 from mdnum.references.independent import SLACK, Edges, PairModel, edges_of
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import build

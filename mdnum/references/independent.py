@@ -159,10 +159,14 @@ class PairForm:
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
-        u, du = self.bare(r)
-        at_cut, slope_at_cut = (float(x[0]) for x in self.bare(np.array([self.r_cut])))
-        at = AtCutoff(self.r_cut, self.r_onset, at_cut, slope_at_cut)
-        return CUTOFFS.parse(self.cutoff).reference(r, u, du, at)
+        at = AtCutoff(self.r_cut, self.r_onset, *self.at_cutoff)
+        return CUTOFFS.parse(self.cutoff).reference(r, *self.bare(r), at)
+
+    @property
+    def at_cutoff(self) -> tuple[float, float]:
+        """u and u' at the cutoff, without it."""
+        u, du = self.bare(np.array([self.r_cut]))
+        return float(u[0]), float(du[0])
 
 
 def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:

@@ -60,12 +60,11 @@ def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) 
     return made
 
 
-def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder: Path, name: str) -> Any:
+def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder: Path) -> Any:
     """The potential of some tables for atoms: a `CutPotential`, or one of many bodies.
 
     Args:
         folder: where the files that the tables name are.
-        name: of the system, for messages.
 
     Raises:
         InputError: a species for which there are no constants.
@@ -79,7 +78,8 @@ def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder:
             }
         )
     if spec.cutoff is None:
-        return _many_body_model(spec.potential, atoms, folder, name)
+        a, b, c = (bool(flag) for flag in atoms.pbc)
+        return pairs.many_body(spec.potential, species_of(atoms)[0], folder, (a, b, c))
     return _pair_model(schema.Interaction(spec.potential, spec.cutoff), atoms, folder)
 
 
@@ -96,25 +96,6 @@ def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tup
         )
     ends = (row if row is None else _per_type(row) for row in pairs.cutoff_radii(tables, species))
     return cut(potential, cutoff.kind, species, *ends, weights=own)
-
-
-def _many_body_model(potential: Any, atoms: Atoms, folder: Path, name: str):
-    from mdnum.md import manybody
-
-    a, b, c = (bool(flag) for flag in atoms.pbc)
-    pbc = (a, b, c)
-    if isinstance(potential, schema.EmbeddedAtomTable):
-        return manybody.embedded_atom(folder / potential.file, atoms.get_chemical_symbols(), pbc)
-    assert isinstance(potential, schema.TersoffTable | schema.StillingerWeberTable)
-    if others := sorted(set(species_of(atoms)[0]) - {potential.parameters}):
-        raise InputError(
-            f"the structure holds {', '.join(others)}, and the constants are those of {potential.parameters}",
-            where=f"{name}: [potential]",
-            remedy="Use a structure of that element alone, or a potential for all of them",
-        )
-    if isinstance(potential, schema.TersoffTable):
-        return manybody.tersoff(potential.parameters, pbc)
-    return manybody.stillinger_weber(potential.parameters, pbc)
 
 
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:
@@ -145,7 +126,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
         Origin(system.name, spec.about, system, {} if fork is None else fork.model_dump()),
         system.atoms,
         units,
-        model_of(spec, system.atoms, system.folder, system.name),
+        model_of(spec, system.atoms, system.folder),
         spec.compare,
         RebuildRule(spec.skin, rebuild.every, rebuild.delay, rebuild.check),
         neighbors.builder,

@@ -110,7 +110,7 @@ def simulation(
     Args:
         atoms: positions, cell and periodicity; masses default to ASE's, in reduced units to 1.
         potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; a dictionary of
-            `Term`s, which add; or one of `mdnum.md.manybody`.
+            `Term`s, which add; or one of `mdnum.md.manybody` or `mdnum.md.tetrahedral`.
         cutoff: of a pair potential; terms and one of many bodies have their own.
         timestep: in ps, or in reduced time; not beside an integrator that has one.
         units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
@@ -397,7 +397,7 @@ def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:
 
     Args:
         simulation: the system as objects; in float64.
-        potential: an `EnergyFunction`, or another of `mdnum.md.manybody`.
+        potential: an `EnergyFunction`, or another `ManyBody`.
 
     Raises:
         InputError: its radius and the skin do not fit the box, or the system is not in float64 throughout.

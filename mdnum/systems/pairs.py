@@ -7,6 +7,7 @@ that a forgotten cross term is an error and not a guess.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
@@ -110,16 +111,26 @@ def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> 
             pair_constants(one, species)
             longest = max(longest, float(cutoff_radii(one, species)[0].max()))
         return longest
-    from mdnum.md import manybody
+    return many_body(potential, species, folder).r_cut
+
+
+def many_body(
+    potential: Any, species: Sequence[str], folder: Path, pbc: tuple[bool, bool, bool] = (True, True, True)
+) -> Any:
+    """The many-body potential of a table, a `ManyBody`.
+
+    Raises:
+        InputError: its constants are not those of these species, or its file cannot be used.
+    """
+    from mdnum.md import embedded_atom, tetrahedral
 
     if isinstance(potential, schema.EmbeddedAtomTable):
-        return manybody.read_setfl(folder / potential.file, species).r_cut
-    unknown = [name for name in species if name != potential.parameters]
-    if unknown:
+        return embedded_atom.embedded_atom(folder / potential.file, species, pbc)
+    if unknown := [name for name in species if name != potential.parameters]:
         raise InputError(
-            f"{potential.kind} has constants for {potential.parameters}, but the structure holds "
-            f"{', '.join(unknown)}",
+            f"the structure holds {', '.join(unknown)}, and {potential.kind} has constants for "
+            f"{potential.parameters}",
             remedy="Correct the structure or the potential",
         )
-    made = manybody.tersoff if potential.kind == "tersoff" else manybody.stillinger_weber
-    return made(potential.parameters).r_cut
+    made = tetrahedral.tersoff if potential.kind == "tersoff" else tetrahedral.stillinger_weber
+    return made(potential.parameters, pbc)

@@ -19,7 +19,7 @@ from ase.build import bulk
 from ase.neighborlist import neighbor_list
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.md import jaxmd, manybody
+from mdnum.md import jaxmd, tetrahedral
 
 pytestmark = pytest.mark.jax_md
 ALWAYS = (True, True, True)
@@ -194,10 +194,10 @@ def test_tersoff_forces_are_nan_beside_padding(md):
     gradient = np.asarray(jax.grad(energy_fn)(positions, neighbor))
     assert np.isnan(gradient).any(), mended(
         "masks the bond order after its power (NaN forces)",
-        "mdnum.md.manybody may wrap jax-md's energy function, if its cosines are mended too",
+        "mdnum.md.tetrahedral may wrap jax-md's energy function, if its cosines are mended too",
     )
     cell = jnp.asarray(atoms.cell.array)
-    assert np.isfinite(np.asarray(manybody.tersoff().forces(positions, neighbor, cell))).all()
+    assert np.isfinite(np.asarray(tetrahedral.tersoff().forces(positions, neighbor, cell))).all()
 
 
 def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
@@ -210,7 +210,7 @@ def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
     charge, embedding, _, _ = md.energy.load_lammps_eam_parameters(io.StringIO("\n".join([*table, ""])))
     value = float(embedding(jnp.asarray(0.5)))
     assert value != float(numbers[5]) and value == pytest.approx(float(numbers[5]), rel=1e-6), mended(
-        "rounds EAM tables to float32", "manybody.read_setfl may go"
+        "rounds EAM tables to float32", "embedded_atom.read_setfl may go"
     )
     assert float(charge(jnp.asarray(100.0))) == 0.0, mended(
         "returns 0 off its splines", "the NaN of EmbeddedAtom.embed may be reconsidered"
@@ -250,7 +250,7 @@ def test_cosines_are_bent_by_a_length_of_1e_minus_7(md):
     cosine = float(md.quantity.cosine_angle_between_two_vectors(a, b))
     offset = np.sqrt(0.5) - cosine
     assert offset == pytest.approx(np.sqrt(0.5) * (1e-7 / 2.35 + 1e-7 / (2.35 * np.sqrt(2))), rel=1e-3), (
-        mended("adds 1e-7 to lengths in cosines", "the unit of length in manybody.stillinger_weber may go")
+        mended("adds 1e-7 to lengths in cosines", "the unit of length in tetrahedral.stillinger_weber may go")
     )
     scaled = float(md.quantity.cosine_angle_between_two_vectors(a * 2.0**24, b * 2.0**24))
     assert abs(scaled - np.sqrt(0.5)) < 1e-14
@@ -341,7 +341,7 @@ def test_a_list_from_outside_equals_jax_mds_own(md, format):
 @pytest.mark.nightly
 def test_relaxation_finds_the_crystal_over_a_list_that_must_be_rebuilt():
     atoms = silicon(0.25)
-    potential = manybody.stillinger_weber()
+    potential = tetrahedral.stillinger_weber()
     cell, built = jnp.asarray(atoms.cell.array), []
 
     def neighbors(positions):
@@ -397,6 +397,7 @@ def test_displacement_is_ases_and_follows_a_cell_given_later(pbc):
 
 
 def test_importing_the_adaptor_does_not_import_jax_md():
-    script = "import sys, mdnum.md.jaxmd, mdnum.md.manybody; print('jax_md' in sys.modules)"
+    importing = "import sys, mdnum.md.jaxmd, mdnum.md.tetrahedral, mdnum.md.embedded_atom"
+    script = f"{importing}; print('jax_md' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

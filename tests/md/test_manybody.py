@@ -17,9 +17,9 @@ from ase.neighborlist import neighbor_list
 from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_weber, tersoff
 
 from mdnum.errors import InputError
-from mdnum.md import jaxmd, manybody
-from mdnum.md.manybody import embedded_atom as made_eam
-from mdnum.md.manybody import read_setfl
+from mdnum.md import jaxmd, manybody, tetrahedral
+from mdnum.md.embedded_atom import embedded_atom as made_eam
+from mdnum.md.embedded_atom import read_setfl
 
 COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
 # relative energy, and forces relative to the largest one; measured 4e-16 and 8e-15
@@ -66,11 +66,11 @@ def _evaluate(potential, positions, idx, cell):
 
 CASES = {
     "eam": (lambda: made_eam(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
-    "tersoff": (manybody.tersoff, tersoff, "Si", 3, 0.05),
+    "tersoff": (tetrahedral.tersoff, tersoff, "Si", 3, 0.05),
     # bonds inside the taper and beyond it
-    "tersoff, hot": (manybody.tersoff, tersoff, "Si", 3, 0.15),
-    "stillinger-weber": (manybody.stillinger_weber, stillinger_weber, "Si", 3, 0.05),
-    "stillinger-weber, hot": (manybody.stillinger_weber, stillinger_weber, "Si", 3, 0.15),
+    "tersoff, hot": (tetrahedral.tersoff, tersoff, "Si", 3, 0.15),
+    "stillinger-weber": (tetrahedral.stillinger_weber, stillinger_weber, "Si", 3, 0.05),
+    "stillinger-weber, hot": (tetrahedral.stillinger_weber, stillinger_weber, "Si", 3, 0.15),
 }
 
 
@@ -145,7 +145,10 @@ def test_triclinic_and_slab_agree_with_extended_precision():
     free.pbc = False
     for atoms in (tilted, slab, free):
         pbc = tuple(bool(flag) for flag in atoms.pbc)
-        for make, oracle in ((manybody.tersoff, tersoff), (manybody.stillinger_weber, stillinger_weber)):
+        for make, oracle in (
+            (tetrahedral.tersoff, tersoff),
+            (tetrahedral.stillinger_weber, stillinger_weber),
+        ):
             potential = make(pbc=pbc)
             idx = jaxmd.dense_pairs(atoms.positions, atoms.cell.array, pbc, potential.r_cut + 0.3)
             expected = dense(atoms, potential.r_cut + 0.3, 1)
@@ -161,7 +164,7 @@ def test_tersoff_dimer_has_a_force_and_no_third_neighbor():
     atoms = cluster("Si", [[0, 0, 0], [2.4, 0, 0]])
     for r in (2.4, 2.8, 2.999):
         atoms.positions[1, 0] = r
-        energy, forces, _ = evaluate(manybody.tersoff(), atoms)
+        energy, forces, _ = evaluate(tetrahedral.tersoff(), atoms)
         exact, exact_forces = energy_and_forces(tersoff(atoms), atoms.positions, [0, 1])
         assert abs(energy - exact) <= 1e-14
         np.testing.assert_allclose(forces[:2], exact_forces.astype(float), rtol=0, atol=1e-13)
@@ -251,8 +254,8 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     [
         (lambda: made_eam(COPPER, ["Cu", "Al"]), "table for Cu, .*holds Al"),
         (lambda: made_eam(COPPER.with_name("none.alloy")), "no such potential table"),
-        (lambda: manybody.tersoff("Ge"), "known are Si and Si-1989"),
-        (lambda: manybody.stillinger_weber("Ge"), "known is Si"),
+        (lambda: tetrahedral.tersoff("Ge"), "known are Si and Si-1989"),
+        (lambda: tetrahedral.stillinger_weber("Ge"), "known is Si"),
     ],
 )
 def test_another_element_and_a_missing_table_are_refused(make, message):
@@ -262,7 +265,7 @@ def test_another_element_and_a_missing_table_are_refused(make, message):
 
 def test_the_1989_constants_differ_from_those_of_1988():
     atoms = crystal("Si", 3, 0.0)
-    newer, older = manybody.tersoff("Si-1989"), manybody.tersoff("Si")
+    newer, older = tetrahedral.tersoff("Si-1989"), tetrahedral.tersoff("Si")
     per_atom = [evaluate(p, atoms)[0] / len(atoms) for p in (newer, older)]
     # cohesive energy of diamond silicon in both papers: 4.63 eV
     np.testing.assert_allclose(per_atom, -4.63, atol=5e-3)

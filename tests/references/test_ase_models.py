@@ -12,7 +12,8 @@ from ase.calculators.fd import calculate_numerical_forces, calculate_numerical_s
 from ase.calculators.tersoff import TersoffParameters
 from small_systems import KOB_ANDERSEN, make
 
-from mdnum.references.ase_models import evaluate, independent, reference
+from mdnum.references.adapted import evaluate
+from mdnum.references.ase_models import independent, reference
 from mdnum.references.independent import OnNeighborList, StillingerWeberModel, TersoffModel, pair_forms
 from mdnum.systems.build import model_of
 
@@ -53,7 +54,7 @@ def agree(system) -> None:
 
 
 def forms_of(system):
-    model = model_of(system.spec, system.atoms, system.folder, system.name)
+    model = model_of(system.spec, system.atoms, system.folder)
     return pair_forms(model, system.species, system.spec.cutoff.compare)
 
 

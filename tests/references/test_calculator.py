@@ -14,7 +14,8 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.references import MdnumCalculator
-from mdnum.references.ase_models import evaluate, reference
+from mdnum.references.adapted import evaluate
+from mdnum.references.ase_models import reference
 from mdnum.systems import build
 
 SWITCHED = {"kind": "switched", "radius": 2.2, "onset": 1.8}
