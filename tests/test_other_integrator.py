@@ -223,6 +223,15 @@ def test_unrolled_differentiates_through_its_state(kind):
         assert slope == pytest.approx((high - low) / 2e-6, rel=1e-6), name
 
 
+def test_a_page_says_why_methods_are_missing(tmp_path):
+    made = mdnum.grad(held(), "potential", "epsilon", steps=3, out=tmp_path / "grad")
+    missing = {one["what"]: one["why"] for one in made.summary["left_out"] if not one["how"]}
+    assert all("nose-hoover" in missing[name] for name in ("symmetric", "event-aware", "trust", "flips"))
+    text = " ".join((made.folder / "report.html").read_text().split())
+    # of all that have the same reason in one line
+    assert text.count(missing["symmetric"]) == 1 and "symmetric, forward, " in text
+
+
 class Squeezed(KickDrift):
     """A kick and a drift, of which the drift scales velocities by their size."""
 

@@ -27,7 +27,6 @@ from mdnum.gradients.recorded import tape_of
 from mdnum.gradients.tape import KEPT, RunTape, frame_of, listed
 from mdnum.md.cell import displacement
 from mdnum.md.cutoffs import Hard
-from mdnum.md.integrators import Langevin
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.md.pairforce import PairForce
 from mdnum.systems.simulation import Simulation
@@ -345,7 +344,8 @@ class Reweighting(Method):
         why = one_term(problem.simulation)
         if why is not None:
             return why
-        if not isinstance(problem.simulation.integrator, Langevin):
+        integrator = problem.simulation.integrator
+        if integrator.random is None or "temperature" not in integrator.numbers():
             return "without a thermostat states are not met with the weights of a temperature"
         if not problem.loss.of_single_frames:
             return f"{problem.loss.name} compares frames in time, and is no average over an ensemble"
@@ -387,8 +387,7 @@ class Reweighting(Method):
 def _score(simulation: Simulation, seen: Frames, name: str) -> Float[np.ndarray, "frames *types"]:
     """Derivative of the logarithm of each frame's weight."""
     bath = simulation.integrator
-    assert isinstance(bath, Langevin)
-    kT = float(bath.kT)
+    kT = float(getattr(bath, bath.keys()["temperature"].name))
     if name == "dynamics.temperature":
         return (seen.energy + seen.kinetic) / kT * simulation.units.k_B / kT
     return -seen.force_energy[name] / kT

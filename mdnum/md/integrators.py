@@ -119,8 +119,8 @@ class Integrator(eqx.Module):
         return cls(**made)
 
     @property
-    def random(self) -> Array | None:
-        """Its random key; None without noise."""
+    def random(self) -> Any:
+        """Its random key, an array; None without noise. eqx.tree_at may have something else in its place."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 

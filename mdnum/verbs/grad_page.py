@@ -406,11 +406,15 @@ def _scaling(view: View) -> Iterator[Any]:
 
 def _left_out(view: View) -> Iterator[Any]:
     left = [one for one in view.summary["left_out"] if one["how"]]
-    never = [one for one in view.summary["left_out"] if not one["how"]]
+    never: dict[str, list[str]] = {}
+    for one in view.summary["left_out"]:
+        if not one["how"]:
+            never.setdefault(one["why"], []).append(one["what"])
     if left:
         yield table_of(left, {"what": "what", "it is": "why", "to have it": "how"})
     if never:
-        yield Code("What does not apply", "\n".join(f"{one['what']}: {one['why']}" for one in never))
+        lines = (f"{', '.join(names)}: {why}" for why, names in never.items())
+        yield Code("What does not apply", "\n".join(lines))
 
 
 def _what(view: View) -> Iterator[Any]:

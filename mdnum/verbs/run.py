@@ -207,11 +207,10 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None) -> 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
     """Puts how well a run in fixed-point numbers keeps its energy into the summary, and float64's."""
-    from mdnum.md.integrators import Langevin
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
-    if simulation.lattice is None or isinstance(simulation.integrator, Langevin):
+    if simulation.lattice is None or simulation.integrator.random is not None:
         return
     steps = min(int(summary["steps"]), _BESIDE)
     float64 = []

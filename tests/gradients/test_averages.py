@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from ase import Atoms
@@ -13,6 +16,7 @@ from mdnum.gradients.averages import BoundaryTerm, Reweighting, frames
 from mdnum.gradients.losses import MeanPotential, MeanPressure, MeanSquaredDisplacement
 from mdnum.gradients.problem import Problem
 from mdnum.gradients.tape import RunTape
+from mdnum.md.integrators import KickDrift, Langevin, quantity
 from mdnum.systems import build
 
 
@@ -140,3 +144,28 @@ def test_what_is_no_average_is_refused(pair):
     ):
         with pytest.raises(InputError, match=text):
             method(problem, names)
+
+
+class OtherBath(KickDrift):
+    """Langevin dynamics of another package, whose fields have names of their own."""
+
+    name = "other-bath"
+    friction: Any = quantity("rate")
+    heat: Any = quantity("temperature")
+    generator: Any = quantity("seed")
+
+    def drift(self, x, v, masses, step, order):
+        return Langevin(self.timestep, self.friction, self.heat, self.generator).drift(
+            x, v, masses, step, order
+        )
+
+
+def test_any_noise_at_a_temperature_is_a_thermostat(pair):
+    names, short = ("sigma", "temperature"), replace(pair, steps=400)
+    bath = pair.simulation.integrator
+    assert isinstance(bath, Langevin)
+    other = OtherBath(bath.timestep, bath.friction, bath.kT, bath.key)
+    made = replace(short, simulation=replace(short.simulation, integrator=other))
+    own, theirs = (Reweighting()(one, names) for one in (short, made))
+    assert own.value == theirs.value and own.gradient == theirs.gradient
+    assert all(float(one) for one in own.gradient.values())

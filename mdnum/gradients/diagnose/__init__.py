@@ -295,6 +295,7 @@ def diagnose(
     near: Near | None = None
     saltation = isinstance(base, EventAware)
     if base is None:
+        why = why or Symmetric().reason_unavailable(problem, full) or ""
         why = why or "it is read off a reverse pass, event-aware or symmetric, and neither was asked for"
         failed = {part: why for part in parts if part != "agreement"}
     else:
