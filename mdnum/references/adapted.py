@@ -6,12 +6,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator
-from ase.stress import voigt_6_to_full_3x3_stress
+from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from numpy import ndarray
 
+from mdnum.md.jaxmd import as_neighbor_list
+from mdnum.md.manybody import EnergyFunction
 from mdnum.references.independent import ClassicalCalculator, PairForm, edges_of
 
 
@@ -132,3 +136,35 @@ def short_listed_eam(file: Path) -> Calculator:
             self.neighbors.update(atoms)
 
     return ShortListed(potential=str(file), form="alloy", skin=0.0)
+
+
+class EnergyOnNeighborList(ClassicalCalculator):
+    """An energy function on ASE's neighbor list, operation by operation.
+
+    It judges lists, decisions and the loop, not the function and its derivatives, which are jax's here too.
+    """
+
+    implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012
+
+    def __init__(self, potential: EnergyFunction, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.potential = potential
+
+    def evaluated(self, atoms, changes):
+        edges, n, x = edges_of(atoms, self.potential.r_cut), len(atoms), jnp.asarray(atoms.positions)
+        i, j = (ends[edges.r < self.potential.r_cut] for ends in (edges.i, edges.j))
+        counts = np.bincount(i, minlength=n)
+        index = np.full((n, max(1, int(counts.max(initial=0)))), n, np.int32)
+        index[i, np.arange(len(i)) - (np.cumsum(counts) - counts)[i]] = j
+        neighbor = as_neighbor_list(index, x, self.potential.format)
+
+        def energy(x, strain):
+            deform = jnp.eye(3) + strain
+            return self.potential.energy(x @ deform, neighbor, jnp.asarray(atoms.cell.array) @ deform)
+
+        with jax.disable_jit():
+            total, (slope, strain) = jax.value_and_grad(energy, argnums=(0, 1))(x, jnp.zeros((3, 3)))
+        results = {"energy": float(total), "forces": -np.asarray(slope)}
+        if atoms.cell.rank == 3:
+            results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(strain) / atoms.get_volume())
+        return results

@@ -12,6 +12,7 @@ What differs between the codes, and what is done about it:
 | morse, quintic | MorsePotential(rcut1, rcut2) | alpha = rho0 / r0; the switch is the same quintic in r |
 | eam | EAM(potential=file) | none |
 | tersoff | Tersoff | none: the same 14 constants |
+| an energy function | no ASE class | the function on ASE's neighbor list, and labeled so |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
 
 ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped), its neighbor lists do not (r < rc). In the
@@ -29,9 +30,16 @@ from typing import Any
 from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
 
-from mdnum.errors import InputError
+from mdnum.md.manybody import EnergyFunction
 from mdnum.md.potentials import PairFunction
-from mdnum.references.adapted import SpeciesSum, StepAtCutoff, lennard_jones, morse, short_listed_eam
+from mdnum.references.adapted import (
+    EnergyOnNeighborList,
+    SpeciesSum,
+    StepAtCutoff,
+    lennard_jones,
+    morse,
+    short_listed_eam,
+)
 from mdnum.references.independent import (
     OnNeighborList,
     PairForm,
@@ -43,8 +51,11 @@ from mdnum.references.independent import (
 from mdnum.systems import System, build
 from mdnum.systems.simulation import Simulation
 
-#: Label of the judge of a pair function that a person wrote.
-ITSELF = "the function itself on ASE's neighbor list"
+#: Labels of the judges of a pair function, and of an energy function, that a person wrote.
+ITSELF, ENERGY = (
+    "the function itself on ASE's neighbor list",
+    "the energy function itself on ASE's neighbor list",
+)
 
 
 @dataclass(frozen=True)
@@ -92,16 +103,14 @@ def independent(subject: Simulation | System) -> Reference:
 
     Args:
         subject: as for `reference`.
-
-    Raises:
-        InputError: of an energy function, which nothing here evaluates a second time.
     """
     simulation = _objects(subject)
     kind = simulation.potential.name
     models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
-    if not simulation.pairwise and kind not in models:
-        raise InputError("nothing here evaluates an energy function a second time", where=kind)
     model, compare = simulation.model, simulation.decider.compare
+    if isinstance(model, EnergyFunction):
+        conversion = "none: the function, called operation by operation"
+        return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
     make_model = models[kind] if kind in models else lambda: PairModel.of(model, simulation.symbols, compare)
     return Reference(

@@ -50,7 +50,7 @@ class Layout:
             those whose own name ends in a question mark.
         usual: values of columns where rows leave them out, by table.
         resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
-        further: files beside tables that something is read from or shown from, as patterns with spaces between.
+        further: files beside tables that are read or shown, as patterns with spaces between.
 
     Raises:
         ValueError: a name, type or value is none that a folder could have.

@@ -103,7 +103,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:
     """What to know of energies, forces and stresses beside a reference."""
-    from mdnum.references.ase_models import ITSELF
+    from mdnum.references.ase_models import ENERGY, ITSELF
 
     wrong = [frame for frame in report.frames if not frame.ok]
     if wrong:
@@ -111,7 +111,8 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
         variants = ["third"] * (worst.energy_third is not None) + ["ambiguous"] * bool(worst.ambiguous)
         yield TEXTS.finding("ASE_DISAGREES", *variants, reference=report.reference, **vars(worst))
     if not report.is_ase:
-        yield TEXTS.finding("NOT_ASE", *["own"] * (report.reference == ITSELF))
+        own = {ITSELF: ["own"], ENERGY: ["energy"]}.get(report.reference, [])
+        yield TEXTS.finding("NOT_ASE", *own)
     if report.precision != "float64":
         yield TEXTS.finding(
             "NARROW_PRECISION",

@@ -63,7 +63,9 @@ def tables() -> str:
 
 def main() -> None:
     """Write, or compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if not current")
     asked = parser.parse_args()
     text = PAGE.read_text(encoding="utf-8")

@@ -8,14 +8,20 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.build import bulk
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
+import mdnum
+from mdnum.md.jaxmd import displacement
+from mdnum.md.manybody import EnergyFunction
+from mdnum.md.pairforce import ManyBodyForce
 from mdnum.plain import plain
 from mdnum.references import energy_check
-from mdnum.references.ase_models import independent, reference
+from mdnum.references.ase_models import ENERGY, evaluate, independent, reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy, neighborhoods
 from mdnum.systems import build
 from mdnum.systems.simulation import Simulation
@@ -257,3 +263,46 @@ def test_a_sample_is_compared_at_other_places_in_each_frame(monkeypatch):
     assert report.sampled is not None and 18 < report.sampled <= 36
     off = faulty(build(system), energies=lambda energies: energies * (1 + 1e-9))
     assert not check_energy(off, {"initial": atoms}).ok
+
+
+def own_energy(parameters, positions, neighbor, cell):
+    """A Lennard-Jones energy that somebody wrote over a list of jax-md, of either format."""
+    toward = jnp.vectorize(displacement(cell, (True, True, True)), signature="(k),(k)->(k)")
+    n = positions.shape[0]
+    if neighbor.format.name == "Dense":
+        here, other = jnp.arange(n)[:, None], neighbor.idx
+    else:
+        here, other = neighbor.idx
+    real = other < n
+    d = toward(positions[jnp.where(real, here, 0)], positions[jnp.where(real, other, 1)])
+    r2 = jnp.where(real, jnp.sum(d * d, axis=-1), 1.0)
+    s6 = (parameters["size"] ** 2 / r2) ** 3
+    inside = real & (r2 < 2.0**2)
+    return 0.5 * jnp.sum(jnp.where(inside, 4 * parameters["depth"] * (s6 * s6 - s6), 0.0))
+
+
+@pytest.mark.parametrize("form", ["dense", "sparse"])
+def test_an_energy_function_is_compared_on_ase_s_list(form: str, monkeypatch):
+    constants = {"size": jnp.asarray(1.0), "depth": jnp.asarray(1.0)}
+    function = EnergyFunction(constants, own_energy, 2.0, format=form, name="mine")
+    pair = {"kind": "lennard-jones", "sigma": 1.0, "epsilon": 1.0}
+    same = build(make(crystal(), pair, {"kind": "hard", "radius": 2.0}))
+    simulation = mdnum.simulation(same.structure, function, units="lj", timestep=0.002, skin=0.3)
+    report = check_energy(simulation)
+    assert report.ok and not report.is_ase and report.reference == ENERGY
+    assert max(frame.stress_max for frame in report.frames) < 1e-12
+    assert codes(report) == [("NOT_ASE", "info")]
+    # the judge is right, too
+    energy, forces = (evaluate(reference(one).make(), same.structure) for one in (simulation, same))
+    np.testing.assert_allclose(energy["forces"], forces["forces"], atol=1e-11)
+    np.testing.assert_allclose(energy["stress"], forces["stress"], atol=1e-11)
+    # a list without some of its pairs
+    listed = ManyBodyForce.neighbors
+
+    def short(self, positions, tables, bits):
+        return listed(self, positions, tables, bits & jnp.uint8(0xFE))
+
+    monkeypatch.setattr(ManyBodyForce, "neighbors", short)
+    jax.clear_caches()
+    assert not check_energy(simulation, {"first": simulation.structure}).ok
+    jax.clear_caches()
