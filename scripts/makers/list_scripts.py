@@ -3,8 +3,8 @@
     python scripts/makers/list_scripts.py          write them
     python scripts/makers/list_scripts.py --check  exit with 1 if they are not current
 
-A script begins with its question. The paragraph that begins with "Answer." says what was found, and ends with how
-long that takes.
+A script begins with its question. The paragraph that begins with "Answer." says what was found, and ends
+with how long that takes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MARK = "<!-- written by scripts/makers/list_scripts.py -->"
 TITLES = {
     "studies": "Studies: a question, a table and a figure",
     "benchmarks": "Benchmarks: how fast",
-    "campaigns": "Campaigns: how often, over hundreds of cases; each goes on where it was stopped, or has a quick form",
+    "campaigns": "Campaigns: how often, over hundreds of cases; each can be continued, or has a quick form",
     "makers": "Makers of what is shipped",
 }
 
