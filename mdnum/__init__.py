@@ -29,10 +29,14 @@ jax_md takes six, and `mdnum --help` needs neither.
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from mdnum.lazy import on_first_use
 from mdnum.version import __version__ as __version__
+
+# a library prints nothing of its log; who wants it adds a handler
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 if TYPE_CHECKING:
     # submodules that docs/python.md names, first
@@ -93,7 +97,9 @@ if TYPE_CHECKING:
     from mdnum.verbs.fork_certify import fork_processes as fork_processes
     from mdnum.verbs.fork_map import fork_forecast as fork_forecast
     from mdnum.verbs.fork_map import fork_map as fork_map
+    from mdnum.verbs.frame import read as read
     from mdnum.verbs.grad import grad as grad
+    from mdnum.verbs.outcome import Outcome as Outcome
     from mdnum.verbs.run import run as run
 
     audit_calculator = _audit

@@ -18,7 +18,7 @@ from command_line import call
 
 import mdnum
 from mdnum.cli import programs_folder
-from mdnum.cli.output import ProgressBar, is_interrupt
+from mdnum.cli.output import CommandBar, is_interrupt
 from mdnum.errors import InputError
 from mdnum.report.finding import conclude
 from mdnum.report.section import Page
@@ -200,7 +200,8 @@ def test_closed_streams_are_nothing_to_stop_for(tmp_path, closed, words):
 def test_an_encoding_that_lacks_a_sign_is_given_its_number(monkeypatch, encoding, sign):
     def answered(system: str, **how: Any) -> Any:
         summary = {"status": "complete", "findings": [], "unit": "σ, Å"}
-        return Outcome(Path("x"), summary, conclude([], headline="2.5 σ and 3 Å"), Page("", ""))
+        verdict = conclude([], headline="2.5 σ and 3 Å")
+        return Outcome(Path("x"), "md", "run", "", summary, verdict, _page=Page(""))
 
     monkeypatch.setattr(mdnum, "run", answered, raising=False)
     for words in ((), ("--json",)):
@@ -272,7 +273,7 @@ def test_control_c_during_an_import_ends_without_a_traceback(tmp_path, name):
 def test_control_c_is_caught_once_there_is_something_to_keep():
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        with ProgressBar() as bar:
+        with CommandBar() as bar:
             assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
             bar(0, 10, {"phase": "run"})
             assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -6,24 +6,23 @@ import json
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TextIO
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
 from mdnum.plain import plain
+from mdnum.verbs.progress import ProgressBar
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
 
     from mdnum.report.finding import Finding
     from mdnum.report.section import Table
-    from mdnum.verbs.frame import Outcome
+    from mdnum.verbs.outcome import Outcome
 
 EXIT_FINE = 0
 EXIT_FINDINGS = 1
@@ -253,12 +252,17 @@ def _print_part(table: Table) -> None:
         console().print(f"  and {len(table.rows) - shown} more, which report.html shows", markup=False)
 
 
-# -- progress on stderr once work has proved to be long: a bar at a terminal, elsewhere a line now and then
+# -- progress, and control-C
 
-_WORDS = {
-    "start": "starting", "compile": "compiling", "run": "running", "gradient": "differentiating",
-    "check": "checking", "report": "writing the report",
-}  # fmt: skip
+
+class CommandBar(ProgressBar):
+    """The progress of a command; control-C raises from the first report on: there is something to keep."""
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """What a rollout reports."""
+        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL and threading.current_thread() is _MAIN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        super().__call__(step, steps, info)
 
 
 @contextmanager
@@ -272,7 +276,7 @@ def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
         Stopped: somebody pressed control-C.
     """
     try:
-        with ProgressBar() as progress:
+        with CommandBar() as progress:
             yield progress
     except BaseException as error:
         if not is_interrupt(error):
@@ -285,120 +289,3 @@ def is_interrupt(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt | MdnumError):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return isinstance(error, KeyboardInterrupt)
-
-
-class ProgressBar:
-    """Called by a rollout as progress(step, steps, info); shows steps/s, flips, rebuilds and ETA.
-
-    What counts something else than steps says so: info["unit"] names it.
-
-    The bar is started by a timer rather than by a call, because the first thing a run does is compile,
-    for seconds, without calling.
-
-    Args:
-        stream: where to draw a bar, or to print lines where it is no terminal.
-        delay: seconds of run before the bar appears.
-        pause: seconds to the first line where it is no terminal, doubled after each up to a minute.
-    """
-
-    def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 10.0):
-        self._stream = sys.stderr if stream is None else stream
-        self._pause = delay if self._stream.isatty() else pause
-        self._began = time.monotonic()
-        self._lock = threading.Lock()
-        self._bar: Progress | None = None
-        self._timer: threading.Timer | None = None
-        self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
-        self._closed = False
-        #: the folder that the rollout writes, once it has named it
-        self.folder: Path | None = None
-
-    def __enter__(self) -> Self:
-        self._began = time.monotonic()
-        self._wait()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._closed = True
-            if self._timer is not None:
-                self._timer.cancel()
-            if self._bar is not None:
-                self._bar.stop()
-
-    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """What a rollout reports: the step reached, of how many, and counts so far."""
-        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL and threading.current_thread() is _MAIN:
-            # there is something to be kept by now
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        with self._lock:
-            self._last = (step, steps, dict(info))
-            self.folder = info.get("folder", self.folder)
-            self._draw()
-
-    @property
-    def shown(self) -> bool:
-        """Whether the bar has appeared."""
-        return self._bar is not None
-
-    def _wait(self) -> None:
-        self._timer = threading.Timer(self._pause, self._show)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def _show(self) -> None:
-        """Begins to draw at a terminal; elsewhere prints a line, and waits until it is time for another."""
-        with self._lock:
-            if self._closed:
-                return
-            if self._stream.isatty():
-                self._bar = _drawn(self._stream)
-                self._draw()
-                return
-            seconds = f"({time.monotonic() - self._began:.0f} s)"
-            with suppress(OSError, ValueError):  # whoever read it has gone
-                line = ", ".join(filter(None, self._words()))
-                print(f"mdnum: {line} {seconds}", file=self._stream, flush=True)
-            self._pause = min(2 * self._pause, 60.0)
-            self._wait()
-
-    def _words(self) -> tuple[str, str]:
-        """The phase, and the numbers beside it where it counts."""
-        step, steps, info = self._last
-        phase = str(info.get("phase", "run"))
-        counts = steps > 0 and (phase == "run" or "unit" in info)
-        return _WORDS.get(phase, phase), describe(step, steps, info) if counts else ""
-
-    def _draw(self) -> None:
-        if self._bar is not None:
-            (step, steps, _), (phase, line) = self._last, self._words()
-            total = steps if line else None
-            self._bar.update(self._bar.task_ids[0], description=phase, total=total, completed=step, line=line)
-
-
-def _drawn(stream: TextIO) -> Progress:
-    """A bar that is there until it is stopped."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
-
-    bar = Progress(
-        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=None),
-        TextColumn("{task.fields[line]}"), console=Console(file=stream), transient=True, expand=True,
-    )  # fmt: skip
-    bar.add_task("", total=None, line="")
-    bar.start()
-    return bar
-
-
-def describe(step: int, steps: int, info: dict[str, Any]) -> str:
-    """The numbers beside the bar, in one line."""
-    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
-    rate = info.get("steps_per_second")
-    if rate:
-        parts.append(f"{rate:,.0f} steps/s")
-    for name in ("flips", "rebuilds"):
-        if name in info:
-            parts.append(f"{info[name]:,} {name}")
-    if rate:
-        parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
-    return "  ".join(parts)

@@ -28,9 +28,8 @@ _THEMES = {
     "bad": ("#b3261e", "#f07b72"), "paper": ("#ffffff", "#14181e"),
 }  # fmt: skip
 LIGHT, DARK = ({role: colors[k] for role, colors in _THEMES.items()} for k in range(2))
-# colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
-COLORS = {role: f"#0102{index:02x}" for index, role in enumerate(_THEMES, 1)}
-INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, _ = COLORS.values()
+# figures are drawn in those of a light page; each is one role's, so it can be replaced in the finished file
+INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, _ = LIGHT.values()
 
 #: gid of text that stands on lines: it gets a rim in the color of the paper.
 HALO = "halo"
@@ -50,22 +49,29 @@ BINS = 700
 MARKS = 1500
 
 
-def draw(figure: Figure | Plot) -> Canvas:
-    """A figure of a page as matplotlib has it."""
+def draw(figure: Figure | Plot, make: Callable[..., Canvas] = Canvas) -> Canvas:
+    """A figure of a page as matplotlib has it.
+
+    Args:
+        make: an empty one; pyplot's `figure` for one that pyplot shows.
+    """
     if isinstance(figure, Plot):
-        return canvas(lambda empty: _plot(figure, empty), 3.3 if figure.region else 2.9)
-    return canvas(figure.draw, figure.height)
+        return canvas(lambda empty: _plot(figure, empty), 3.3 if figure.region else 2.9, make)
+    return canvas(figure.draw, figure.height, make)
 
 
-def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
+def canvas(
+    draw_into: Callable[[Canvas], None], height: float, make: Callable[..., Canvas] = Canvas
+) -> Canvas:
     """A figure in the report's style.
 
     Args:
         draw_into: draws.
         height: inches.
+        make: see `draw`.
     """
     with style():
-        figure = Canvas(figsize=(WIDTH, height), layout="constrained")
+        figure = make(figsize=(WIDTH, height), layout="constrained")
         draw_into(figure)
         figure.align_ylabels()
         for axes in figure.axes:
@@ -241,7 +247,7 @@ def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
     y = np.where(there, y, np.nan)
-    color, label = COLORS[series.role], typeset(series.label)
+    color, label = LIGHT[series.role], typeset(series.label)
     kept = (thin_points if series.mark == "points" else thin_line)(x, y)
     look: dict[str, object] = {"ls": "--" if series.dashed else "-", "lw": 1.2 + 1.8 * covered}
     if series.mark == "steps":
@@ -394,7 +400,7 @@ def markup(figure: Canvas, name: str) -> str:
     text = text[text.index("<svg ") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    for role, color in COLORS.items():
+    for role, color in LIGHT.items():
         text = text.replace(color, f"var(--{role})")
     # the page's own font instead of the one it was measured with
     text = text.replace("font-family: 'DejaVu Sans'; ", "")

@@ -48,15 +48,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mdnum.plain import beside, plain
 from mdnum.report import words
 from mdnum.report.browse import Browse, Column
 from mdnum.report.section import Key, Plot, Series, cell
-
-if TYPE_CHECKING:
-    from mdnum.store import RunFolder
 
 Severity = Literal["info", "warning", "error"]
 Tone = Literal["good", "info", "warning", "error"]
@@ -250,13 +247,11 @@ class Verdict:
         """Headline and evidence."""
         return " ".join((self.headline, *self.evidence))
 
-    def store(self, folder: RunFolder, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Writes headline, findings and verdict into a folder's summary.json, beside what summary holds."""
-        judged = {
+    def judged(self, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """A summary with headline, findings and verdict."""
+        return {
             **summary, "headline": self.headline, "findings": plain(self.findings), "verdict": self.text,
         }  # fmt: skip
-        folder.write_summary(judged)
-        return judged
 
 
 def conclude(

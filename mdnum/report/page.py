@@ -63,6 +63,28 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     return path
 
 
+def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
+    """Verdict, numbers, findings and first figure of a page, as HTML that is shown between other things.
+
+    Args:
+        path: the folder.
+        verb: that wrote it.
+    """
+    from mdnum.report import drawing
+
+    parts = (part for section in page.sections for part in section.parts)
+    figure, image = next((part for part in parts if isinstance(part, Figure | Plot)), None), ""
+    if figure is not None:
+        # ids are those of the whole notebook
+        name = f"{figure.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+        image = drawing.inline(drawing.markup(drawing.draw(figure), name), typeset(figure.alt))
+    text = _render(
+        "brief.html.j2", page=page, verdict=verdict, findings=_under_causes(verdict.findings), path=str(path),
+        verb=verb, figure=figure, picture=Markup(image),
+    )  # fmt: skip
+    return printable(text, json_escape)
+
+
 #: Files beside a page that it links to.
 _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 

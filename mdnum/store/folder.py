@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import math
 import os
 import re
@@ -23,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 
 from mdnum import units
-from mdnum.errors import FolderError, MdnumError, expect_path
+from mdnum.errors import FolderError, MdnumError, expect_path, printable
 from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
@@ -59,6 +60,7 @@ _NOTHING_YET = (
 )  # fmt: skip
 _QUANTITIES = ("length", "energy", "mass", "time", "temperature", "pressure")
 _RESTORE = "Restore it from a copy, or run again in a new folder"
+_LOGGER = logging.getLogger(__name__)
 # what values of another kind or form than those that were written lead to
 _OF_WRONG_VALUES = (
     ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
@@ -159,6 +161,7 @@ class RunFolder:
             folder._foreign = frozenset(entry.name for entry in folder.path.iterdir())
             folder._owner = True
             manifest.save(folder.path, manifest.Manifest(layout))
+        _LOGGER.info("%s begins in %s", layout.command, printable(str(folder.path)))
         return folder
 
     @classmethod
@@ -232,6 +235,7 @@ class RunFolder:
                 self._log = io.TextIOWrapper(opened(path, "ab"), encoding="utf-8")
             self._log.write(line.rstrip("\n") + "\n")
             self._log.flush()
+        _LOGGER.debug("%s: %s", self.path.name, printable(line))
 
     def checkpoint_due(self) -> bool:
         """Whether `checkpoint` would write now.
@@ -390,6 +394,7 @@ class RunFolder:
             if (log := self.path / "log.txt").exists():
                 with opened(log, "r+b") as file:
                     os.ftruncate(file.fileno(), min(store["log"], log.stat().st_size))
+        _LOGGER.info("%s continues in %s", self.layout.command, printable(str(self.path)))
         return state
 
     def take(self, layout: Layout) -> None:

@@ -31,7 +31,7 @@ from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
 from mdnum.store.files import read_text, remove, subfolder, write_text
 from mdnum.verbs import frame
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Outcome, Progress, Verb, View, Wanted
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -62,7 +62,7 @@ def audit(
     out: str | Path | None = None,
     resume: str | Path | None = None,
     report: bool = True,
-    progress: Progress | None = None,
+    progress: Wanted = None,
 ) -> Outcome:
     """Ask a calculator whether it is safe to run and to differentiate.
 
@@ -89,7 +89,8 @@ def audit(
         resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
             kept, the others are made as it was asked for.
         report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures.
+        progress: called now and then with what is done, of how much, and a dictionary of figures; default a
+            bar, False for nothing.
 
     Returns:
         an outcome whose `result` holds what each check found, by its name.
@@ -209,7 +210,7 @@ def _ask_all(
         state.during = next(iter(state.left), None)
         answers.save()
         summary = plain(_summary(state))
-        _judge(AuditView(folder, summary, given=state)).store(folder, summary)
+        folder.write_summary(_judge(AuditView(folder, summary, given=state)).judged(summary))
     answers.save()
     frame.store(folder, _summary(state), _tables(state))
     outcome = frame.finish(

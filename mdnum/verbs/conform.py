@@ -25,7 +25,7 @@ from mdnum.report.words import count, listed
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
 from mdnum.verbs import frame
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Outcome, Verb, View, Wanted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -98,7 +98,7 @@ def conform(
     out: str | Path | None = None,
     resume: str | Path | None = None,
     report: bool = True,
-    progress: Progress | None = None,
+    progress: Wanted = None,
 ) -> Outcome:
     """Put a neighbor list through the conformance suite.
 
@@ -124,7 +124,8 @@ def conform(
         out: the new folder; default runs/conform-<name>-<n>.
         resume: a folder to resume instead, with the options that it was begun with.
         report: write report.html.
-        progress: called now and then with cases done, cases and a dictionary of words.
+        progress: called now and then with cases done, cases and a dictionary of words; default a bar, False
+            for nothing.
 
     Returns:
         the outcome; its result is the `references.conformance.Report`. Status "partial" in its summary: time

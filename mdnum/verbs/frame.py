@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,7 +28,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, cast
 import numpy as np
 
 from mdnum import units
-from mdnum.errors import FolderError, InputError
+from mdnum.errors import FolderError, InputError, printable
 from mdnum.plain import plain
 from mdnum.registry import nearest
 from mdnum.report.finding import Finding, Verdict, restore
@@ -37,14 +38,16 @@ from mdnum.store import Layout, RunFolder
 from mdnum.store.files import default_folder, read_text
 from mdnum.systems import code
 from mdnum.verbs import VERBS, declared, home
+from mdnum.verbs.outcome import Outcome
+from mdnum.verbs.progress import Progress as Progress
+from mdnum.verbs.progress import Wanted, reported
 
 if TYPE_CHECKING:
     from mdnum.units import Units
 
 V = TypeVar("V", bound=Callable[..., Any])
-
-#: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
-Progress = Callable[[int, int, dict[str, Any]], None]
+_LOGGER = logging.getLogger(__name__)
+_LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}  # of findings
 
 #: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
 #: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
@@ -113,17 +116,6 @@ class Verb:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What every verb returns."""
-
-    folder: Path  # that was written
-    summary: Mapping[str, Any]  # content of summary.json: numbers, findings, headline and verdict
-    verdict: Verdict
-    page: Page  # what report.html and the terminal show
-    result: Any = None  # what the verb computed, as Python has it; None where a folder was only read
-
-
-@dataclass(frozen=True)
 class Listing:
     """What there is to name, of a command that lists it: nothing is computed, and no folder made."""
 
@@ -142,6 +134,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, outcome: Outcome):
         super().__init__("stopped")
         self.outcome = outcome
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.outcome,)
 
 
 @contextmanager
@@ -181,8 +176,9 @@ class Keep(TypedDict, total=False):
     # dotted keys of the system file to values, such as {"cutoff.kind": "switched"}
     overrides: Mapping[str, Any] | None
     report: bool  # write report.html; default True
-    # called now and then with what is done, of how much, and a dictionary that names the phase
-    progress: Progress | None
+    # called now and then with what is done, of how much, and a dictionary that names the phase; default a
+    # bar, or a line now and then where stderr is no terminal; False for nothing
+    progress: Wanted
     allow_code: bool  # whether Python that the system file names may be executed; default False
 
 
@@ -209,15 +205,15 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
         known += [*Keep.__annotations__, *more]
 
     @functools.wraps(verb)
-    def checked(*args: Any, allow_code: bool = False, **kwargs: Any) -> Any:
+    def checked(*args: Any, allow_code: bool = False, progress: Wanted = None, **kwargs: Any) -> Any:
         for word in kwargs:
             if word not in known:
                 close = nearest(word, known)
                 hint = f"Did you mean {close!r}? " if close else ""
                 message = f"{name or verb.__name__}() has no keyword {word!r}"
                 raise UnknownKeyword(message, remedy=f"{hint}It takes {', '.join(known)}")
-        with code.allow_code(allow_code):
-            return verb(*args, **kwargs)
+        with code.allow_code(allow_code), reported(progress) as report_to:
+            return verb(*args, progress=report_to, **kwargs)
 
     return cast(V, checked)
 
@@ -310,12 +306,14 @@ def finish(
     result: Any = None,
     progress: Progress | None = None,
     view: View | None = None,
+    write: bool = True,
 ) -> Outcome:
     """Judges a folder, writes findings and verdict into its summary.json, and its page if it is wanted.
 
     Args:
         result: what the verb computed, for who called it from Python.
         view: of the folder, where it was looked at already.
+        write: False leaves the folder as it is.
 
     Raises:
         FolderError: it holds no answer, is damaged or cannot be written.
@@ -333,13 +331,32 @@ def finish(
             )  # fmt: skip
         view = verb.view(folder, summary) if view is None else view
         verdict = verb.judge(view)
-        judged = verdict.store(folder, summary)
+        judged = plain(verdict.judged(summary))
+        if write:
+            folder.write_summary(judged)
         page = verb.page(view, verdict)
         if report:
-            from mdnum.report.page import write
+            from mdnum.report.page import write as write_page
 
-            write(folder, page, verdict)
-    return Outcome(folder.path, judged, verdict, page, result)
+            write_page(folder, page, verdict)
+    if write:
+        for finding in verdict.findings:
+            _LOGGER.log(_LEVELS[finding.severity], "%s: %s", finding.code, printable(finding.title))
+        _LOGGER.info("%s: %s (%s)", folder.layout.command, printable(verdict.headline), printable(str(folder.path)))
+    named = (folder.path, folder.kind, folder.layout.command, page.title)
+    return Outcome(*named, judged, verdict, tuple(page.keys), result, page, read)
+
+
+def read(folder: str | Path) -> Outcome:
+    """The outcome of a folder that a verb wrote, whatever its kind; it is judged again, and not changed.
+
+    Example:
+        >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
+
+    Raises:
+        FolderError: it holds no answer, or is damaged.
+    """
+    return finish(folder, report=False, write=False)
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:

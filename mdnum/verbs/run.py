@@ -23,7 +23,7 @@ from mdnum.report.words import pair_name
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.check import temperature_findings
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, keywords_checked, layout, say
+from mdnum.verbs.frame import Outcome, Verb, Wanted, finish, keywords_checked, layout, say
 from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, RunView, draw_first, page
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def run(
     resume: str | Path | None = None,
     check: bool = True,
     report: bool = True,
-    progress: Progress | None = None,
+    progress: Wanted = None,
     allow_code: bool = False,
 ) -> Outcome:
     """Simulate a system, record every flip, compare the first and last frame with ASE, and write a report.
@@ -81,7 +81,8 @@ def run(
         resume: continue the run in this folder, bit for bit.
         check: compare with ASE (or with plain numpy where ASE has no such potential).
         report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures.
+        progress: called now and then with step, steps and a dictionary of figures; default a bar, False for
+            nothing.
         allow_code: execute the Python that a system file names.
 
     Returns:

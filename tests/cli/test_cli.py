@@ -7,6 +7,7 @@ import io
 import json
 import subprocess
 import sys
+import threading
 import time
 import tomllib
 from collections.abc import Iterator
@@ -21,7 +22,6 @@ from command_line import Recorder, call, printed
 
 from mdnum import bounce, conform, fork_map, verbs
 from mdnum.cli import main, output
-from mdnum.cli.output import ProgressBar, describe
 from mdnum.cli.verbs import app
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import beside, plain
@@ -30,6 +30,7 @@ from mdnum.store.files import default_folder
 from mdnum.verbs import VERBS, declared
 from mdnum.verbs.fork_pair import PairQuestion
 from mdnum.verbs.frame import Keep, layout
+from mdnum.verbs.progress import ProgressBar, describe
 
 SUMMARY: dict[str, Any] = {
     "flips_entered": 1_234, "steps_per_second": np.float64(512.0), "findings": [], "status": "complete",
@@ -263,18 +264,17 @@ INFO = {"phase": "run", "steps_per_second": 10.0, "flips": 1_500, "rebuilds": 2}
 
 
 def test_progress_appears_at_a_terminal_after_a_while_and_not_of_a_short_run():
-    for delay, shown in ((0.05, True), (60.0, False)):
+    before = threading.active_count()
+    for delay, shown in ((0.2, True), (60.0, False)):
         stream = _Terminal()
         with ProgressBar(stream, delay=delay) as progress:
             progress(100, 1_000, INFO)
-            timer = progress._timer
-            assert not progress.shown and timer is not None
-            if shown:
-                timer.join(20)
-                progress(200, 1_000, INFO)
-            assert progress.shown == shown
-        timer.join(20)
-        assert not timer.is_alive() and (stream.getvalue() != "") == shown
+            assert stream.getvalue() == ""
+            until = time.monotonic() + 20
+            while shown and "100 of 1,000 steps" not in stream.getvalue() and time.monotonic() < until:
+                time.sleep(0.01)
+        assert ("100 of 1,000 steps" in stream.getvalue()) == shown
+        assert threading.active_count() == before
 
 
 def test_progress_is_a_line_now_and_then_where_it_is_piped():

@@ -12,7 +12,7 @@ from mdnum.cli import main
 from mdnum.errors import InputError
 from mdnum.report.finding import conclude, restore
 from mdnum.report.section import Key, Page, Section, records
-from mdnum.verbs.frame import Outcome
+from mdnum.verbs.outcome import Outcome
 
 SHOWN = Section("Lists", ["Sound.", records([{"name": "a", "pairs": n} for n in range(30)])], terminal=True)
 HIDDEN = Section("Details", ["On the page alone."])
@@ -48,4 +48,5 @@ class Recorder:
         keys = [Key("Flips", "2,464", "1,234 entered, 1,230 left")]
         page = Page("argon/crystal-108", "108 atoms", keys, [SHOWN, HIDDEN])
         folder = options.get("out") or options.get("resume") or "runs/argon-crystal-108-1"
-        return Outcome(Path(folder), self.summary, verdict, page)
+        told = (Path(folder), "md", "run", page.title, self.summary, verdict, tuple(keys))
+        return Outcome(*told, _page=page)

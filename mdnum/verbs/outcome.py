@@ -1,0 +1,139 @@
+"""What every verb returns: plain data, and tables, figures and a page read from its folder on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from mdnum.errors import FolderError, InputError, MdnumError, printable
+from mdnum.report.finding import Finding, Verdict
+from mdnum.report.section import Figure, Key, Page, Plot
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.axes import Axes
+
+# of a repr: key numbers, and characters of a line
+_NUMBERS, _WIDTH = 6, 300
+
+
+@dataclass(frozen=True, repr=False)
+class Outcome:
+    """What every verb returns: plain data, and ways to read the rest from its folder.
+
+    It can be pickled, and returned by the workers of a pool. Tables, figures and the page are read from the
+    folder when they are used, so the folder must still be where it was written.
+
+    Example:
+        >>> outcome = mdnum.run("argon/crystal-108", steps=200)
+        >>> outcome.verdict.headline, outcome.summary["flips_entered"]
+        >>> outcome.table("flips").to_pandas()
+        >>> outcome.plot("energy").figure.savefig("energy.png")
+        >>> outcome = mdnum.read("runs/argon-crystal-108-1")
+    """
+
+    path: Path  # the folder
+    kind: str  # of the folder: "md", "fork", "screen", "grad", ...
+    verb: str  # of the command line that writes folders of this kind
+    title: str  # of the page
+    summary: Mapping[str, Any]  # content of summary.json: numbers, findings, headline and verdict
+    verdict: Verdict
+    keys: tuple[Key, ...] = ()  # the numbers above the page
+    # what the verb computed, as Python has it; None in another process, in a copy and where a folder was read
+    result: Any = field(default=None, compare=False)
+    _page: Page | None = field(default=None, compare=False)
+    _read: Any = field(default=None, compare=False)  # the function `mdnum.read`, which knows all verbs
+    _place: Path = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # it is found from another working directory, too
+        object.__setattr__(self, "_place", self.path.absolute())
+
+    @property
+    def folder(self) -> Path:
+        """The same as `path`."""
+        return self.path
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What a person should know about the result, errors first."""
+        return self.verdict.findings
+
+    @property
+    def page(self) -> Page:
+        """What report.html and the terminal show.
+
+        Raises:
+            FolderError: the folder is gone, or damaged.
+        """
+        if self._page is None:
+            object.__setattr__(self, "_page", self._read(self._place).page)
+        return cast(Page, self._page)
+
+    def table(self, name: str) -> pa.Table:
+        """A table of the folder, with all of its rows; `.to_pandas()` makes a data frame of it.
+
+        Raises:
+            FolderError: the folder has no such table (the message lists those that it has), or it is damaged.
+        """
+        from mdnum.store import RunFolder
+
+        folder = RunFolder.open(self._place)
+        with folder.explained():
+            folder.check(f"{name}.parquet")
+            parts = {file.stem.rpartition("-")[0] for file in self._place.glob("parts/*.parquet")}
+            names = sorted(parts | {file.stem for file in self._place.glob("*.parquet")})
+            if name not in names:
+                has = f"Its tables: {', '.join(names)}" if names else "It has no tables"
+                raise FolderError(f"has no table {name!r}", remedy=has, where=str(self.path))
+            return folder.table(name)
+
+    def plot(self, name: str) -> Axes:
+        """Draws a figure of the page with pyplot, which a notebook shows; in the colors of a light page.
+
+        Args:
+            name: of its file in figures/, without the suffix.
+
+        Returns:
+            its axes, of several the first: all of them are `.figure.axes`.
+
+        Raises:
+            InputError: the page has no such figure; the message lists those that it has.
+            FolderError: the folder is gone, or damaged.
+        """
+        from matplotlib import pyplot
+
+        from mdnum.report import drawing
+
+        parts = [part for section in self.page.sections for part in section.parts]
+        figures = {part.name: part for part in parts if isinstance(part, Figure | Plot)}
+        if name not in figures:
+            has = f"Its figures: {', '.join(figures)}" if figures else "It has none"
+            raise InputError(f"the page has no figure {name!r}", remedy=has, where=str(self.path))
+        figure = drawing.draw(figures[name], pyplot.figure)
+        figure.set_facecolor(drawing.LIGHT["paper"])
+        return figure.axes[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "path": self._place, "result": None, "_page": None}
+
+    def __repr__(self) -> str:
+        numbers = [f"{key.label} {key.value}" for key in self.keys if key.value != "–"][:_NUMBERS]
+        lines = (
+            f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}",
+            "; ".join(numbers),
+        )  # fmt: skip
+        told = (" ".join(printable(line).split()) for line in lines if line)
+        short = [line if len(line) <= _WIDTH else f"{line[:_WIDTH]}…" for line in told]
+        return "\n  ".join([*short, printable(str(self.path))])
+
+    def _repr_html_(self) -> str:
+        from mdnum.report.page import brief
+
+        page = Page(self.title, keys=self.keys)
+        with suppress(MdnumError, OSError):  # of a folder that is gone, what is known of it
+            page = self.page
+        return brief(page, self.verdict, self._place, self.verb)

@@ -1,0 +1,161 @@
+"""Progress of a verb: a bar in a terminal and in a notebook, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from html import escape
+from pathlib import Path
+from typing import Any, Self, TextIO
+
+#: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
+Progress = Callable[[int, int, dict[str, Any]], None]
+#: What a verb's keyword `progress` may be: a `Progress`, True, False or None. `reported` makes of it what the
+#: verb itself is given, a `Progress` or None.
+Wanted = Any
+
+_WORDS = {
+    "start": "starting", "compile": "compiling", "run": "running", "gradient": "differentiating",
+    "check": "checking", "report": "writing the report",
+}  # fmt: skip
+# seconds from one picture of a bar to the next
+_REFRESH = 0.2
+# taken by the verb that is under way: verbs that it calls, and those of other threads, have no bar
+_OUTERMOST = threading.Lock()
+
+
+@contextmanager
+def reported(progress: Wanted) -> Iterator[Progress | None]:
+    """What a verb reports its progress to.
+
+    Args:
+        progress: a function; None for a bar, or lines where stderr is no terminal, except for a verb that
+            another one calls and in the workers of a pool; True for one in any case; False for nothing.
+    """
+    from multiprocessing import parent_process
+
+    outermost = _OUTERMOST.acquire(blocking=False)
+    try:
+        if progress is True or (progress is None and outermost and parent_process() is None):
+            with ProgressBar() as bar:
+                yield bar
+        else:
+            yield progress or None
+    finally:
+        if outermost:
+            _OUTERMOST.release()
+
+
+class ProgressBar:
+    """Called by a rollout as progress(step, steps, info); shows steps/s, flips, rebuilds and ETA.
+
+    What counts something else than steps says so: info["unit"] names it.
+
+    It is drawn by a thread rather than by a call, because the first thing a run does is compile, for seconds,
+    without calling.
+
+    Args:
+        stream: where to draw a bar, or to print lines where it is no terminal; default stderr, or the output
+            of a notebook's cell.
+        delay: seconds of run before the bar appears.
+        pause: seconds to the first line where it is no terminal, doubled after each up to a minute.
+    """
+
+    def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 10.0):
+        self._stream = sys.stderr if stream is None else stream
+        ipython = sys.modules.get("IPython") if stream is None else None
+        notebook = hasattr(ipython and ipython.get_ipython(), "kernel")
+        self._draw = _Cell if notebook else _drawn if self._stream.isatty() else None
+        self._pause = pause if self._draw is None else delay
+        self._began = time.monotonic()
+        self._bar: Any = None
+        self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        #: the folder that the rollout writes, once it has named it
+        self.folder: Path | None = None
+
+    def __enter__(self) -> Self:
+        self._began = time.monotonic()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """What a rollout reports: the step reached, of how many, and counts so far."""
+        self._last = (step, steps, dict(info))
+        self.folder = info.get("folder", self.folder)
+
+    def _watch(self) -> None:
+        """Draws the bar, or prints a line, whenever it is time to."""
+        while not self._over.wait(self._pause):
+            step, steps, info = self._last
+            phase = str(info.get("phase", "run"))
+            counts = steps > 0 and (phase == "run" or "unit" in info)
+            phase, line = _WORDS.get(phase, phase), describe(step, steps, info) if counts else ""
+            if self._draw is None:
+                seconds = f"({time.monotonic() - self._began:.0f} s)"
+                with suppress(OSError, ValueError):  # whoever read it has gone
+                    words = ", ".join(filter(None, (phase, line)))
+                    print(f"mdnum: {words} {seconds}", file=self._stream, flush=True)
+                self._pause = min(2 * self._pause, 60.0)
+                continue
+            if self._bar is None:
+                self._bar, self._pause = self._draw(self._stream), _REFRESH
+            total = steps if line else None
+            self._bar.update(0, description=phase, total=total, completed=step, line=line, refresh=True)
+
+
+def _drawn(stream: TextIO) -> Any:
+    """A bar that is there until it is stopped."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+
+    bar = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=None),
+        TextColumn("{task.fields[line]}"), console=Console(file=stream), transient=True, expand=True,
+        auto_refresh=False,
+    )  # fmt: skip
+    bar.add_task("", total=None, line="")
+    bar.start()
+    return bar
+
+
+class _Cell:
+    """A bar below a notebook's cell, until it is stopped."""
+
+    def __init__(self, stream: TextIO):
+        from IPython.display import display  # pyright: ignore[reportMissingImports]
+
+        self._shown: Any = display({"text/plain": ""}, raw=True, display_id=True)
+
+    def update(self, _: int, *, description: str, total: int | None, completed: int, line: str, **_more: Any):
+        value = "" if total is None else f' value="{completed}" max="{total}"'
+        words = f"{description}  {line}".rstrip()
+        html = f"<div><progress{value}></progress> {escape(words)}</div>"
+        self._shown.update({"text/plain": words, "text/html": html}, raw=True)
+
+    def stop(self) -> None:
+        self._shown.update({"text/plain": ""}, raw=True)
+
+
+def describe(step: int, steps: int, info: dict[str, Any]) -> str:
+    """The numbers beside the bar, in one line."""
+    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
+    rate = info.get("steps_per_second")
+    if rate:
+        parts.append(f"{rate:,.0f} steps/s")
+    for name in ("flips", "rebuilds"):
+        if name in info:
+            parts.append(f"{info[name]:,} {name}")
+    if rate:
+        parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
+    return "  ".join(parts)
