@@ -49,29 +49,22 @@ BINS = 700
 MARKS = 1500
 
 
-def draw(figure: Figure | Plot, make: Callable[..., Canvas] = Canvas) -> Canvas:
-    """A figure of a page as matplotlib has it.
-
-    Args:
-        make: an empty one; pyplot's `figure` for one that pyplot shows.
-    """
+def draw(figure: Figure | Plot) -> Canvas:
+    """A figure of a page as matplotlib has it."""
     if isinstance(figure, Plot):
-        return canvas(lambda empty: _plot(figure, empty), 3.3 if figure.region else 2.9, make)
-    return canvas(figure.draw, figure.height, make)
+        return canvas(lambda empty: _plot(figure, empty), 3.3 if figure.region else 2.9)
+    return canvas(figure.draw, figure.height)
 
 
-def canvas(
-    draw_into: Callable[[Canvas], None], height: float, make: Callable[..., Canvas] = Canvas
-) -> Canvas:
+def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
     """A figure in the report's style.
 
     Args:
         draw_into: draws.
         height: inches.
-        make: see `draw`.
     """
     with style():
-        figure = make(figsize=(WIDTH, height), layout="constrained")
+        figure = Canvas(figsize=(WIDTH, height), layout="constrained")
         draw_into(figure)
         figure.align_ylabels()
         for axes in figure.axes:

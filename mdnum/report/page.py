@@ -64,12 +64,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
 
 
 def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
-    """Verdict, numbers, findings and first figure of a page, as HTML that is shown between other things.
-
-    Args:
-        path: the folder.
-        verb: that wrote it.
-    """
+    """Verdict, numbers, findings and first figure of the page of a folder, as HTML for a notebook."""
     from mdnum.report import drawing
 
     parts = (part for section in page.sections for part in section.parts)

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 V = TypeVar("V", bound=Callable[..., Any])
 _LOGGER = logging.getLogger(__name__)
-_LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}  # of findings
 
 #: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
 #: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
@@ -132,11 +131,8 @@ class Interrupted(KeyboardInterrupt):
     """
 
     def __init__(self, outcome: Outcome):
-        super().__init__("stopped")
+        super().__init__(outcome)
         self.outcome = outcome
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.outcome,)
 
 
 @contextmanager
@@ -341,9 +337,10 @@ def finish(
             write_page(folder, page, verdict)
     if write:
         for finding in verdict.findings:
-            _LOGGER.log(_LEVELS[finding.severity], "%s: %s", finding.code, printable(finding.title))
-        _LOGGER.info("%s: %s (%s)", folder.layout.command, printable(verdict.headline), printable(str(folder.path)))
-    named = (folder.path, folder.kind, folder.layout.command, page.title)
+            level = logging.getLevelNamesMapping()[finding.severity.upper()]
+            _LOGGER.log(level, "%s: %s", finding.code, printable(finding.title))
+        ended = folder.layout.command, printable(verdict.headline), printable(str(folder.path))
+        _LOGGER.info("%s: %s (%s)", *ended)
     return Outcome(*named, judged, verdict, tuple(page.keys), result, page, read)
 
 

@@ -64,20 +64,16 @@ class Outcome:
 
     @property
     def page(self) -> Page:
-        """What report.html and the terminal show.
-
-        Raises:
-            FolderError: the folder is gone, or damaged.
-        """
+        """What report.html and the terminal show; a FolderError where the folder is gone, or damaged."""
         if self._page is None:
             object.__setattr__(self, "_page", self._read(self._place).page)
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """A table of the folder, with all of its rows; `.to_pandas()` makes a data frame of it.
+        """A table of the folder; `.to_pandas()` makes a data frame of it.
 
         Raises:
-            FolderError: the folder has no such table (the message lists those that it has), or it is damaged.
+            FolderError: there is no such table (the message lists those that there are), or it is damaged.
         """
         from mdnum.store import RunFolder
 
@@ -92,17 +88,13 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """Draws a figure of the page with pyplot, which a notebook shows; in the colors of a light page.
-
-        Args:
-            name: of its file in figures/, without the suffix.
+        """A figure of the page, by the name of its file in figures/, as a new figure of pyplot.
 
         Returns:
-            its axes, of several the first: all of them are `.figure.axes`.
+            its axes, of several the first: `.figure.axes` are all.
 
         Raises:
-            InputError: the page has no such figure; the message lists those that it has.
-            FolderError: the folder is gone, or damaged.
+            InputError: there is no such figure; the message lists those that there are.
         """
         from matplotlib import pyplot
 
@@ -113,21 +105,19 @@ class Outcome:
         if name not in figures:
             has = f"Its figures: {', '.join(figures)}" if figures else "It has none"
             raise InputError(f"the page has no figure {name!r}", remedy=has, where=str(self.path))
-        figure = drawing.draw(figures[name], pyplot.figure)
-        figure.set_facecolor(drawing.LIGHT["paper"])
-        return figure.axes[0]
+        drawn = drawing.draw(figures[name])
+        drawn.set_facecolor(drawing.LIGHT["paper"])
+        made: Any = lambda **_: drawn  # noqa: E731
+        return pyplot.figure(FigureClass=made).axes[0]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "path": self._place, "result": None, "_page": None}
 
     def __repr__(self) -> str:
         numbers = [f"{key.label} {key.value}" for key in self.keys if key.value != "–"][:_NUMBERS]
-        lines = (
-            f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}",
-            "; ".join(numbers),
-        )  # fmt: skip
-        told = (" ".join(printable(line).split()) for line in lines if line)
-        short = [line if len(line) <= _WIDTH else f"{line[:_WIDTH]}…" for line in told]
+        head = f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}"
+        lines = (" ".join(printable(line).split()) for line in (*head, "; ".join(numbers)) if line)
+        short = (line if len(line) <= _WIDTH else f"{line[:_WIDTH]}…" for line in lines)
         return "\n  ".join([*short, printable(str(self.path))])
 
     def _repr_html_(self) -> str:

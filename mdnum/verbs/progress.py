@@ -21,19 +21,14 @@ _WORDS = {
     "start": "starting", "compile": "compiling", "run": "running", "gradient": "differentiating",
     "check": "checking", "report": "writing the report",
 }  # fmt: skip
-# seconds from one picture of a bar to the next
-_REFRESH = 0.2
 # taken by the verb that is under way: verbs that it calls, and those of other threads, have no bar
 _OUTERMOST = threading.Lock()
 
 
 @contextmanager
 def reported(progress: Wanted) -> Iterator[Progress | None]:
-    """What a verb reports its progress to.
-
-    Args:
-        progress: a function; None for a bar, or lines where stderr is no terminal, except for a verb that
-            another one calls and in the workers of a pool; True for one in any case; False for nothing.
+    """What a verb reports to: the function that it is given; None gives a bar, except in a verb that another
+    one calls and in the workers of a pool; True gives a bar in any case, False nothing.
     """
     from multiprocessing import parent_process
 
@@ -54,8 +49,7 @@ class ProgressBar:
 
     What counts something else than steps says so: info["unit"] names it.
 
-    It is drawn by a thread rather than by a call, because the first thing a run does is compile, for seconds,
-    without calling.
+    A thread draws it: the first thing a run does is compile, for seconds, without calling.
 
     Args:
         stream: where to draw a bar, or to print lines where it is no terminal; default stderr, or the output
@@ -70,13 +64,11 @@ class ProgressBar:
         notebook = hasattr(ipython and ipython.get_ipython(), "kernel")
         self._draw = _Cell if notebook else _drawn if self._stream.isatty() else None
         self._pause = pause if self._draw is None else delay
-        self._began = time.monotonic()
         self._bar: Any = None
         self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
-        #: the folder that the rollout writes, once it has named it
-        self.folder: Path | None = None
+        self.folder: Path | None = None  # that the rollout writes, once it has named it
 
     def __enter__(self) -> Self:
         self._began = time.monotonic()
@@ -109,7 +101,7 @@ class ProgressBar:
                 self._pause = min(2 * self._pause, 60.0)
                 continue
             if self._bar is None:
-                self._bar, self._pause = self._draw(self._stream), _REFRESH
+                self._bar, self._pause = self._draw(self._stream), 0.2
             total = steps if line else None
             self._bar.update(0, description=phase, total=total, completed=step, line=line, refresh=True)
 
@@ -149,13 +141,8 @@ class _Cell:
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
     """The numbers beside the bar, in one line."""
-    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
     rate = info.get("steps_per_second")
-    if rate:
-        parts.append(f"{rate:,.0f} steps/s")
-    for name in ("flips", "rebuilds"):
-        if name in info:
-            parts.append(f"{info[name]:,} {name}")
-    if rate:
-        parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
-    return "  ".join(parts)
+    counts = [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]
+    speed, left = [f"{rate:,.0f} steps/s"] * bool(rate), (steps - step) / rate if rate else 0.0
+    eta = [time.strftime("ETA %H:%M:%S", time.gmtime(left))] * bool(rate)
+    return "  ".join([f"{step:,} of {steps:,} {info.get('unit', 'steps')}", *speed, *counts, *eta])
