@@ -141,8 +141,9 @@ class _Cell:
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
     """The numbers beside the bar, in one line."""
-    rate = info.get("steps_per_second")
-    counts = [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]
-    speed, left = [f"{rate:,.0f} steps/s"] * bool(rate), (steps - step) / rate if rate else 0.0
-    eta = [time.strftime("ETA %H:%M:%S", time.gmtime(left))] * bool(rate)
-    return "  ".join([f"{step:,} of {steps:,} {info.get('unit', 'steps')}", *speed, *counts, *eta])
+    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
+    parts += [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]
+    if rate := info.get("steps_per_second"):
+        parts.insert(1, f"{rate:,.0f} steps/s")
+        parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
+    return "  ".join(parts)
