@@ -339,8 +339,9 @@ def finish(
         for finding in verdict.findings:
             level = logging.getLevelNamesMapping()[finding.severity.upper()]
             _LOGGER.log(level, "%s: %s", finding.code, printable(finding.title))
-        ended = folder.layout.command, printable(verdict.headline), printable(str(folder.path))
-        _LOGGER.info("%s: %s (%s)", *ended)
+        where = printable(str(folder.path))
+        _LOGGER.info("%s: %s (%s)", folder.layout.command, printable(verdict.headline), where)
+    named = (folder.path, folder.kind, folder.layout.command, page.title)
     return Outcome(*named, judged, verdict, tuple(page.keys), result, page, read)
 
 
