@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -12,10 +12,10 @@ import pyarrow as pa
 
 from mdnum.plain import beside
 
-_DECLARED: Mapping[str, Mapping[str, tuple[str, str]]] = beside(__file__)
+_DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
-def meaning(table: str, column: str) -> tuple[str, str]:
+def meaning(table: str, column: str) -> Sequence[str]:
     """(unit in quantities, description) of a column; empty words where it is not declared."""
     for declared in (_DECLARED.get(table, {}), _DECLARED["columns"]):
         if found := declared.get(column):

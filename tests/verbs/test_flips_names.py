@@ -9,7 +9,8 @@ import pytest
 
 import mdnum
 from mdnum.trajectories import topology
-from mdnum.trajectories.trajectory import open_trajectory, select
+from mdnum.trajectories.readers import open_trajectory
+from mdnum.trajectories.selection import select
 
 MDAnalysis = pytest.importorskip("MDAnalysis")
 ase_io = pytest.importorskip("ase.io")
