@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+from typing import Any
 
 from mdnum.errors import InputError
 
@@ -44,6 +48,50 @@ METAL = Units(
 LJ = Units("lj", "σ", "ε", "m", "τ", "ε/k", "ε/σ³", 1.0, 1.0, 1.0)
 # energies are per mass; a ball has no temperature
 BALL = Units("ball", "m", "m²/s²", "", "s", "", "", 1.0, 1.0, 1.0)
+
+#: In text, where the names of units come in when it is written.
+ENERGY, LENGTH = "{units.energy}", "{units.length}"
+FORCE = f"{ENERGY}/{LENGTH}"
+_PREFIXES = {"": 1.0, "m": 1e-3}
+
+
+def named(quantity: str, units: Mapping[str, Any]) -> str:
+    """A unit made of quantities in the names of a unit system; empty where it lacks one of them.
+
+    >>> named("energy/length", {"energy": "eV", "length": "Å"})
+    'eV/Å'
+    """
+    names = {word: str(units.get(word) or "") for word in re.findall(r"[a-z]{3,}", quantity)}
+    return re.sub(r"[a-z]{3,}", lambda word: names[word[0]], quantity) if all(names.values()) else ""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number with its unit, and what it is worth."""
+
+    value: float
+    unit: str = ""  # of names ("eV/Å") or, until it is written, of quantities ("energy/length")
+    floor: float | None = None  # the largest that noise or rounding explains: less is not told from nothing
+    scale: float | None = None  # what it is compared with, such as a typical force
+
+    @property
+    def found(self) -> bool:
+        """Whether it is more than noise or rounding explains; nan is."""
+        return self.floor is None or not abs(self.value) <= self.floor
+
+    def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
+        """The same in a unit with a prefix ("m": meV), and with quantities as the names of a unit system."""
+        unit = named(self.unit, units) or self.unit
+        parts = {name: part for name, part in vars(self).items() if isinstance(part, float)}
+        scaled = {name: part / _PREFIXES[prefix] for name, part in parts.items()}
+        return replace(self, unit=prefix + unit, **scaled)
+
+
+def revived(value: Any) -> Any:
+    """A `Measured` that was written as JSON; any other value as it is."""
+    names = {each.name for each in fields(Measured)}
+    return Measured(**value) if isinstance(value, dict) and value.keys() == names else value
+
 
 _ALL = {units.name: units for units in (METAL, LJ, BALL)}
 

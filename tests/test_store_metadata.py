@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import mdnum
+from mdnum import units
 from mdnum.plain import beside
 from mdnum.store import RunFolder, columns
 from mdnum.verbs import VERBS, declared
@@ -56,7 +57,7 @@ def test_every_declared_column_has_a_description_and_no_other_has_one():
             assert len(row) == 2 and row[1] and not row[1].endswith("."), f"{table}.{name}"
             # a quantity is one that folders have, or a word that no quantity is made of
             if row[0] not in ("ms", "s"):
-                left = columns.unit(
+                left = units.named(
                     row[0], dict.fromkeys((*UNITS, "temperature", "pressure", "loss", "parameter"), "U")
                 )
                 assert left.strip("U/³²·√()") == "", f"{table}.{name}: {row[0]}"
@@ -70,7 +71,7 @@ def test_every_declared_column_has_a_description_and_no_other_has_one():
     ],
 )  # fmt: skip
 def test_units_are_made_of_the_folders_own(quantity, expected):
-    assert columns.unit(quantity, UNITS) == expected
+    assert units.named(quantity, UNITS) == expected
 
 
 def test_the_schema_names_version_kind_system_and_units(folder):

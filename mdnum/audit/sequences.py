@@ -10,6 +10,7 @@ from ase import Atoms
 
 from mdnum.audit.noise import displaced
 from mdnum.audit.structures import Pair, modified
+from mdnum.units import LENGTH
 
 #: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
 #: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
@@ -72,7 +73,7 @@ def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, A
     for number in range(1, 13):
         # there and back, so that atoms do not run into one another
         there = displaced(atoms, 0.04 * min(number, 12 - number) * heading)
-        yield f"all atoms moved by 0.04 Å, {number} times", there
+        yield f"all atoms moved by 0.04 {LENGTH}, {number} times", there
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
@@ -88,7 +89,7 @@ def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
         yield "the structure", atoms
         for number in range(1, 6):
             there = displaced(atoms, number * step)
-            yield f"{words} moved by 0.09 Å toward another, {number} times", there
+            yield f"{words} moved by 0.09 {LENGTH} toward another, {number} times", there
         step[1 + other] = -step[0]
     yield "the structure", atoms
 
@@ -143,16 +144,16 @@ def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceSt
             there = start.copy()
             there.positions[:count, 0] += 0.5 * moved
             there.positions[count:, 0] -= 0.5 * moved
-            what = f"each moved by {0.5 * moved:.3g} Å toward the other"
+            what = f"each moved by {0.5 * moved:.3g} {LENGTH} toward the other"
             sequence.append(SequenceStep(what, there, compared=bool(moved > beyond)))
-        yield f"two atoms from {beyond:.2g} Å beyond the cutoff", sequence
+        yield f"two atoms from {beyond:.2g} {LENGTH} beyond the cutoff", sequence
     if len(pair.first) == len(pair.second) == 1:
         # atoms stand still while the cell brings an image of one into the other's reach: across the face they
         # are 0.05 Å beyond the cutoff at first
         shrinking = []
         for moved in (0.0, 0.03, 0.06, 0.09, 0.12, 0.16):
             there = modified(pair.at(2.0 * radius - 0.05), cell=[3.0 * radius - moved] * 3, pbc=True)
-            what = f"the cell shrank by {moved:.2g} Å" if moved else apart
+            what = f"the cell shrank by {moved:.2g} {LENGTH}" if moved else apart
             shrinking.append(SequenceStep(what, there, compared=moved > 0.05))
         yield "a cell that shrinks around two atoms", shrinking
         near = SequenceStep("one atom jumped next to the other", pair.at(0.95 * radius))

@@ -37,7 +37,8 @@ Where a list has several texts, the first counts whose fields all have a value; 
 out. A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3
 significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
 "2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` one
-word or the other.
+word or the other. A `Measured` is written with its unit (`{x:3m}`: in thousandths of it, meV), `{x.floor:1}`
+without; where a verb has a unit system, `{units.energy}` is the name of a unit.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ from mdnum.plain import beside, plain
 from mdnum.report import words
 from mdnum.report.browse import Browse, Column
 from mdnum.report.section import Key, Plot, Series, cell
+from mdnum.units import Measured, Units, revived
 
 Severity = Literal["info", "warning", "error"]
 Tone = Literal["good", "info", "warning", "error"]
@@ -78,6 +80,10 @@ class Finding:
 
 class _Fields(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, Measured):
+            digits, milli, _ = format_spec.partition("m")
+            shown = value.to(milli)
+            return f"{self.format_field(shown.value, digits)} {shown.unit}".rstrip()
         if format_spec.startswith("#"):
             return words.many(value, *(word.replace("_", " ") for word in format_spec[1:].split()))
         if format_spec.startswith("?"):
@@ -95,7 +101,7 @@ class _Fields(string.Formatter):
 
     def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:
         try:
-            return super().get_value(key, args, kwargs)
+            return revived(super().get_value(key, args, kwargs))
         except (KeyError, IndexError):
             raise KeyError(
                 f"a sentence names {key!r}; given are {', '.join(kwargs) or 'no values'}"
@@ -107,10 +113,12 @@ class Texts:
 
     Args:
         module: `__file__` of the module; its text file lies beside it with the suffix .toml.
+        units: whose names `{units.energy}` and the like are.
     """
 
-    def __init__(self, module: str | Path):
+    def __init__(self, module: str | Path, units: Units | None = None):
         self.entries: Mapping[str, Any] = beside(str(module))
+        self.units = units
 
     def finding(
         self,
@@ -133,14 +141,15 @@ class Texts:
         """
         entry = self.entries[code]
         values = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
+        known = {"units": self.units, **values}
 
         def text(part: str) -> str:
             chosen = next(
                 (entry[f"{part}_{v}"] for v in variants if f"{part}_{v}" in entry), entry.get(part, "")
             )
-            return fill(chosen, values)
+            return fill(chosen, known)
 
-        more = [fill(entry[f"more_{v}"], values) for v in variants if f"more_{v}" in entry]
+        more = [fill(entry[f"more_{v}"], known) for v in variants if f"more_{v}" in entry]
         worst = severity or next((entry[f"severity_{v}"] for v in variants if f"severity_{v}" in entry), None)
         return Finding(
             code, worst or entry["severity"], text("title"), " ".join(filter(None, [text("text"), *more])),
@@ -149,7 +158,7 @@ class Texts:
 
     def __call__(self, name: str, /, **values: Any) -> str:
         """A sentence of the table [sentences], its fields filled in."""
-        return fill(self.entries["sentences"][name], values)
+        return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
         self,
@@ -206,7 +215,7 @@ class Texts:
 
 def _plain(value: Any) -> Any:
     # infinite numbers are written as such in a sentence
-    return value if isinstance(value, float) else plain(value)
+    return value if isinstance(value, float | Measured) else revived(plain(value))
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
@@ -289,4 +298,5 @@ def restore(kept: Mapping[str, Any]) -> Finding:
     severity: Any = kept.get("severity") if kept.get("severity") in _ORDER else "info"
     named = ("code", "title", "text", "remedy", "section", "cause")
     texts = {name: str(kept.get(name) or "") for name in named}
-    return Finding(severity=severity, values=dict(kept.get("values") or {}), **texts)
+    values = {name: revived(value) for name, value in dict(kept.get("values") or {}).items()}
+    return Finding(severity=severity, values=values, **texts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from mdnum.plain import beside
+from mdnum.units import named
 
 _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
@@ -23,17 +23,6 @@ def meaning(table: str, column: str) -> Sequence[str]:
         if pattern := next((one for one in declared if "*" in one and fnmatchcase(column, one)), None):
             return declared[pattern]
     return "", ""
-
-
-def unit(quantity: str, units: Mapping[str, str]) -> str:
-    """A unit made of quantities in those of a folder; empty where the folder does not have them all.
-
-    >>> unit("energy/length", {"energy": "eV", "length": "Å"})
-    'eV/Å'
-    """
-    words = re.findall(r"[a-z]{3,}", quantity)
-    missing = any(units.get(word) in ("", None) for word in words)
-    return "" if missing else re.sub(r"[a-z]{3,}", lambda word: units[word[0]], quantity)
 
 
 def _json(value: Any) -> str:
@@ -51,7 +40,7 @@ def described(schema: pa.Schema, table: str, about: Mapping[str, Any]) -> pa.Sch
     fields, told = [], {}
     for field in schema:
         quantity, text = meaning(table, field.name)
-        held = {"unit": unit(quantity, about["units"]), "description": text}
+        held = {"unit": named(quantity, about["units"]), "description": text}
         told[field.name] = {key: word for key, word in held.items() if word}
         fields.append(field.with_metadata(told[field.name]))
     words = {key: value if isinstance(value, str) else _json(value) for key, value in about.items()}

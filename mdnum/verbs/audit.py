@@ -41,12 +41,8 @@ if TYPE_CHECKING:
     from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
     from mdnum.deadline import Deadline
 
-TEXTS = Texts(__file__)
+TEXTS = Texts(__file__, units.METAL)
 _SCRIPT = "reproduce.py"
-#: k_B, eV/K (CODATA 2018, exact).
-_BOLTZMANN = 8.617333262e-5
-#: A unit of a system with dimensions where text has one: not in the name of a file.
-_UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 
 
 @partial(frame.keywords_checked, name="audit_calculator")
@@ -127,7 +123,7 @@ def audit(
     _internal(timestep, loaded.units)
     wanted = _wanted(checks)
     given = None if structure is None and loaded.atoms is None else _structure(structure, loaded, deadline)
-    kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
+    kT = 300.0 * units.METAL.k_B if loaded.kT is None else loaded.kT
     kT = kT if temperature is None else temperature * loaded.units.k_B
     # before the first question, which may never be answered
     with ExitStack() as stack:
@@ -240,6 +236,7 @@ def answer_of(
         values["file"] = error.structure.name if error.structure else ""
         failed = base.finding("CALCULATOR_FAILED", "error", "saved" if error.structure else None, **values)
         result = base.CheckResult((["failed"], values), [failed], skipped=[(rest, error.message)], **named)
+    result = _named(result, subject.units)
     if any(one.code == "NOT_REPEATABLE" for each in (*before, result) for one in each.findings):
         return result
     return replace(result, findings=[*subject.repeats.findings(subject.kT), *result.findings])
@@ -332,7 +329,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
     atoms, given = state.atoms, units.get(state.units)
-    said = conclusion.answers(state.shown, state.checks)
+    texts, said = Texts(__file__, given), conclusion.answers(state.shown, state.checks)
     why = state.why or "not finished"
     left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
     whys = dict.fromkeys(left, why) | {name: "not selected" for name in CHECKS if name not in state.checks}
@@ -341,30 +338,27 @@ def _summary(state: AuditState) -> dict[str, Any]:
     early = frame.UNDECIDED if conclusion.to_come(state.shown, state.checks) else frame.PARTIAL
     status = {"stopped": "stopped", base.TIME_UP: early}.get(state.why, "unfinished")
     status = {frame.PARTIAL: "complete"}.get(early, early) if state.during is None else status
-    return _in_units(
-        {
-            "system": state.name, "calculator": state.name, "atoms": len(atoms),
-            "formula": atoms.get_chemical_formula(), "periodic": atoms.pbc.tolist(),
-            "structure": atoms.info.get("origin"), "kT": state.kT, "units": state.units,
-            "safe_to_run": said["run"], "safe_to_differentiate": said["differentiate"],
-            "parts": [
-                {
-                    "name": one.name, "title": one.title, "tables": one.tables,
-                    "says": " ".join(TEXTS(name, **one.says[1]) for name in one.says[0]),
-                    "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
-                    "seconds": one.seconds,
-                }
-                for one in state.shown
-            ],
-            "left_out": rest,
-            "causes": [
-                {"code": head.code, "below": [one.code for one in below]}
-                for head, below in _by_cause([one for each in state.shown for one in each.findings])
-            ],
-            "status": status, "seconds": state.seconds,
-        },
-        given,
-    )  # fmt: skip
+    return {
+        "system": state.name, "calculator": state.name, "atoms": len(atoms),
+        "formula": atoms.get_chemical_formula(), "periodic": atoms.pbc.tolist(),
+        "structure": atoms.info.get("origin"), "kT": state.kT, "units": state.units,
+        "safe_to_run": said["run"], "safe_to_differentiate": said["differentiate"],
+        "parts": [
+            {
+                "name": one.name, "title": one.title, "tables": one.tables,
+                "says": " ".join(texts(name, **one.says[1]) for name in one.says[0]),
+                "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
+                "seconds": one.seconds,
+            }
+            for one in state.shown
+        ],
+        "left_out": rest,
+        "causes": [
+            {"code": head.code, "below": [one.code for one in below]}
+            for head, below in _by_cause([one for each in state.shown for one in each.findings])
+        ],
+        "status": status, "seconds": state.seconds,
+    }  # fmt: skip
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
@@ -383,22 +377,18 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
     return tables
 
 
-def _in_units(value: Any, given: units.Units) -> Any:
-    """Text in any value with the names of a unit system: checks say eV and Å, which may be ε and σ."""
-    if given.energy == "eV":
-        return value
-
-    def unit(found: re.Match[str]) -> str:
-        return given.length if found[0] == "Å" else f"{found[1]}{given.energy}"
-
+def _named(value: Any, given: units.Units) -> Any:
+    """What checks found with the names of units where their text leaves room for them."""
+    if isinstance(value, units.Measured):
+        return value.to("", vars(given))
     if isinstance(value, str):
-        return _UNIT.sub(unit, value)
+        return value.replace(units.ENERGY, given.energy).replace(units.LENGTH, given.length)
     if isinstance(value, Mapping):
-        return {_in_units(key, given): _in_units(item, given) for key, item in value.items()}
+        return {_named(key, given): _named(item, given) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(_in_units(item, given) for item in value)
+        return type(value)(_named(item, given) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{name: _in_units(item, given) for name, item in vars(value).items()})
+        return replace(value, **{name: _named(item, given) for name, item in vars(value).items()})
     return value
 
 
@@ -415,16 +405,16 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
     ]
 
 
-def _finding(one: Observed, section: str, cause: str) -> Finding:
+def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
     """The sentences of what was found; of a check of another package, those that it gave."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
-    made = TEXTS.finding(
+    made = texts.finding(
         one.code, *one.variants, severity=one.severity, section=section, cause=cause, **one.values
     )
     # ways of writing a structure down have one text for all
-    return made if made.text else replace(made, text=TEXTS("invariance_finding", **one.values))
+    return made if made.text else replace(made, text=texts("invariance_finding", **one.values))
 
 
 @dataclass(frozen=True)
@@ -445,7 +435,7 @@ def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
     state = view.state
     given, titles, more = units.get(state.units), {}, conclusion.concluded(state.shown)
-    observed = []
+    texts, observed = Texts(__file__, given), []
     for result in state.shown:
         # what a check has said by itself goes before what several say together
         told = [replace(one, variants=[*one.variants, more.get(one.code, "")]) for one in result.findings]
@@ -454,13 +444,13 @@ def _judge(view: AuditView) -> Verdict:
     found = []
     groups = _by_cause(observed)
     for head, below in groups:
-        found.append(_finding(head, titles[id(head)], ""))
-        found += [_finding(one, titles[id(one)], head.code) for one in below]
+        found.append(_finding(head, titles[id(head)], "", texts))
+        found += [_finding(one, titles[id(one)], head.code, texts) for one in below]
     headline = _headline(state, [one for one in found if not one.cause])
     if state.during is not None:
         name = {"stopped": "stopped", base.TIME_UP: "time_up"}.get(state.why, "unfinished")
         headline = TEXTS(name, check=state.during, headline=headline)
-    return _in_units(conclude(found, headline=headline, best="good", judged=True), given)
+    return conclude(found, headline=headline, best="good", judged=True)
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
@@ -533,7 +523,7 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
     if (script := view.folder.path / _SCRIPT).exists():
         code = Code("A script that shows it without mdnum", read_text(script))
         sections.append(Section("Reproduce", [code]))
-    for result in _in_units(state.shown, given):
+    for result in state.shown:
         parts = [_plot(result, place) for place in range(len(result.charts))]
         parts += [_marked(rows, title) for title, rows in result.tables.items() if rows]
         sections.append(Section(result.title, parts))

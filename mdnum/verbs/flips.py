@@ -18,7 +18,7 @@ from mdnum.errors import InputError, MdnumError, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, columns_about, ending, selected, stem
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
 from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords_checked
 
 if TYPE_CHECKING:
@@ -113,13 +113,12 @@ def flips(
     groups = selected(opened, between)
     sample = opened.sample()
     resolution = infer(sample, opened.bits, opened.format)
-    rows = HeldRows()
+    rows = HeldRows(opened)
     passes = follow(opened, asked, groups, resolution, rows.add)
     # no folder for a file whose first frame cannot be used
     found, began = next(passes), time.perf_counter()
     with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
         folder, log = answer.folder, answer.log
-        folder.told = columns_about(opened)
         atoms = opened.table.columns
         for end in "ij":
             folder.look_up("flips", end, {f"{name}_{end}": values for name, values in atoms.items()})

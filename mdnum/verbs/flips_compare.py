@@ -16,17 +16,7 @@ from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, g
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.separation import velocities_of
 from mdnum.trajectories.tracker import Tracker, atoms_of
-from mdnum.verbs.flips_shared import (
-    FlipsView,
-    HeldRows,
-    about,
-    columns_about,
-    ending,
-    name_of,
-    resolution,
-    selected,
-    stem,
-)
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
 from mdnum.verbs.frame import Keep, Outcome, Verb, answering
 
 if TYPE_CHECKING:
@@ -73,13 +63,12 @@ def compare(
         ])
         for rule in asked
     ]  # fmt: skip
-    rows = HeldRows()
+    rows = HeldRows(a)
     passes = follow_both(sets, atoms_of(groups), rows.add)
     # no folder for files whose first frames cannot be used
     found = next(passes)
     with answering("flips-compare", f"flips-{stem(a)}", **keep) as answer:
         folder, log = answer.folder, answer.log
-        folder.told = columns_about(a)
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
         interrupted = rows.drain(folder, passes, found, total, log)
         table = folder.read("apart")

@@ -58,13 +58,6 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
     }  # fmt: skip
 
 
-def columns_about(trajectory: Trajectory) -> dict[str, Any]:
-    """What the schemas of tables say of a file."""
-    length = trajectory.length
-    units = {"length": length, "decision": length, "time": trajectory.time}
-    return {"system": name_of(trajectory), "units": units}
-
-
 def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
     """What summary.json says of how the reading ended."""
     return {
@@ -77,7 +70,10 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
 class HeldRows:
     """Rows of a folder's tables, appended for many frames together."""
 
-    def __init__(self) -> None:
+    def __init__(self, trajectory: Trajectory) -> None:
+        units = {"length": trajectory.length, "decision": trajectory.length, "time": trajectory.time}
+        # what the schemas of the tables say
+        self._told = {"system": name_of(trajectory), "units": units}
         self._held: dict[str, list[Mapping[str, np.ndarray]]] = {}
         self._count = self.flips = 0
 
@@ -96,6 +92,7 @@ class HeldRows:
             found: what it goes by, with `frames` read so far, and `stopped` where the rest cannot be read.
             of: how many there are, 0 if not known.
         """
+        folder.told = self._told
         with asked_to_stop() as stop:
             while True:
                 if self._count > _ROWS_HELD:

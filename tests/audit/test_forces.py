@@ -18,6 +18,7 @@ from mdnum.audit.checks.forces import ForcesCheck, slope
 from mdnum.audit.checks.invariance import InvarianceCheck
 from mdnum.audit.noise import Digits, NoiseFloor, along_a_line, digits, precision, settled
 from mdnum.audit.subject import CalculatorSubject
+from mdnum.units import FORCE
 
 
 def test_digits_are_read_off_the_numbers():
@@ -255,7 +256,7 @@ def test_a_direction_that_cannot_tell_is_no_comfort():
 def test_the_curl_of_a_whirl_is_twice_its_rate():
     """An atom that turns in its plane: times the share that moves, for the center moves along by a sixth."""
     rows = asked("curl", planted.Whirl, chain()).tables["Work around closed loops"]
-    planar = [row["curl (eV/Å²)"] for row in rows if row["plane"].endswith("in xy")]
+    planar = [row[f"curl ({FORCE}²)"] for row in rows if row["plane"].endswith("in xy")]
     np.testing.assert_allclose(planar, 2e-3 * 5 / 6, rtol=1e-6)
 
 

@@ -21,6 +21,7 @@ from mdnum.audit.checks.smoothness import SmoothnessCheck
 from mdnum.audit.noise import NoiseFloor
 from mdnum.audit.sequences import all_sequences
 from mdnum.audit.subject import CalculatorError
+from mdnum.units import ENERGY, FORCE, LENGTH
 
 ROWS = "One object, asked again and again, beside new ones"
 LJ = lambda: LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)  # noqa: E731
@@ -150,9 +151,17 @@ def found_by(check, make, atoms: Atoms, order: int | None = 4) -> dict[str, str]
         assert {key: told[key] for key in expected} == expected
     wrong = [row for row in result.tables.get(ROWS, ()) if not row["same"]]
     if "STALE_STATE" in codes(result):
-        told, worst = values(result, "STALE_STATE"), max(wrong, key=lambda row: row["energy differs by (eV)"])
-        assert told["energy"] == worst["energy differs by (eV)"] and told["step"] == worst["what happened"]
-        assert told["force"] == worst["forces differ by (eV/Å)"] and told["allowed"] == worst["allowed"]
+        told, worst = (
+            values(result, "STALE_STATE"),
+            max(wrong, key=lambda row: row[f"energy differs by ({ENERGY})"]),
+        )
+        assert (
+            told["energy"].value == worst[f"energy differs by ({ENERGY})"]
+            and told["step"] == worst["what happened"]
+        )
+        assert (
+            told["force"] == worst[f"forces differ by ({FORCE})"] and told["energy"].floor == worst["allowed"]
+        )
         assert told["sequences"] == ", ".join(sorted({row["sequence"] for row in wrong}))
         assert told["questions"] == result.numbers["remembered"] == len(wrong)
         # who answers again after a failure is not broken by it
@@ -358,7 +367,7 @@ def test_an_energy_that_alone_is_cut_is_seen_where_thresholds_are_known(make, ex
     if expected:
         told = values(result, "TWO_ENERGIES")
         assert told["variants"] == ["wrong"]
-        assert all(part in told["places"] for part in ("Ar-Ar", "3.4 Å", "0.01 eV"))
+        assert all(part in told["places"] for part in ("Ar-Ar", f"3.4 {LENGTH}", f"0.01 {ENERGY}"))
 
 
 @pytest.mark.parametrize(("name", "what"), [("invariance", "lattice"), ("state", "sheared")])
@@ -457,7 +466,7 @@ def test_who_knows_whole_molecules_alone_is_asked_about_molecules_alone(make):
     found = AloneCheck()
     found.look(subject(make), water(4), NoiseFloor(1e-13, 1e-13))
     assert not list(found.findings()) and not found.takes_atoms
-    assert [row["atoms"] for row in found.rows] == ["one H2O", "two H2O 60 Å apart"]
+    assert [row["atoms"] for row in found.rows] == ["one H2O", f"two H2O 60 {LENGTH} apart"]
 
 
 def test_failing_on_an_atom_without_neighbors_is_found_where_the_cluster_has_one_too():

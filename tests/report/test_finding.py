@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import string
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 import mdnum
 from mdnum.report import words
 from mdnum.report.finding import Finding, Texts, conclude, fill, restore
+from mdnum.units import METAL, Measured
 
 TEXTS = sorted(Path(mdnum.__file__).parent.rglob("*.toml"))
 
@@ -110,8 +112,13 @@ def test_variants_replace_and_add_and_a_finding_comes_back_from_a_summary(tmp_pa
 def test_every_sentence_can_be_filled(path):
     """A field that is misspelled or a format that is none would show only when its finding comes up."""
     for text in sentences(path):
-        fields = {name: 2 for _, name, _, _ in string.Formatter().parse(text) if name}
-        assert "{" not in fill(text, fields)
+        parts = [(name, form or "") for _, name, form, _ in string.Formatter().parse(text) if name]
+        fields = {name: 2 for name, _ in parts}
+        # a number with its unit is one of which the floor is written, or thousandths
+        known = {name.split(".")[0] for name, form in parts if "." in name or re.fullmatch(r"[+]?\d*m", form)}
+        known -= {"units"}
+        fields |= dict.fromkeys(known, Measured(2.0, "energy", 1.0, 1.0))
+        assert "{" not in fill(text, {"units": METAL, **fields})
 
 
 def test_sentences_are_found_with_their_fields():

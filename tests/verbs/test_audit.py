@@ -33,9 +33,9 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.words import listed
 from mdnum.store import RunFolder
-from mdnum.units import LJ
+from mdnum.units import LJ, Measured, get
 from mdnum.verbs import frame
-from mdnum.verbs.audit import TEXTS, VERBS, AuditView
+from mdnum.verbs.audit import KINDS, TEXTS, AuditView
 
 QUICK = "invariance,forces"
 CHECKS = in_order(list(checks.CHECKS))
@@ -131,7 +131,7 @@ def test_a_mistake_is_evidence_that_others_can_see(bad):
         atoms.calc = planted.OneImage()
         energies.append(atoms.get_potential_energy())
     told = next(one for one in bad.verdict.findings if one.code == "IMAGES")
-    assert told.values["energy"] == pytest.approx(abs(energies[1] - energies[0]), rel=1e-6)
+    assert told.values["energy"].value == pytest.approx(abs(energies[1] - energies[0]), rel=1e-6)
     assert told.values["slug"] == "images" and "images-before" in told.text
     assert "Reproduce" in [section.title for section in bad.page.sections]
     json.loads((bad.folder / "summary.json").read_text(), parse_constant=pytest.fail)
@@ -218,7 +218,7 @@ def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[s
     names = wanted or [one.name for one in parts]
     state = AuditState("x", True, encoded(Atoms("Ar")), 1.0, "metal", names, None, None, None, parts)
     told = answers(parts, names)
-    headline = VERBS["audit"].judge(AuditView(cast(Any, None), {}, given=state)).headline
+    headline = KINDS["audit"].judge(AuditView(cast(Any, None), {}, given=state)).headline
     return told["run"], told["differentiate"], headline
 
 
@@ -435,7 +435,6 @@ def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
     monkeypatch.setattr("mdnum.audit.record.load_calculator", lambda words: loaded)
     monkeypatch.setattr("mdnum.audit.checks.dynamics.find_thresholds", lambda subject: [])
     atoms = planted.crystal()
-    atoms.info["origin"] = "8 atoms, nearest distance 2.76 Å"
     checks = "forces,curl,dynamics"
     outcome = mdnum.audit_calculator("reduced", atoms, checks=checks, steps=16, out=tmp_path / "a")
     assert {"FORCES_NOT_GRADIENT", "NET_FORCE"} <= codes(outcome)
@@ -444,6 +443,52 @@ def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
     seen = re.sub(r"<(style|script)\b.*?</\1>|<(?!!--)[^>]*>", " ", page, flags=re.DOTALL)
     for text in (seen, (tmp_path / "a/summary.json").read_text()):
         assert not [text[one.start() - 40 : one.end() + 20] for one in DIMENSIONS.finditer(text)]
+    assert "ε/σ" in seen and "{units" not in page
+
+
+@pytest.mark.parametrize(("system", "unit"), [("metal", "eV"), ("lj", "ε")])
+def test_numbers_have_the_units_of_the_calculator_and_words_stay_what_they_are(
+    system, unit, tmp_path, monkeypatch
+):
+    """Whatever a check of another package says about eV.py in SteveV is not touched."""
+    module = (
+        "from mdnum.audit.base import AuditCheck, Chart, CheckResult, finding\n"
+        "from mdnum.units import ENERGY, LENGTH, Measured\n"
+        "class Odd(AuditCheck):\n"
+        '    """Measures in the unit of the calculator."""\n'
+        '    name, title = "odd", "Odd"\n'
+        "    def ask(self, subject, progress):\n"
+        "        rows = [{f'at ({LENGTH})': 1.0, 'where': 'eV.py in SteveV failed at 3 Å {x}'}]\n"
+        "        size = Measured(0.25, 'energy/length', 1e-3, 2.0)\n"
+        "        told = [finding('NET_FORCE', 'error', size=size),\n"
+        "                finding('ODD', 'warning', title='odd', text=f'It is 7 {ENERGY} in SteveV.')]\n"
+        "        chart = Chart('t', f'r ({LENGTH})', f'u ({ENERGY})', [0.0, 1.0], {'u': [1.0, 2.0]})\n"
+        "        return CheckResult(([], {}), told, {'Rows': rows}, [chart])\n"
+    )
+    monkeypatch.syspath_prepend(
+        install(
+            tmp_path / "site", "odd-units", {"in_units": module}, {"mdnum.checks": {"odd": "in_units:Odd"}}
+        )
+    )
+    loaded = LoadedCalculator("odd", "odd", planted.Good, planted.crystal(), 0.01, get(system))
+    monkeypatch.setattr("mdnum.verbs.audit._loaded", lambda calculator: loaded)
+    outcome = mdnum.audit_calculator("odd", checks="odd", out=tmp_path / "a")
+    length = {"eV": "Å", "ε": "σ"}[unit]
+    force, odd = outcome.verdict.findings
+    assert f"0.250 {unit}/{length}" in force.text and odd.text == f"It is 7 {unit} in SteveV."
+    assert force.values["size"] == Measured(0.25, f"{unit}/{length}", 1e-3, 2.0)
+    stored = json.loads((tmp_path / "a/summary.json").read_text())
+    (part,) = stored["parts"]
+    assert part["tables"] == {"Rows": [{f"at ({length})": 1.0, "where": "eV.py in SteveV failed at 3 Å {x}"}]}
+    by_code = {one["code"]: one for one in stored["findings"]}
+    assert by_code["NET_FORCE"]["values"]["size"] == {
+        "value": 0.25, "unit": f"{unit}/{length}", "floor": 1e-3, "scale": 2.0,
+    }  # fmt: skip
+    # what is read again says the same
+    again = frame.finish(tmp_path / "a")
+    assert again.verdict == outcome.verdict and again.summary["parts"] == outcome.summary["parts"]
+    page = (tmp_path / "a/report.html").read_text()
+    assert f"r ({length})" in page and "{units" not in page
 
 
 def test_another_package_adds_a_check(tmp_path, monkeypatch):

@@ -12,10 +12,13 @@ from mdnum.audit.base import AuditCheck, CalculatorError, CheckResult, Observed,
 from mdnum.audit.noise import NoiseFloor, settled
 from mdnum.audit.structures import molecules, nearest_distance, whole
 from mdnum.audit.subject import CalculatorSubject, largest
+from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
 #: Å between two parts that cannot feel one another, and a cell that does not repeat around them: some lists
 #: take long over an empty one.
 _FAR, _BOX = 60.0, 75.0
+_AWAY = f"{_FAR:g} {LENGTH}"
+_ENERGY, _FORCE = f"energy ({ENERGY})", f"force ({FORCE})"  # columns
 _CLUSTER = 12
 _EPS = np.finfo(float).eps
 
@@ -37,10 +40,11 @@ class AloneCheck(AuditCheck):
         with subject.meter.limited():
             self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
+        known = Measured(self.floor.force, "energy/length"), Measured(self.floor.energy, "energy")
         return CheckResult(
             says=(
                 [f"alone_{'wrong' if found else 'right' if self.rows else 'none'}"],
-                {"parts": len(self.rows), "far": _FAR},
+                {"parts": len(self.rows), "far": _FAR, "force": known[0], "energy": known[1]},
             ),
             findings=found,
             tables={"Atoms alone": self.rows},
@@ -52,6 +56,7 @@ class AloneCheck(AuditCheck):
     def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
         """Ask, by a new object each, about parts of a structure; molecules where nothing less is taken."""
         self.rows: list[dict[str, Any]] = []
+        self.floor = noise.allowed
         self.refused: list[tuple[str, CalculatorError]] = []
         single: dict[str, float] = {}
 
@@ -68,8 +73,9 @@ class AloneCheck(AuditCheck):
             force = largest(answer[1].reshape(-1, size, 3).sum(axis=1)[lone])
             expected = answer[0] if expected is None else expected
             allowed = noise.louder(NoiseFloor(_EPS * abs(expected), _EPS)).allowed
+            self.floor = self.floor.louder(allowed)
             self.rows.append({
-                "atoms": what, "energy (eV)": answer[0], "expected": expected, "force (eV/Å)": force,
+                "atoms": what, _ENERGY: answer[0], "expected": expected, _FORCE: force,
                 "adds up": abs(answer[0] - expected) <= allowed.energy, "no force": force <= allowed.force,
             })  # fmt: skip
             return answer[0]
@@ -87,12 +93,12 @@ class AloneCheck(AuditCheck):
                     single.setdefault(symbol, alone)
         first, last = species[0], species[-1]
         sides = total(single.get(first), single.get(last))
-        energy(f"{first} and {last} {_FAR:g} Å apart", _apart(_boxed(Atoms(first)), Atoms(last)), sides)
+        energy(f"{first} and {last} {_AWAY} apart", _apart(_boxed(Atoms(first)), Atoms(last)), sides)
         if first != last and first in single:
             # who numbers species by what is there gives the last one other numbers without the first
             two = _boxed(Atoms([last] * 2, [[0, 0, 0], [nearest_distance(atoms), 0, 0]]))
             together = total(energy(f"two {last} atoms", two, lone=slice(0)), single[first])
-            what = f"one {first} atom {_FAR:g} Å from two {last} atoms"
+            what = f"one {first} atom {_AWAY} from two {last} atoms"
             energy(what, _apart(two, Atoms(first)), together, slice(2, None))
         cluster = _boxed(atoms[: min(len(atoms), _CLUSTER)])
         near = subject.fresh().try_both(cluster)
@@ -104,14 +110,14 @@ class AloneCheck(AuditCheck):
         if failed:
             self.refused.append((f"a cluster of {len(cluster)} atoms", near))
         elif self.takes_atoms:
-            both, what = _apart(cluster, Atoms(first)), f"one {first} atom {_FAR:g} Å from a cluster"
+            both, what = _apart(cluster, Atoms(first)), f"one {first} atom {_AWAY} from a cluster"
             energy(what, both, total(near[0], single.get(first)), slice(-1, None))
         else:
             one = _boxed(whole(atoms, molecules(atoms)[0]))
             name, size = one.get_chemical_formula(), len(one)
             # within a molecule there are forces, on it as a whole there is none
             alone = energy(f"one {name}", one, size=size)
-            energy(f"two {name} {_FAR:g} Å apart", _apart(one, one), total(alone, alone), size=size)
+            energy(f"two {name} {_AWAY} apart", _apart(one, one), total(alone, alone), size=size)
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""
@@ -120,11 +126,11 @@ class AloneCheck(AuditCheck):
         for what, why in [one for one in self.refused if one[1].cause is not None and self.takes_atoms][:1]:
             yield finding("LONELY_FAILS", "warning", what=what, why=why.message)
         if pushed := [row for row in self.rows if not row["no force"]]:
-            worst = max(pushed, key=lambda row: row["force (eV/Å)"])
-            yield finding("LONELY_FORCE", "error", what=worst["atoms"], force=worst["force (eV/Å)"])
+            worst = max(pushed, key=lambda row: row[_FORCE])
+            yield finding("LONELY_FORCE", "error", what=worst["atoms"], force=worst[_FORCE])
         if apart := [row for row in self.rows if not row["adds up"]]:
-            worst = max(apart, key=lambda row: abs(row["energy (eV)"] - row["expected"]))
-            energies = f"{worst['energy (eV)']:.10g}", f"{worst['expected']:.10g}"
+            worst = max(apart, key=lambda row: abs(row[_ENERGY] - row["expected"]))
+            energies = f"{worst[_ENERGY]:.10g}", f"{worst['expected']:.10g}"
             values = {"what": worst["atoms"], "energy": energies[0], "expected": energies[1], "far": _FAR}
             yield finding("LONELY_ENERGY", "warning", **values)
 

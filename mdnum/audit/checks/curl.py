@@ -13,6 +13,7 @@ from jaxtyping import Float
 from mdnum.audit.base import AuditCheck, CheckResult, Progress, Ways, finding
 from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
+from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
 _RADII = (0.03, 0.003, 0.0003)  # Å; the loop with the smaller error counts
 _POINTS = 12  # on a loop: equally spaced, they integrate a smooth periodic function to all orders below
@@ -82,8 +83,8 @@ class CurlCheck(AuditCheck):
         }  # fmt: skip
         values: dict[str, Any] = {**vars(worst), "share": worst.share} if worst else {}
         values |= {
-            "loops": len(loops), "wrong": len(wrong), "limit": abs(limit.curl) + limit.error,
-            "stiffness": limit.stiffness,
+            "loops": len(loops), "wrong": len(wrong),
+            "limit": Measured(abs(limit.curl) + limit.error, "energy/length²", scale=limit.stiffness),
         }  # fmt: skip
         severity = "error" if worst and worst.share > _SMALL else "warning"
         return CheckResult(
@@ -177,6 +178,7 @@ def around(
 
 def _row(one: Loop) -> dict[str, Any]:
     return {
-        "plane": one.plane, "radius (Å)": one.radius, "work (eV)": one.work, "curl (eV/Å²)": one.curl,
-        "error": one.error, "stiffness (eV/Å²)": one.stiffness, "no work": one.conservative,
+        "plane": one.plane, f"radius ({LENGTH})": one.radius, f"work ({ENERGY})": one.work,
+        f"curl ({FORCE}²)": one.curl, "error": one.error, f"stiffness ({FORCE}²)": one.stiffness,
+        "no work": one.conservative,
     }  # fmt: skip

@@ -6,7 +6,7 @@ ASE's velocity Verlet; molecules of rigid models keep their shape.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +23,7 @@ from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, direction, displace
 from mdnum.audit.structures import group
 from mdnum.audit.subject import CalculatorSubject, largest, rms
 from mdnum.audit.thresholds import PairThreshold, find_thresholds
-from mdnum.units import Units
+from mdnum.units import ENERGY, LENGTH, Measured, Units
 
 #: Of a run where nobody says how many. A step takes some six calls: two in the run of half the time step,
 #: warming up, work on the way.
@@ -123,7 +123,8 @@ def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult
     """What a few steps tell: that they were answered, and by what does not depend on the steps before."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
-    old = [finding("STALE_DYNAMICS", "error", differs=differs, allowed=allowed)] if differs > allowed else []
+    seen = Measured(differs, "energy", allowed)
+    old = [finding("STALE_DYNAMICS", "error", differs=seen)] if differs > allowed else []
     values: dict[str, Any] = {"steps": steps, "change": change, "stale": differs}
     values |= {"timestep": ran.timestep / units.time_factor, "time_unit": units.time}
     return CheckResult(says=(["dynamics_brief"], values), findings=old, numbers=values, possible=2)
@@ -215,7 +216,8 @@ class TwoRuns:
         balance, jumps = self.balance, self.balance.hidden.jumps
         numbers = {
             "drift": shares["total"].slope, "drift_error": shares["total"].error,
-            "drift_unit": f"meV/atom/{units.time}", "drift_ratio": ratio(one.time, one.total, one.kinetic),
+            "drift_unit": f"m{units.energy}/atom/{units.time}",
+            "drift_ratio": ratio(one.time, one.total, one.kinetic),
             "integrator_by_halving": shares["integrator, by halving"].slope,
             "timestep": one.timestep / units.time_factor, "steps": len(one.potential) - 1,
             "time": one.time[-1] / units.time_factor, "crossings": len(balance.crossed),
@@ -245,7 +247,7 @@ class TwoRuns:
         differs, allowed = self.stale
         old = differs > allowed
         if old:
-            yield finding("STALE_DYNAMICS", "error", differs=differs, allowed=allowed)
+            yield finding("STALE_DYNAMICS", "error", differs=Measured(differs, "energy", allowed))
         rest, total, flips = shares["rest"], shares["total"], shares["flips"]
         swing = numbers["rest_swing"] / kT
         drifts = rest.significant and abs(rest.slope) > 1e-2 * max(abs(total.slope), 1e-2 * much)
@@ -255,8 +257,8 @@ class TwoRuns:
             yield finding("NOT_CONSERVED", severity, "old" if old else None, **values("rest", swing=swing))
 
         size = numbers["flips_wander"]
-        if numbers["largest_jump"] > 2 * self.noise.allowed.energy and size > _WANDERS:
-            jump = 1e3 * numbers["largest_jump"]
+        jump = Measured(numbers["largest_jump"], "energy", 2 * self.noise.allowed.energy, kT)
+        if jump.found and size > _WANDERS:
             told = values("flips", crossings=numbers["crossings"], jump=jump, wander=size)
             severity = "error" if flips.significant and abs(flips.slope) > much else "warning"
             yield finding("FLIPS_CHANGE_ENERGY", severity, **told)
@@ -267,7 +269,7 @@ class TwoRuns:
             most = 0.5 * len(hidden.jumps)
             told = values(
                 "elsewhere", candidates=len(hidden.candidates), searched=len(hidden.steps), k=k, times=times,
-                share=hidden.share, jump=1e3 * numbers["largest_hidden_jump"], wander=size,
+                share=hidden.share, jump=replace(jump, value=numbers["largest_hidden_jump"]), wander=size,
                 places=len(hidden.jumps), at=radius, passed=passed,
             )  # fmt: skip
             severity = "error" if one.significant and abs(one.slope) > much else "warning"
@@ -292,8 +294,8 @@ class TwoRuns:
             entered, jump = sum(one.entered for one in mine), 1e3 * means.get(limit, float("nan"))
             if mine:
                 flips.append({
-                    "pair": "-".join(limit.species), "at (Å)": limit.radius, "entered": entered,
-                    "left": len(mine) - entered, "jump on entering (meV)": jump,
+                    "pair": "-".join(limit.species), f"at ({LENGTH})": limit.radius, "entered": entered,
+                    "left": len(mine) - entered, f"jump on entering (m{ENERGY})": jump,
                 })  # fmt: skip
         drifts = [
             {
@@ -323,7 +325,7 @@ class TwoRuns:
         units = self.subject.units
         title, time = "Change of the energy during a run, and what explains it", one.time / units.time_factor
         curves = {name: (scale * line).tolist() for name, line in lines.items()}
-        return Chart(title, f"time ({units.time})", "change (meV/atom)", time.tolist(), curves)
+        return Chart(title, f"time ({units.time})", f"change (m{ENERGY}/atom)", time.tolist(), curves)
 
     def energy_rows(self) -> dict[str, list[Any]]:
         """Rows of energies.parquet."""

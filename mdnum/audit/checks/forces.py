@@ -26,8 +26,10 @@ from mdnum.audit.checks import invariance
 from mdnum.audit.noise import NoiseFloor, digits, direction, displaced, measured, precision, settled, steps
 from mdnum.audit.places import WrongPlaces, wrong_places
 from mdnum.audit.subject import CalculatorSubject, no_rounding, rms
+from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
 _LADDER = 0.064 * 0.25 ** np.arange(9)  # Å, each a quarter of the one before: 0.064 Å to 1e-6 Å
+_SUMS = {"NET_FORCE": "energy/length", "NET_TORQUE": "energy"}
 _SIGNIFICANT = 10.0  # difference over estimated error from which forces and energy disagree
 _SMALL = 1e-4  # of the root mean square force: below, a disagreement is one of tables or precision
 #: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
@@ -117,10 +119,10 @@ class ForcesCheck(AuditCheck):
         slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
         wrong_sums = [
             finding(
-                code, "error" if row["found"] > _SMALL * scale else "warning", size=row["found"],
-                allowed=row["rounding explains"],
+                code, "error" if row["found"] > _SMALL * scale else "warning",
+                size=Measured(row["found"], unit, row["rounding explains"], float(scale)),
             )
-            for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False)
+            for row, (code, unit) in zip(sums, _SUMS.items(), strict=False)
             if row["found"] > row["rounding explains"]
         ]  # fmt: skip
         if wrong_sums or not all(one.agrees for one in slopes):
@@ -282,12 +284,12 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
-    yield {"sum": "net force (eV/Å)", "found": net, "rounding explains": float(allowed)}
+    yield {"sum": f"net force ({FORCE})", "found": net, "rounding explains": float(allowed)}
     if not atoms.pbc.any() and len(atoms) > 1:
         arms = atoms.positions - atoms.positions.mean(axis=0)
         reach = float(np.max(np.linalg.norm(arms, axis=1)))
         torque, allowed = float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))), allowed * max(reach, 1.0)
-        yield {"sum": "net torque (eV)", "found": torque, "rounding explains": float(allowed)}
+        yield {"sum": f"net torque ({ENERGY})", "found": torque, "rounding explains": float(allowed)}
 
 
 def _drowned(
@@ -332,8 +334,8 @@ def _judged(slopes: list[Slope], scale: float, places: WrongPlaces | None) -> It
 
 def _row(one: Slope) -> dict[str, Any]:
     return {
-        "moved": one.direction, "by differences (eV/Å)": one.difference, "error": one.error,
-        "by forces (eV/Å)": one.force, "difference": one.gap, "step (Å)": one.step,
+        "moved": one.direction, f"by differences ({FORCE})": one.difference, "error": one.error,
+        f"by forces ({FORCE})": one.force, "difference": one.gap, f"step ({LENGTH})": one.step,
         "agree": one.agrees and not one.jump,
     }  # fmt: skip
 
@@ -344,7 +346,8 @@ def _chart(slopes: list[Slope]) -> Chart:
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
     title = "Forces against differences of the energy, by step"
-    return Chart(title, "step (Å)", "difference (eV/Å)", _LADDER[::-1].tolist(), lines, log_y=True)
+    labels = title, f"step ({LENGTH})", f"difference ({FORCE})"
+    return Chart(*labels, _LADDER[::-1].tolist(), lines, log_y=True)
 
 
 # -- calculators that know two energies: the one forces belong to, and the one that a run logs
@@ -388,7 +391,7 @@ def _two_energies(
     limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
     other = abs(along.difference - along.force + slope_of_offset) <= limit
     belong = ("both" if other else "free") if along.agrees else "energy" if other else "neither"
-    wrong = [f"{what}, by {abs(by):.3g} eV" for what, by in changes.items() if abs(by) > _LARGE_OFFSET * kT]
+    wrong = [f"{k}, by {abs(by):.3g} {ENERGY}" for k, by in changes.items() if abs(by) > _LARGE_OFFSET * kT]
     yield finding(
         "TWO_ENERGIES", "error" if wrong else "warning", belong, "wrong" if wrong else None,
         formula=atoms.get_chemical_formula(), offset=offset, change=worst, places="; ".join(wrong),

@@ -16,6 +16,7 @@ from mdnum.audit.noise import NoiseFloor, along_a_line, displaced, measured, set
 from mdnum.audit.places import wrong_places
 from mdnum.audit.structures import group, modified, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
+from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
 #: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
 #: are said to differ.
@@ -77,8 +78,8 @@ class _Difference:
 
     def row(self) -> dict[str, Any]:
         return {
-            "the structure": self.same.what, "energy differs by (eV)": self.energy,
-            "allowed": self.allowed.energy, "forces differ by (eV/Å)": self.force,
+            "the structure": self.same.what, f"energy differs by ({ENERGY})": self.energy,
+            "allowed": self.allowed.energy, f"forces differ by ({FORCE})": self.force,
             "allowed for forces": self.allowed.force, "same": self.agrees,
         }  # fmt: skip
 
@@ -172,8 +173,9 @@ class InvarianceCheck(AuditCheck):
                 # of a narrow cell, the structure itself is answered for as it should be
                 "error" if large and code != "NARROW_CELL" else "warning",
                 *(variants if code == "PLACE_IN_LIST" else ()),
-                what=worst.same.what, energy=worst.energy, kT=kT, allowed=worst.allowed.energy,
-                force=worst.force, allowed_force=worst.allowed.force, differ=len(cases), slug=slug,
+                energy=Measured(worst.energy, "energy", worst.allowed.energy, judge.subject.kT),
+                force=Measured(worst.force, "energy/length", worst.allowed.force, force),
+                what=worst.same.what, kT=kT, differ=len(cases), slug=slug,
                 tried=sum(one.same.code == worst.same.code for one in differences),
                 tests=_SEPARATE.get(code, ()), **more if code == "PLACE_IN_LIST" else {},
             )  # fmt: skip
@@ -331,7 +333,7 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         axes = "the free axes" if atoms.pbc.any() else "x, y, z"
         for length in (7.3, -250.0):
             there = displaced(atoms, length * _outward(atoms, free))
-            yield same(f"all atoms moved by {length:g} Å along {axes}", there)
+            yield same(f"all atoms moved by {length:g} {LENGTH} along {axes}", there)
 
 
 def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -367,7 +369,7 @@ def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
             yield placed(f"at L along {'abc'[axis]}", cell[axis])
         yield placed("one ulp short of L", np.nextafter(corner, 0.0))
         for tiny in _TINY:
-            yield placed(f"at {-tiny:.0e} Å", np.where(atoms.pbc, -tiny, zero), extra=tiny)
+            yield placed(f"at {-tiny:.0e} {LENGTH}", np.where(atoms.pbc, -tiny, zero), extra=tiny)
         yield placed("at -0", np.where(atoms.pbc, -0.0, zero))
 
 
@@ -445,7 +447,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     places = 1.1 * places + 0.02 * nearest * rng.uniform(-1, 1, (4, 3))
     few = Atoms((4 * species)[:4], places, cell=[1.1 * edge] * 3, pbc=True)
     there, order = few.repeat(3), np.tile(np.arange(4), 27)
-    what = f"a cell of four atoms, {1.1 * edge:.3g} Å wide, repeated three times along each axis"
+    what = f"a cell of four atoms, {1.1 * edge:.3g} {LENGTH} wide, repeated three times along each axis"
     yield Same(what, "NARROW_CELL", there, order, copies=27, rounding=ulp(there, few), before=few)
 
 

@@ -10,6 +10,7 @@ from ase import Atoms
 from mdnum.audit.checks.invariance import InvarianceCheck, Same, ulp
 from mdnum.audit.noise import displaced
 from mdnum.audit.structures import FARTHEST, modified, nearest_distance
+from mdnum.units import LENGTH
 
 _SHORT = 1.3  # of the nearest distance: length of a free vector with which atoms would feel their own images
 
@@ -50,7 +51,7 @@ def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Itera
         return Same(what, "MIXED_PERIODICITY", there, order, copies, rounding=rounding, before=base)
 
     short = _SHORT * (nearest_distance(atoms) or 3.0)
-    yield same(f"free axes of {short:.3g} Å", _with(base, periodic, normals * short))
+    yield same(f"free axes of {short:.3g} {LENGTH}", _with(base, periodic, normals * short))
     yield same("free axes of length 0", _with(base, periodic, 0.0 * normals))
     leaning = base.cell.array[~periodic] + 1.7 * rows[0]
     yield same("free axes that lean", _with(base, periodic, leaning))

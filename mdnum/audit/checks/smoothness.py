@@ -14,6 +14,7 @@ from mdnum.audit.structures import FARTHEST
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.surroundings import Crowd, EnvironmentWalks, Event, crowd, walk_surroundings
 from mdnum.audit.thresholds import BESIDE, PairThreshold, PairWalk, PairWalks, find_thresholds, walk_pairs
+from mdnum.units import ENERGY, FORCE, LENGTH
 
 ORDERS = (
     "energy", "force", "curvature", "third derivative", "fourth derivative", "fifth derivative",
@@ -158,7 +159,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
         if not same:
             continue
         worst = max(same, key=lambda one: abs(one.jumps[order]))
-        rest = [f"{'-'.join(one.species)} {one.radius:.6g} Å" for one in same if one is not worst]
+        rest = [f"{'-'.join(one.species)} {one.radius:.6g} {LENGTH}" for one in same if one is not worst]
         more = f" and {len(rest) - 4} more" if len(rest) > 4 else ""
         size, severity = abs(worst.jumps[order]) / kT, "info"
         values: dict[str, Any] = {
@@ -208,7 +209,8 @@ def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
         for one in walk.thresholds:
             sides = [subject.energies(walk.pair.at(at)) for at in (one.inside, one.outside)]
             before, after = (np.nan if other is None else other - free for free, other in sides)
-            where = f"between {walk.pair.name} at {one.radius:.8g} Å, by {abs(after - before):.3g} eV"
+            at, by = f"{one.radius:.8g} {LENGTH}", f"{abs(after - before):.3g} {ENERGY}"
+            where = f"between {walk.pair.name} at {at}, by {by}"
             jumps.append((after - before, before, walk.pair.name, where))
     kT = subject.kT
     if wrong := [one for one in jumps if abs(one[0]) > _LARGE * (kT or 1.0)]:
@@ -305,13 +307,13 @@ def _tables(
 ) -> dict[str, list[dict[str, Any]]]:
     thresholds = [
         {
-            "pair": "-".join(one.species), "distance (Å)": place(one),
+            "pair": "-".join(one.species), f"distance ({LENGTH})": place(one),
             "what": "the end" if one.dies else "a change", "first to jump": ORDERS[one.order],
-            "energy (meV)": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
+            f"energy (m{ENERGY})": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
             "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
-            "force (eV/Å)": one.jumps[1] if one.order <= 1 else 0.0,
-            "curvature (eV/Å²)": one.jumps[2] if one.order <= 2 else 0.0,
-            "third derivative (eV/Å³)": one.third or None,
+            f"force ({FORCE})": one.jumps[1] if one.order <= 1 else 0.0,
+            f"curvature ({FORCE}²)": one.jumps[2] if one.order <= 2 else 0.0,
+            f"third derivative ({FORCE}³)": one.third or None,
             "last before": repr(one.inside), "first beyond": repr(one.outside),
         }
         for one in _all(walks)
@@ -319,29 +321,32 @@ def _tables(
     events = [
         {
             "moved": one.route,
-            "pair distance (Å)": f"{one.threshold.radius:.10g}" if one.threshold else "none fits",
+            f"pair distance ({LENGTH})": f"{one.threshold.radius:.10g}" if one.threshold else "none fits",
             "first to jump": _first_to_jump(one),
-            "energy (meV)": 1e3 * one.jump.energy if one.jump.order == 0 else 0.0,
+            f"energy (m{ENERGY})": 1e3 * one.jump.energy if one.jump.order == 0 else 0.0,
             "in kT": abs(one.jump.energy) / kT if one.jump.order == 0 else 0.0,
-            "largest force (eV/Å)": one.force if one.jump.order <= 1 else 0.0,
-            "curvature (eV/Å²)": one.jump.curvature if one.jump.order == 2 else None,
+            f"largest force ({FORCE})": one.force if one.jump.order <= 1 else 0.0,
+            f"curvature ({FORCE}²)": one.jump.curvature if one.jump.order == 2 else None,
         }
         for one in around.events
     ]
     steps = [
         {
-            "pair": "-".join(walk.pair.species), "from (Å)": walk.steps[0], "to (Å)": walk.steps[1],
-            "everywhere, above (eV/Å)": walk.steps[3], "over half of the way, above (eV/Å)": walk.steps[2],
+            "pair": "-".join(walk.pair.species),
+            f"from ({LENGTH})": walk.steps[0],
+            f"to ({LENGTH})": walk.steps[1],
+            f"everywhere, above ({FORCE})": walk.steps[3],
+            f"over half of the way, above ({FORCE})": walk.steps[2],
         }
         for walk in walks.walks
         if walk.steps
     ]  # fmt: skip
     crowded = [
         {
-            "element": one.species, "neighbors given": one.neighbors, "within (Å)": one.radius,
+            "element": one.species, "neighbors given": one.neighbors, f"within ({LENGTH})": one.radius,
             "nearest that are kept": one.kept, "order of atoms matters from": one.order.start,
-            "energy (meV)": 1e3 * max(one.energy, one.order.energy),
-            "force (eV/Å)": max(one.force, one.order.force),
+            f"energy (m{ENERGY})": 1e3 * max(one.energy, one.order.energy),
+            f"force ({FORCE})": max(one.force, one.order.force),
         }
         for one in crowds
     ]  # fmt: skip
@@ -368,11 +373,12 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
     marks = {
-        f"{'the interaction ends' if one.dies else 'the law changes'} at {one.radius:.6g} Å": one.radius
+        f"the {'interaction ends' if one.dies else 'law changes'} at {one.radius:.6g} {LENGTH}": one.radius
         for one in walk.thresholds[-4:]
     }
     title, lines = f"Two particles: {walk.pair.name}", {"energy": walk.energy[first:].tolist()}
-    return Chart(title, "distance (Å)", "energy (eV)", walk.distance[first:].tolist(), lines, marks)
+    labels = title, f"distance ({LENGTH})", f"energy ({ENERGY})"
+    return Chart(*labels, walk.distance[first:].tolist(), lines, marks)
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
@@ -383,9 +389,9 @@ def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubje
         above.append(float(np.nextafter(above[-1], np.inf)))
     row = threshold.order
     values = walk.pair.curve(subject).many([*below[::-1], *above])[row]
-    what, unit = (("energy", "eV"), ("force", "eV/Å"))[row]
+    what, unit = (("energy", ENERGY), ("force", FORCE))[row]
     return Chart(
-        f"{walk.pair.name} at {threshold.outside!r} Å, distance by representable distance",
+        f"{walk.pair.name} at {threshold.outside!r} {LENGTH}, distance by representable distance",
         "representable distances from the jump",
         f"{what} ({unit})",
         [*np.arange(-_ULPS, 0.0), *np.arange(0.0, _ULPS)],

@@ -15,6 +15,7 @@ from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
 from mdnum.audit.structures import modified, pairs
 from mdnum.audit.subject import Answered, CalculatorSubject, differences, largest, not_repeatable, rms
 from mdnum.audit.thresholds import find_thresholds
+from mdnum.units import ENERGY, FORCE, Measured
 
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
 #: and by new objects.
@@ -73,6 +74,8 @@ class StateCheck(AuditCheck):
         values: dict[str, Any] = {
             "rows": len(rows), "stale": len(stale), "sequences": len({row.sequence for row in rows}),
             "answers": chance["answers"], "energy": max(finite, default=chance.get("energy", 0.0)),
+            "least": Measured(min(row.allowed for row in rows), "energy") if rows else None,
+            "most": Measured(max(row.allowed for row in rows), "energy") if rows else None,
         }  # fmt: skip
         numbers = {
             "structures": len(rows), "remembered": len(stale), "bit_identical": repeats["bit-identical"],
@@ -117,7 +120,7 @@ class StateCheck(AuditCheck):
             self.structures |= {"stale-before": worst.before, "stale-after": worst.atoms}
             yield finding(
                 "STALE_STATE", "error", "refused" if worst.refused else None, step=worst.what,
-                energy=worst.energy, force=worst.force, allowed=worst.allowed, why=worst.why,
+                energy=Measured(worst.energy, "energy", worst.allowed), force=worst.force, why=worst.why,
                 questions=len(stale), sequences=", ".join(sorted({row.sequence for row in stale})),
                 tests=("repeat", "fresh"),
             )  # fmt: skip
@@ -159,8 +162,9 @@ class Comparison:
 
     def row(self) -> dict[str, Any]:
         return {
-            "sequence": self.sequence, "what happened": self.what, "energy differs by (eV)": self.energy,
-            "allowed": self.allowed, "forces differ by (eV/Å)": self.force, "same": not self.remembers,
+            "sequence": self.sequence, "what happened": self.what,
+            f"energy differs by ({ENERGY})": self.energy,
+            "allowed": self.allowed, f"forces differ by ({FORCE})": self.force, "same": not self.remembers,
         }  # fmt: skip
 
 
