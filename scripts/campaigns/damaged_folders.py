@@ -6,12 +6,13 @@ nothing that is read; none goes unnoticed (docs/hostile-input.md). It takes minu
     python scripts/campaigns/damaged_folders.py                      300 damages, some minutes
     python scripts/campaigns/damaged_folders.py --damages 30 --kinds finished,killed
 
-A folder of each verb is made once, tiny. Every damage is done to a fresh copy, a quarter of them with its
-manifest.json removed too, as in a folder of an older mdnum. Then one command reads the copy.
+A folder of each verb is made once, tiny. Every damage is done to a fresh copy; for a quarter of them the
+manifest is given the digest of the damaged file, as somebody would who wants it to be read. Then one command
+reads the copy.
 
-How to read it. Every damage has to end in one of the first three columns: refused in one line that names the
-fault; read, with a line that says so; read with the same result as the whole folder's, to the last digit. A
-traceback, other numbers without a word, or anything changed outside of the folder is a mistake of mdnum, and
+How to read it. Every damage has to end in one of the first four columns: refused in one line that names the
+fault; read, with a line that says so; read with the same result as the whole folder's, to the last digit; or
+with another result where the manifest has the digest of the damaged file. A traceback, other numbers without a word, or anything changed outside of the folder is a mistake of mdnum, and
 the script ends with 1. What is drawn depends on the seed alone.
 """
 
@@ -40,11 +41,13 @@ from _output import parser, say, start, table
 
 import mdnum
 from mdnum.cli import main as command
+from mdnum.errors import FolderError
 from mdnum.report import drawing
 from mdnum.store import RunFolder
+from mdnum.store import files as manifest
 
-OUTCOMES = ("one line", "said, rest read", "same result", "SILENT", "TRACEBACK", "OUTSIDE")
-MISTAKES = OUTCOMES[3:]
+OUTCOMES = ("one line", "said, rest read", "same result", "another result", "SILENT", "TRACEBACK", "OUTSIDE")
+MISTAKES = OUTCOMES[4:]
 SYSTEM = "argon/crystal-108"
 STEPS = 40
 #: What a person's clock has a part in.
@@ -413,7 +416,8 @@ class Campaign:
         def harm(folder: Path) -> None:
             do(folder / file, self.other(kind) / file, np.random.default_rng(seed))
             if not listed:
-                (folder / "manifest.json").unlink(missing_ok=True)
+                with contextlib.suppress(FolderError):
+                    manifest.update(folder, {str(file): [manifest.digest(folder / file)]})
 
         key = (kind, *words)
         if key not in self.expected:
@@ -432,6 +436,8 @@ class Campaign:
             outcome = "one line" if len(lines) == 1 else "TRACEBACK"
         elif made == self.expected[key]:
             outcome = "same result"
+        elif not listed:
+            outcome = "another result"
         elif any(file.name in line or "manifest.json" in line for line in lines):
             outcome = "said, rest read"
         else:
