@@ -12,8 +12,9 @@ reads the copy.
 
 How to read it. Every damage has to end in one of the first four columns: refused in one line that names the
 fault; read, with a line that says so; read with the same result as the whole folder's, to the last digit; or
-with another result where the manifest has the digest of the damaged file. A traceback, other numbers without a word, or anything changed outside of the folder is a mistake of mdnum, and
-the script ends with 1. What is drawn depends on the seed alone.
+with another result where the manifest has the digest of the damaged file. A traceback, other numbers without
+a word, or anything changed outside of the folder is a mistake of mdnum, and the script ends with 1. What is
+drawn depends on the seed alone.
 """
 
 from __future__ import annotations

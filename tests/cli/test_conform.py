@@ -30,6 +30,7 @@ from mdnum.references.conformance.suite import examine
 from mdnum.report.finding import Finding, Verdict
 from mdnum.store import RunFolder
 from mdnum.verbs.conform import judge, summary_of
+from mdnum.verbs.frame import layout
 
 _MINE = """
 import numpy as np
@@ -648,6 +649,7 @@ def test_a_script_is_run_before_it_is_named(
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"word": 1, "tested": 2, "options": 3}', "\0{"])
 def test_answers_that_cannot_be_read_are_one_line(text: str, tmp_path, capsys):
+    RunFolder.create(tmp_path, layout("conform")).close()
     (tmp_path / "answers.json").write_text(text)
     assert call("conform", "--resume", str(tmp_path)) == 2
     line = capsys.readouterr().err
