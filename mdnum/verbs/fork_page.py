@@ -24,7 +24,7 @@ from mdnum.report.section import (
     table_of,
 )  # fmt: skip
 from mdnum.report.words import count, listed, many, number, pair_name, plain
-from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
+from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, decided, sides, subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -125,11 +125,10 @@ def _decision(view: View) -> Iterator[Any]:
     d = s["decision"]
     if d is None:
         return
-    name = "at_start" if d["run"] == "start" else d["channel"]
     values = {**d, **sides(d), "counted": s.get("counted"), "subject": subject(s)}
     when = f"{count(d['step'])}, {plain(d['step'] * s['timestep'], 6)} {view.units.time}"
     also = f"; {many(d['also'], 'more decision')} at the same step" if d["also"] else ""
-    rows = [("Decision", TEXTS(f"decided_{name}", **values)), ("Step", when + also)]
+    rows = [("Decision", TEXTS(decided(d), **values)), ("Step", when + also)]
     slope = 1.0
     if d["channel"] == "pair":
         cutoffs = d["cutoffs"]

@@ -99,11 +99,16 @@ def _evidence(view: View) -> Iterator[str]:
         return
     values = {**decision, "subject": subject(summary), "unit": view.units.length}
     values |= {"runs": " and ".join(decision["ambiguous_in"])}
-    name = "at_start" if decision["run"] == "start" else decision["channel"]
-    yield TEXTS(f"decided_{name}", **values, **sides(decision), counted=summary.get("counted"))
+    yield TEXTS(decided(decision), **values, **sides(decision), counted=summary.get("counted"))
     yield TEXTS("rounding" if decision["ambiguous_in"] else "no_rounding", **values)
     if decision.get("protected") is not None:
         yield TEXTS("separated", **values)
+
+
+def decided(decision: Mapping[str, Any]) -> str:
+    """The name of the sentence on a decision that differs."""
+    name = "at_start" if decision["run"] == "start" else decision["channel"]
+    return f"decided_{name}{'_term' * bool(decision.get('terms'))}"
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:

@@ -208,7 +208,7 @@ def test_folders_of_objects_are_replayed(liquid, tmp_path):
     )  # fmt: skip
     assert made.summary["reproduced"] and made.summary["stored"]["steps"] == 60
     decision = made.summary["decision"]
-    assert decision["terms"] in RADII and f"in the term {decision['terms']}" in str(made.verdict)
+    assert decision["terms"] in RADII and f"of the term {decision['terms']}" in str(made.verdict)
 
 
 def test_folders_of_shared_and_separate_decisions(tmp_path):
