@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import numpy as np
-from jaxtyping import Float
 from pydantic import TypeAdapter, ValidationError
 
 from mdnum.errors import InputError
@@ -33,11 +31,6 @@ if TYPE_CHECKING:
 #: Of a description, what says nothing about what is computed.
 _ASKED = ("name", "about", "dynamics.steps", "record.save_every")
 _CHANGE_OBJECTS = "Change the objects: mdnum.changed(simulation, {...})"
-
-
-def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, "types"]:
-    """The upper triangle of a symmetric table, row by row: one entry per pair type."""
-    return np.asarray(table, np.float64)[np.triu_indices(len(table))]
 
 
 def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) -> schema.Interaction:
@@ -90,12 +83,8 @@ def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tup
     if isinstance(table, schema.PythonTable):
         potential = PairFunction(code.function(table.function, folder), **table.parameters)
     else:
-        constants = pairs.pair_constants(tables, species).items()
-        potential = POTENTIALS[table.kind](
-            **{name: jax.device_put(_per_type(row)) for name, row in constants}
-        )
-    ends = (row if row is None else _per_type(row) for row in pairs.cutoff_radii(tables, species))
-    return cut(potential, cutoff.kind, species, *ends, weights=own)
+        potential = POTENTIALS[table.kind](**jax.device_put(pairs.pair_constants(tables, species)))
+    return cut(potential, cutoff.kind, species, *pairs.cutoff_radii(tables, species), weights=own)
 
 
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:

@@ -1,14 +1,12 @@
-"""Constants and cutoff radii of every pair of species, as square arrays; and the longest interaction.
+"""Constants and cutoff radii of every pair of species, by pair type; and the longest interaction.
 
-A system file gives one set of constants, or one per pair of species; what computes wants arrays indexed by
-two species numbers. No mixing rule is applied: a structure with several species must list every pair, so
-that a forgotten cross term is an error and not a guess.
+A system file gives one set of constants, or one per pair of species. No mixing rule is applied: a structure
+with several species must list every pair, so that a forgotten cross term is an error and not a guess.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +15,9 @@ from jaxtyping import Float64
 
 from mdnum.errors import InputError
 from mdnum.systems import schema
-from mdnum.systems.schema import Interaction, SystemSpec, pair_key
+from mdnum.systems.schema import Interaction, SystemSpec, pair_key, pair_names
 
-Table = Float64[np.ndarray, "species species"]
+Table = Float64[np.ndarray, "types"]
 
 
 def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> dict[str, Table]:
@@ -27,11 +25,11 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
 
     Args:
         spec: a system with a pair potential.
-        species: chemical symbols in the order of the rows.
+        species: chemical symbols, sorted.
 
     Returns:
-        arrays (species, species), symmetric, in the file's units, by name: sigma and epsilon; depth, alpha
-        and r0; or sigma, epsilon and alpha.
+        arrays in the order of `pair_names`, in the file's units, by name: sigma and epsilon; depth, alpha and
+        r0; or sigma, epsilon and alpha.
 
     Raises:
         InputError: a pair of species has no constants.
@@ -42,18 +40,10 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
     if isinstance(potential, schema.PythonTable):
         # its function says what it needs, once it may be executed
         return {}
+    whole = len(species) == 1 and getattr(potential, potential.constants[0], None) is not None
     given = {pair_key(*name.split("-")): row for name, row in (potential.pairs or {}).items()}
-    tables = {name: np.zeros((len(species), len(species))) for name in potential.constants}
-    missing = []
-    for a, b in combinations_with_replacement(range(len(species)), 2):
-        row = given.get(pair_key(species[a], species[b]))
-        if row is None and not (
-            len(species) == 1 and getattr(potential, potential.constants[0], None) is not None
-        ):
-            missing.append(f"{species[a]}-{species[b]}")
-            continue
-        for name, table in tables.items():
-            table[a, b] = table[b, a] = getattr(potential if row is None else row, name)
+    rows = {name: given.get(name, potential if whole else None) for name in pair_names(species)}
+    missing = [name for name, row in rows.items() if row is None]
     if missing:
         known = ", ".join(potential.pairs) if potential.pairs else "one set for all"
         raise InputError(
@@ -61,15 +51,18 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
             f"{', '.join(missing)} (it has {known})",
             remedy=f"Add [potential.pairs.{missing[0]}] and the like, or correct the structure's species",
         )
-    return tables
+    return {
+        name: np.array([getattr(row, name) for row in rows.values()], np.float64)
+        for name in potential.constants
+    }
 
 
 def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tuple[Table, Table | None]:
     """Cutoff radius and onset for every pair of species.
 
     Returns:
-        radius and onset, arrays (species, species) in the file's units; onset is None for a cutoff without
-        one. Pairs with a radius of their own keep the ratio onset / radius.
+        radius and onset, as `pair_constants` has them; onset is None for a cutoff without one. Pairs with a
+        radius of their own keep the ratio onset / radius.
 
     Raises:
         InputError: a pair of species has no radius.
@@ -77,20 +70,17 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
     cutoff = spec.cutoff
     if cutoff is None:
         raise TypeError("a potential without a [cutoff]")
+    names = pair_names(species)
     given = {pair_key(*name.split("-")): radius for name, radius in (cutoff.pairs or {}).items()}
-    shape = (len(species), len(species))
     if cutoff.in_sigma is not None:
         radius = cutoff.in_sigma * pair_constants(spec, species)["sigma"]
     else:
-        radius = np.full(shape, np.nan if cutoff.radius is None else cutoff.radius)
-    for a, b in np.ndindex(shape):
-        radius[a, b] = given.get(pair_key(species[a], species[b]), radius[a, b])
+        radius = np.full(len(names), np.nan if cutoff.radius is None else cutoff.radius)
+    radius = np.array([given.get(name, own) for name, own in zip(names, radius.tolist(), strict=True)])
     if np.isnan(radius).any():
-        a, b = (int(k) for k in np.argwhere(np.isnan(radius))[0])
-        raise InputError(
-            f"[cutoff.pairs] has no radius for {species[a]}-{species[b]} (it has {', '.join(given)})",
-            remedy="Add it, or give a radius for every other pair as cutoff.radius",
-        )
+        message = f"no radius for {names[np.isnan(radius).argmax()]} (it has {', '.join(given)})"
+        remedy = "Add it, or give a radius for every other pair as cutoff.radius"
+        raise InputError(f"[cutoff.pairs] has {message}", remedy=remedy)
     if not cutoff.switches:
         return radius, None
     if cutoff.onset is None:

@@ -84,8 +84,8 @@ def test_species_and_tables_of_a_mixture():
     assert np.bincount(species).tolist() == [800, 200]
     assert np.array_equal(species == 1, system.atoms.symbols == "P")
     tables = pairs.pair_constants(system.spec, system.species)
-    assert tables["sigma"].tolist() == [[1.0, 0.8], [0.8, 0.88]]
-    assert tables["epsilon"].tolist() == [[1.0, 1.5], [1.5, 0.5]]
+    assert tables["sigma"].tolist() == [1.0, 0.8, 0.88]
+    assert tables["epsilon"].tolist() == [1.0, 1.5, 0.5]
     radius, onset = pairs.cutoff_radii(system.spec, system.species)
     assert np.allclose(radius, 2.5 * tables["sigma"], rtol=1e-15)
     assert onset is None and system.r_cut == 2.5
@@ -99,12 +99,12 @@ def test_onsets_are_kept_to_the_bit_and_those_of_single_pairs_scaled():
         return system, radius, onset
 
     _, radius, onset = tables(MIXTURE, kind="switched", onset="2.0", **{"pairs.P-Ni": "1.9"})
-    assert np.allclose(radius, [[2.5, 1.9], [1.9, 2.2]], rtol=1e-15)
+    assert np.allclose(radius, [2.5, 1.9, 2.2], rtol=1e-15)
     assert np.allclose(onset, 0.8 * radius, rtol=1e-15)
     _, radius, onset = tables(ARGON, kind="quintic", onset="7.1")
-    assert (onset.tolist(), radius.tolist()) == ([[7.1]], [[8.5125]])
+    assert (onset.tolist(), radius.tolist()) == ([7.1], [8.5125])
     system, _, onset = tables(ARGON, kind="switched")
-    assert onset.tolist() == [[0.9 * 8.5125]] and "onset = " in system.to_toml()
+    assert onset.tolist() == [0.9 * 8.5125] and "onset = " in system.to_toml()
 
 
 def test_a_pair_without_a_radius_is_named():

@@ -171,6 +171,7 @@ def frames_of(folder: RunFolder) -> list[np.ndarray]:
 
 def radii(simulation) -> Any:
     """The cutoff as a function of two atoms' indices, from the system file's own tables."""
+    from mdnum.md.potentials import pair_type
     from mdnum.systems import pairs
 
     spec = simulation.origin.system.spec
@@ -180,7 +181,7 @@ def radii(simulation) -> Any:
     species = simulation.origin.system.species
     table, _ = pairs.cutoff_radii(spec, species)
     index = np.array([species.index(symbol) for symbol in symbols])
-    return lambda i, j: table[index[i], index[j]]
+    return lambda i, j: table[pair_type(index[i], index[j], len(species))]
 
 
 def assert_ledger_is_complete(result: RunResult, folder: RunFolder) -> int:
