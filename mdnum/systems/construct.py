@@ -31,8 +31,6 @@ from mdnum.units import Units
 if TYPE_CHECKING:
     from ase import Atoms
 
-DOUBLE_ONLY = "many-body potentials are evaluated in float64 only"
-
 
 @dataclass(frozen=True)
 class Cut:
@@ -330,8 +328,6 @@ def assembled(
     symbols, species = species_of(atoms)
     pairwise = isinstance(model, CutPotential | Channels)
     if not pairwise:
-        if policy != PrecisionPolicy():
-            raise InputError(DOUBLE_ONLY, where="precision", remedy="Remove the [precision] table")
         # its energy function takes lattice vectors off along these axes
         model = replace(model, pbc=cell.pbc)
     radii = tuple(float(r) for r in np.asarray(model.r_cut)) if pairwise else (float(model.r_cut),)
@@ -390,24 +386,6 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         simulation.policy, simulation.reduction, simulation.integrator,
         replace(simulation.draw, drawn=not atoms.has("momenta")), simulation.steps, simulation.save_every,
     )  # fmt: skip
-
-
-def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:
-    """The system with another potential: any energy over a neighbor list, such as one of jax-md's.
-
-    Args:
-        simulation: the system as objects; in float64.
-        potential: an `EnergyFunction`, or another `ManyBody`.
-
-    Raises:
-        InputError: its radius and the skin do not fit the box, or the system is not in float64 throughout.
-    """
-    if simulation.policy != PrecisionPolicy():
-        raise InputError(DOUBLE_ONLY, remedy="Remove the [precision] table")
-    radius = float(potential.r_cut)  # type: ignore[attr-defined]
-    check_radius(simulation.cell, radius, simulation.rule.skin)
-    decider = PairDecider((radius,), "r <", "float64", simulation.decider.reach)
-    return replace(simulation, model=potential, decider=decider)
 
 
 def in_whole_numbers(simulation: Simulation) -> Simulation:

@@ -238,8 +238,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
         constant = key not in leaves_by_path(model)
         model = with_quantities(model, {key: float(new) if constant else jnp.asarray(new)})
         # its radius may follow
-        decider = replace(simulation.decider, r_cut=(float(model.r_cut),))
-        return replace(simulation, model=model, decider=decider)
+        return simulation.with_model(model)
     if table in ("potential", "cutoff", "terms"):
         leaf = jnp.asarray(new.reshape(leaf_of(model, name).shape))
         if shared_radius(model, name):
@@ -255,7 +254,6 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
             if term.cutoff.switches and np.any(onset >= radius):
                 seen = f"an onset of {float(np.max(onset))!r} is not below"
                 raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
-        check_radius(simulation.cell, float(np.max(model.r_cut)), simulation.rule.skin)
         return simulation.with_model(model)
     if table == "dynamics":
         if key in integrator.numbers():

@@ -105,6 +105,9 @@ class Simulation:
 
     def __post_init__(self):
         short = self.policy.state == LATTICE or self.policy.force not in WIDE
+        if not self.pairwise and self.policy != PrecisionPolicy():
+            message = "many-body potentials are evaluated in float64 only"
+            raise InputError(message, where="precision", remedy="Remove the [precision] table")
         if short and self.pairwise and "" not in self.model.terms:
             seen = f"not with {self.policy.state} state and {self.policy.force} forces"
             remedy = "Leave out state and force, or write the sum as one potential"
@@ -317,10 +320,17 @@ class Simulation:
         # not jnp.asarray, which compiles a program for every shape
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
 
-    def with_model(self, model: CutPotential | Channels) -> Simulation:
-        """The same system with other pair terms, and decisions at their radii."""
-        decider = replace(self.decider, r_cut=tuple(np.asarray(model.r_cut).tolist()))
-        return replace(self, model=model, decider=decider)
+    def with_model(self, model: Any) -> Simulation:
+        """The same system with other pair terms or a many-body potential, and decisions at their radii.
+
+        Raises:
+            InputError: the longest radius and the skin do not fit the box, or a many-body potential is not in
+                float64 throughout.
+        """
+        radii = tuple(np.atleast_1d(np.asarray(model.r_cut, np.float64)).tolist())
+        check_radius(self.cell, max(radii), self.rule.skin)
+        compare = self.decider.compare if isinstance(model, CutPotential | Channels) else "r <"
+        return replace(self, model=model, decider=replace(self.decider, r_cut=radii, compare=compare))
 
     @property
     def apart(self) -> Simulation:

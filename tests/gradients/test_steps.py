@@ -26,7 +26,6 @@ from mdnum.md.jaxmd import neighbor_vectors
 from mdnum.md.manybody import EnergyFunction
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
-from mdnum.systems.construct import with_potential
 
 SCALARS = ("timestep", "temperature", "scale")
 
@@ -200,7 +199,7 @@ def test_any_energy_has_the_derivatives_of_the_closed_forms_and_tangents_that_ag
     """The same energy as a function instead of the package's own pair potential."""
     constants = {"size": jnp.asarray(1.0), "depths": jnp.asarray([1.0])}
     assert float(switched.simulation.model.r_cut[0]) == RADIUS
-    function = with_potential(switched.simulation, EnergyFunction(constants, lennard_jones, RADIUS))
+    function = switched.simulation.with_model(EnergyFunction(constants, lennard_jones, RADIUS))
     of_function = replace(switched, simulation=function)
     words, shared = ("size", "potential.parameters.depths"), ("timestep", "temperature", "scale", "x0", "v0")
     ours = Symmetric()(of_function, (*words, *shared))
