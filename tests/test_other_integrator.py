@@ -190,15 +190,15 @@ def test_a_run_that_was_killed_goes_on_with_its_state(site, tmp_path):
 
 
 def test_it_is_forked_with_a_counterfactual(site, tmp_path):
-    """A's decisions, handed to A's own arithmetic, change no bit; single precision diverges."""
+    """A's decisions, imposed on A's own arithmetic, change no bit; single precision diverges."""
     system = load(write_system(tmp_path / "system", liquid()), CHAIN)
     made = mdnum.fork(system, "precision", steps=400, repeats=0, report=False, out=tmp_path / "fork")
     assert made.summary["first_bit"] is not None
     assert "nose-hoover is another" in made.summary["lyapunov_reason"]
-    from mdnum.rollout.lockstep import lockstep
+    from mdnum.rollout.program import MdProgram
 
-    simulation = build(system)
-    for rows in lockstep(simulation, simulation, 100, handed=True, back=False):
+    program = MdProgram(build(system))
+    for rows in program.lockstep(program, 100, forward=True, back=False, guard=None):
         assert not np.any(rows.separation["B"]) and not np.any(rows.separation["B|A"])
 
 

@@ -7,7 +7,7 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -15,156 +15,67 @@ from jaxtyping import Float, Int
 
 from mdnum.program import PairRows
 from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, ReferenceFrame, differ
-from mdnum.rollout.engine import Segment, Start
+from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.flips import AmbiguousPairs
-from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
+from mdnum.rollout.tracks import Rows, Track
 from mdnum.systems.simulation import Simulation
 
 
-def lockstep(
-    a: Simulation,
-    b: Simulation,
-    last: int,
-    *,
-    start_a: Start | None = None,
-    start_b: Start | None = None,
-    frame: ReferenceFrame | None = None,
-    handed: bool = True,
-    back: bool = False,
-    guard: float | None = None,
-) -> Iterator[PairRows]:
-    """Advance both runs, and what is compared with them, a stretch of A's steps at a time.
+def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
+    """Advance both runs, and what is compared with them, a stretch of the leader's steps at a time.
 
     Args:
-        a, b: the two programs.
-        last: last step.
-        start_a, start_b: where they begin; default their systems' own starts.
-        frame: how B's atoms and axes are A's.
-        handed: whether to run B's arithmetic under A's decisions, "B|A".
-        back: whether to run A's arithmetic under B's decisions too, "A|B".
-        guard: length; a counterfactual ends when a decision it is told is further than this from its
-            cutoff: it would no longer be a decision that rounding could have changed.
-
-    Raises:
-        InputError: a counterfactual of many-body potentials was asked for.
+        leader, follower: the runs, A and B, each with the counterfactual under its decisions as listener.
+        imposed: "B|A", B's arithmetic under A's decisions, and "A|B", the other way around, where wanted.
     """
-    frame = frame or ReferenceFrame.same(a.atoms)
-    forward = Counterfactual(Handed(b, a, start_b, frame), guard) if handed else None
-    backward = Counterfactual(Handed(a, b, start_a, frame.inverse), guard) if back else None
-    leader = Track(a, last, start_a, listener=forward)
-    follower = Track(b, last, start_b, frame, listener=backward)
-    cell_a = Apart(a.cell)
+    tracks = {"A": leader, "B": follower}
+    a, cell = leader.simulation, Apart(leader.simulation.cell)
     crossing: CrossRecorder | None = None
     while leader.segment() is not None:
         end = leader.ready
-        rows_a, flips_a = leader.until(end)
-        rows_b, flips_b = follower.until(end)
-        assert rows_a is not None
+        (clock, flips_a), (rows_b, flips_b) = (track.until(end) for track in tracks.values())
+        assert clock is not None
+        rows = {"A": clock, "B": rows_b, **{name: run.until(end) for name, run in imposed.items()}}
         opening: list[CrossFlip] = []
         if crossing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
             crossing = CrossRecorder(leader.first_pairs, follower.first_pairs, a.atoms)
             opening = crossing.opening()
-        cross, flips = crossing.take(rows_a.first, len(rows_a), flips_a, flips_b)
-        separation = {"B": apart(cell_a, rows_a, rows_b)}
-        energy = {"A": rows_a.energy, "B": _energy(rows_a, rows_b)}
-        failed = {"A": leader.failed, "B": follower.failed}
-        overridden: dict[str, np.ndarray] = {}
-        furthest: dict[str, np.ndarray] = {}
-        own: dict[str, Rows | None] = {}
-        for name, told in (("B|A", forward), ("A|B", backward)):
-            if told is None:
-                continue
-            rows, note = told.until(end)
-            own[name] = rows
-            energy[name] = _energy(rows_a, rows)
-            overridden[name], furthest[name] = (_padded(x, rows_a) for x in (note.count, note.furthest))
-            failed[name] = told.failed
+        cross, flips = crossing.take(clock.first, len(clock), flips_a, flips_b)
+        separation = {"B": apart(cell, clock, rows_b)}
         # in the labels and axes of the run whose decisions it acts on; distances do not mind
-        if forward is not None:
-            rows = own["B|A"]
-            separation["B|A"] = apart(cell_a, rows_a, rows)
-            separation["B|A from B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
-        if backward is not None:
-            rows = None if own["A|B"] is None else _in_frame(own["A|B"], frame)
-            separation["A|B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
-            separation["A|B from A"] = apart(cell_a, rows_a, rows)
-        nearest = {"A": _nearest(a, rows_a, rows_a), "B": _nearest(b, rows_b, rows_a)}
-        bound = {"A": _bound(a, rows_a, ReferenceFrame.same(a.atoms)), "B": _bound(b, rows_b, frame)}
-        doubts = {"A": leader.doubts(end), "B": follower.doubts(end)}
-        ambiguous = {
-            name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
-        }
+        if "B|A" in rows:
+            separation["B|A"] = apart(cell, clock, rows["B|A"])
+            separation["B|A from B"] = _padded(apart(cell, rows_b, rows["B|A"]), clock)
+        if "A|B" in rows:
+            under_b = None if rows["A|B"] is None else _in_frame(rows["A|B"], follower.frame)
+            separation["A|B"] = _padded(apart(cell, rows_b, under_b), clock)
+            separation["A|B from A"] = apart(cell, clock, under_b)
+        nearest = {name: _nearest(track.simulation, rows[name], clock) for name, track in tracks.items()}
+        doubts = {name: track.doubts(end) for name, track in tracks.items()}
         yield PairRows(
-            rows_a.first,
+            clock.first,
             separation,
-            _bits_differ(rows_a, rows_b),
-            energy,
+            _bits_differ(clock, rows_b),
+            {
+                name: clock.energy if name == "A" else _column(one, "energy", clock)
+                for name, one in rows.items()
+            },
             cross,
             [*opening, *flips] if opening else flips,
-            overridden,
-            furthest,
+            {name: _column(rows[name], "overridden", clock) for name in imposed},
+            {name: _column(rows[name], "furthest", clock) for name in imposed},
             nearest,
-            {name: _padded(values, rows_a) for name, values in bound.items()},
-            ambiguous,
+            {name: _padded(_bound(track, rows[name]), clock) for name, track in tracks.items()},
+            {
+                name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubt, clock))
+                for name, doubt in doubts.items()
+            },
             doubts,
-            failed,
+            {name: run.failed for name, run in (tracks | dict(imposed)).items()},
         )
         if follower.failed or leader.failed:
             return
-
-
-class Counterfactual:
-    """A handed run that listens to its leader and keeps what it did until it is asked for.
-
-    Args:
-        run: the handed run.
-        guard: length; it ends when a decision that it is told is further than this from its cutoff.
-    """
-
-    def __init__(self, run: Handed, guard: float | None):
-        self._run = run
-        self._guard = guard
-        self._rows: list[Rows] = []
-        self._notes: list[Overridden] = []
-        self._over = False
-
-    @property
-    def failed(self) -> str:
-        """ "blow-up" or "runaway" where it ended that way."""
-        return self._run.failed
-
-    def __call__(self, segment: Segment) -> None:
-        """Act on the decisions of a stretch of the leader's run."""
-        if self._over:
-            return
-        rows, note = self._run.follow(segment)
-        beyond = note.furthest > self._guard if self._guard is not None else np.zeros(len(rows), bool)
-        if beyond.any() or self._run.failed:
-            self._over = True
-            keep = int(beyond.argmax()) if beyond.any() else len(rows)
-            rows, _ = rows.cut(keep)
-            note = Overridden(note.count[:keep], note.furthest[:keep])
-        self._rows.append(rows)
-        self._notes.append(note)
-
-    def until(self, last: int) -> tuple[Rows | None, Overridden]:
-        """The steps up to one that were not yet asked for; none after it was ended."""
-        taken, notes = [], []
-        while self._rows and self._rows[0].first <= last:
-            rows, note = self._rows.pop(0), self._notes.pop(0)
-            count = min(len(rows), last - rows.first + 1)
-            if count < len(rows):
-                rows, rest = rows.cut(count)
-                self._rows.insert(0, rest)
-                self._notes.insert(0, Overridden(note.count[count:], note.furthest[count:]))
-                note = Overridden(note.count[:count], note.furthest[:count])
-            if len(rows):
-                taken.append(rows)
-                notes.append(note)
-        if not taken:
-            return None, Overridden(np.zeros(0, np.int64), np.zeros(0))
-        return joined(taken), Overridden.joined(notes)
 
 
 def _in_frame(rows: Rows, frame: ReferenceFrame) -> Rows:
@@ -192,8 +103,8 @@ def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
     return out
 
 
-def _energy(a: Rows, other: Rows | None) -> Float[np.ndarray, "rows"]:
-    return np.full(len(a), np.nan) if other is None else _padded(other.energy, a)
+def _column(rows: Rows | None, name: str, clock: Rows) -> Float[np.ndarray, "rows"]:
+    return _padded(np.zeros(0) if rows is None else getattr(rows, name), clock)
 
 
 def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
@@ -215,12 +126,13 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
     return _padded(margin, clock)
 
 
-def _bound(run: Simulation, rows: Rows | None, frame: ReferenceFrame) -> Float[np.ndarray, "rows"]:
+def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
     """The largest rounding bound of any pair type at each step of a run as a length."""
     if rows is None:
         return np.zeros(0)
-    slope = 2.0 * np.array(run.decider.r_cut) if run.decider.space == "r2" else 1.0
-    return (run.decider.bounds_at(frame.inverse.positions(rows.x)) / slope).max(axis=1)
+    decider = track.simulation.decider
+    slope = 2.0 * np.array(decider.r_cut) if decider.space == "r2" else 1.0
+    return (decider.bounds_at(track.frame.inverse.positions(rows.x)) / slope).max(axis=1)
 
 
 def _padded(values: np.ndarray, rows: Rows) -> np.ndarray:

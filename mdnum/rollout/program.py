@@ -15,10 +15,11 @@ from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 from mdnum.rollout.compared import Apart, CrossFlip, ReferenceFrame
+from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
-from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
-from mdnum.rollout.tracks import Handed, Track
+from mdnum.rollout.lockstep import apart, lockstep
+from mdnum.rollout.tracks import Track
 from mdnum.systems import parameters
 from mdnum.systems.simulation import Simulation
 
@@ -98,17 +99,14 @@ class MdProgram:
         self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
         """Both runs, and counterfactuals, a stretch at a time (see `Program.lockstep`)."""
-        return lockstep(
-            self.simulation,
-            other.simulation,
-            last,
-            start_a=self.begin,
-            start_b=other.begin,
-            frame=other.frame,
-            handed=forward,
-            back=back,
-            guard=guard,
-        )
+        a, b = self.simulation, other.simulation
+        frame, imposed = other.frame or ReferenceFrame.same(a.atoms), {}
+        if forward:
+            imposed["B|A"] = Counterfactual(b, a, other.begin, frame, guard)
+        if back:
+            imposed["A|B"] = Counterfactual(a, b, self.begin, frame.inverse, guard)
+        leader = Track(a, last, self.begin, listener=imposed.get("B|A"))
+        return lockstep(leader, Track(b, last, other.begin, frame, listener=imposed.get("A|B")), imposed)
 
     def repeats(
         self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
@@ -116,7 +114,7 @@ class MdProgram:
         """Separations of perturbed runs, all beside one run of this program (see `Program.repeats`)."""
         a = self.simulation
         frame = others[0].frame or ReferenceFrame.same(a.atoms)
-        imposed = [Counterfactual(Handed(b.simulation, a, b.begin, frame), guard) for b in others]
+        imposed = [Counterfactual(b.simulation, a, b.begin, frame, guard) for b in others]
 
         def listen(segment: Segment) -> None:
             for run in imposed:
@@ -131,7 +129,7 @@ class MdProgram:
             rows, _ = leader.until(end)
             for (own, under), run, counterfactual in zip(parts, free, imposed, strict=True):
                 own.append(apart(cell, rows, run.until(end)[0]))
-                under.append(apart(cell, rows, counterfactual.until(end)[0]))
+                under.append(apart(cell, rows, counterfactual.until(end)))
             if all(any((rows > tolerance).any() for rows in each) for pair in parts for each in pair):
                 break
         return [(np.concatenate(own), np.concatenate(under)) for own, under in parts]

@@ -1,4 +1,4 @@
-"""Runs side by side are the runs they would be alone, and a handed run acts on what it is handed."""
+"""Runs side by side are the runs they would be alone, and a counterfactual acts on imposed decisions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mdnum.md.cell import Cell, HostCell
 from mdnum.md.neighbors import PairTable, RebuildRule
 from mdnum.rollout import lockstep as lockstep_module
 from mdnum.rollout.compared import Apart, ReferenceFrame, differ, in_user_order
+from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.engine import Engine, Segment
 from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import true_pairs
-from mdnum.rollout.lockstep import Counterfactual, lockstep
-from mdnum.rollout.program import pair_margin
-from mdnum.rollout.tracks import Handed, Overridden, Rows
+from mdnum.rollout.program import MdProgram, pair_margin
+from mdnum.rollout.tracks import Rows
 from mdnum.systems.build import build
 from mdnum.systems.simulation import Simulation
 
@@ -27,6 +27,11 @@ FLOAT32 = {f"precision.{role}": "float32" for role in ("force", "decision", "acc
 LANGEVIN = {"dynamics.kind": "langevin", "dynamics.friction": 1.0}
 #: Of every run here: the rows of a record are part of the program.
 STEPS = 120
+
+
+def lockstep(a, b, last, forward=True, back=False):
+    """Two simulations side by side."""
+    return MdProgram(a).lockstep(MdProgram(b), last, forward=forward, back=back, guard=None)
 
 
 @pytest.fixture(scope="module")
@@ -52,24 +57,24 @@ def alone(crystal) -> list[tuple[np.ndarray, list[set[int]]]]:
         pytest.param("argon/langevin-500", {}, marks=pytest.mark.nightly),
     ],
 )
-def test_handed_its_own_decisions_a_run_is_bit_identical(name, overrides):
+def test_under_its_own_decisions_a_run_is_bit_identical(name, overrides):
     simulation = build(name, overrides)
-    handed = Handed(simulation, simulation)
+    imposed = Counterfactual(simulation, simulation)
     for segment in Engine(simulation, STEPS).segments():
-        rows, note = handed.follow(segment)
+        rows = imposed.follow(segment)
         for row in range(segment.rows):
             np.testing.assert_array_equal(rows.x[row].T, segment.unsorted("x", row))
             np.testing.assert_array_equal(rows.v[row].T, segment.unsorted("v", row))
-        assert not note.count.any()
+        assert not rows.overridden.any()
 
 
 def test_with_lists_of_its_own_it_acts_on_the_same_pairs(crystal, alone):
-    handed = Handed(build(CRYSTAL, {"neighbors.skin": 0.5}), crystal)
-    followed = [handed.follow(segment) for segment in Engine(crystal, STEPS).segments()]
-    x = np.concatenate([rows.x for rows, _ in followed]).transpose(0, 2, 1)
+    imposed = Counterfactual(build(CRYSTAL, {"neighbors.skin": 0.5}), crystal)
+    followed = [imposed.follow(segment) for segment in Engine(crystal, STEPS).segments()]
+    x = np.concatenate([rows.x for rows in followed]).transpose(0, 2, 1)
     # another order of summation, and nothing else
     assert 0 < np.abs(x - alone[0][0]).max() < 1e-12
-    assert not any(note.count.any() for _, note in followed)
+    assert not any(rows.overridden.any() for rows in followed)
 
 
 def test_cross_flips_are_the_differences_of_the_pair_sets(crystal, alone):
@@ -102,8 +107,8 @@ def test_every_run_is_compared_with_the_one_that_its_name_says(crystal, alone):
     free = {"A": alone[0][0], "B": alone[1][0]}
     mixed = {}
     for name, own, leader in (("B|A", b, a), ("A|B", a, b)):
-        told = Handed(own, leader)
-        rows = [told.follow(segment)[0].x for segment in Engine(leader, STEPS).segments()]
+        imposed = Counterfactual(own, leader)
+        rows = [imposed.follow(segment).x for segment in Engine(leader, STEPS).segments()]
         mixed[name] = np.concatenate(rows).transpose(0, 2, 1)
     stretches = list(lockstep(a, b, STEPS, back=True))
     for name, one, other in (
@@ -115,18 +120,20 @@ def test_every_run_is_compared_with_the_one_that_its_name_says(crystal, alone):
     assert stretches[0].separation["A|B from A"][0] == 0, "the same start"
 
 
-class Scripted(Handed):
-    """A run of two atoms that goes nowhere; how far the decisions it is given are from its own is written."""
+class Scripted(Counterfactual):
+    """A run of two atoms that goes nowhere; how far imposed decisions are from its own is written."""
 
-    def __init__(self, furthest: list[float]):
-        self.failed, self._left, self._step = "", furthest, 0
+    def __init__(self, furthest: list[float], guard: float | None):
+        self.failed, self.guard, self._ahead, self._over = "", guard, [], False
+        self._left, self._step = furthest, 0
 
-    def follow(self, segment: Segment) -> tuple[Rows, Overridden]:
+    def follow(self, segment: Segment) -> Rows:
         count, first = segment.rows, self._step
         note, self._left = np.array(self._left[:count]), self._left[count:]
         self._step += count
         x = np.zeros((count, 3, 2)) + np.arange(first, first + count)[:, None, None]
-        return Rows(first, x, x, x[:, 0, 0].copy()), Overridden(np.arange(first, first + count), note)
+        noted = {"overridden": np.arange(first, first + count), "furthest": note}
+        return Rows(first, x, x, x[:, 0, 0].copy(), **noted)
 
 
 @pytest.mark.parametrize("guard", [0.5, None])
@@ -134,20 +141,20 @@ class Scripted(Handed):
 def test_a_counterfactual_ends_before_the_first_decision_beyond_its_guard(crystal, guard, asked):
     """Beyond means more than: the guard itself is still a decision that rounding could have changed."""
     furthest = [0.0, 0.1, 0.2, 0.5, 0.1, 0.0, 0.51, 0.0, 9.0, 0.0]
-    run = Counterfactual(Scripted(furthest), guard)
+    run = Scripted(furthest, guard)
     whole = next(iter(Engine(crystal, STEPS).segments()))
     for first, last in ((0, 3), (4, 8), (9, 9)):
         run(replace(whole, first=first, rows=last - first + 1))
     end = 10 if guard is None else 6
     seen = []
     for last in asked:
-        rows, note = run.until(last)
+        rows = run.until(last)
         if rows is None:
-            assert len(seen) == end and not len(note.count)
+            assert len(seen) == end
             continue
         steps = list(range(rows.first, rows.first + len(rows)))
-        assert rows.energy.tolist() == note.count.tolist() == steps
-        assert note.furthest.tolist() == furthest[rows.first : rows.first + len(rows)]
+        assert rows.energy.tolist() == rows.overridden.tolist() == steps
+        assert rows.furthest.tolist() == furthest[rows.first : rows.first + len(rows)]
         seen += steps
         assert seen == list(range(min(last + 1, end)))
     assert len(seen) == end
@@ -179,7 +186,7 @@ def test_one_wrong_decision_is_found():
     lost = [set(true_pairs(b, x).tolist()) - acted for x, acted in zip(*history(b, STEPS), strict=True)]
     step = next(step for step, pairs in enumerate(lost) if pairs)
     first = next(
-        flip for stretch in lockstep(a, b, STEPS, handed=False) for flip in stretch.flips if flip.differs
+        flip for stretch in lockstep(a, b, STEPS, forward=False) for flip in stretch.flips if flip.differs
     )
     assert first.step == step and first.i * a.atoms + first.j in lost[step]
 

@@ -33,7 +33,7 @@ from mdnum.md.cell import Cell
 from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine, Start, first_state, resume_point, unwrapped
 from mdnum.rollout.flips import PairRecorder, decided_pairs, true_pairs
-from mdnum.rollout.lockstep import lockstep
+from mdnum.rollout.program import MdProgram
 from mdnum.store import RunFolder
 from mdnum.systems.build import build
 from mdnum.systems.simulation import Simulation
@@ -351,12 +351,13 @@ def test_two_runs_are_forked_in_their_boxes(tmp_path):
     ]
     apart = [np.sqrt(np.max(np.sum((one - other) ** 2, axis=1))) for one, other in zip(*free, strict=True)]
     found: dict[str, list[float]] = {"B": [], "B|A": []}
-    for rows in lockstep(a, b, 60, handed=True, back=True):
+    programs = MdProgram(a), MdProgram(b)
+    for rows in programs[0].lockstep(programs[1], 60, forward=True, back=True, guard=None):
         for name, kept in found.items():
             kept.extend(rows.separation[name])
     assert np.allclose(found["B"], apart, rtol=1e-6) and np.allclose(found["B|A"][0], apart[0], rtol=1e-6)
     assert max(apart) < 1e-4
-    for rows in lockstep(a, a, 60, handed=True, back=False):
+    for rows in programs[0].lockstep(programs[0], 60, forward=True, back=False, guard=None):
         assert not np.any(rows.separation["B"]) and not np.any(rows.separation["B|A"])
         assert not np.any(rows.overridden["B|A"])
     made = mdnum.fork(a, "precision", steps=400, repeats=0, report=False, out=tmp_path / "fork")
