@@ -231,9 +231,9 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
                     print_prose(part)
                 elif type(part).__name__ == "Table":
                     _print_part(part)
-    for head in (finding for finding in outcome.findings if not finding.cause):
+    for head in (finding for finding in outcome.verdict.findings if not finding.cause):
         print_findings([head])
-        below = dict.fromkeys(one.title for one in outcome.findings if one.cause == head.code)
+        below = dict.fromkeys(one.title for one in outcome.verdict.findings if one.cause == head.code)
         if below:
             print_prose(f"What may follow from it: {'; '.join(below)}.")
     report = outcome.folder / "report.html"

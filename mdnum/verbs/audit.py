@@ -85,8 +85,7 @@ def audit(
         resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
             kept, the others are made as it was asked for.
         report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures; default a
-            bar, False for nothing.
+        progress: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         an outcome whose `result` holds what each check found, by its name.

@@ -124,8 +124,7 @@ def conform(
         out: the new folder; default runs/conform-<name>-<n>.
         resume: a folder to resume instead, with the options that it was begun with.
         report: write report.html.
-        progress: called now and then with cases done, cases and a dictionary of words; default a bar, False
-            for nothing.
+        progress: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         the outcome; its result is the `references.conformance.Report`. Status "partial" in its summary: time

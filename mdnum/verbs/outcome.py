@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.axes import Axes
 
-# of a repr: key numbers, and characters of a line
-_NUMBERS, _WIDTH = 6, 300
-
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
@@ -114,10 +111,10 @@ class Outcome:
         return {**vars(self), "path": self._place, "result": None, "_page": None}
 
     def __repr__(self) -> str:
-        numbers = [f"{key.label} {key.value}" for key in self.keys if key.value != "–"][:_NUMBERS]
+        numbers = [f"{key.label} {key.value}" for key in self.keys if key.value != "–"][:6]
         head = f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}"
         lines = (" ".join(printable(line).split()) for line in (*head, "; ".join(numbers)) if line)
-        short = (line if len(line) <= _WIDTH else f"{line[:_WIDTH]}…" for line in lines)
+        short = (line if len(line) <= 300 else f"{line[:300]}…" for line in lines)
         return "\n  ".join([*short, printable(str(self.path))])
 
     def _repr_html_(self) -> str:

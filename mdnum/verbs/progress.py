@@ -6,15 +6,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from html import escape
 from pathlib import Path
 from typing import Any, Self, TextIO
 
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]
-#: What a verb's keyword `progress` may be: a `Progress`, True, False or None. `reported` makes of it what the
-#: verb itself is given, a `Progress` or None.
+#: What a verb's keyword `progress` may be: a `Progress`, True, False or None; see `reported`.
 Wanted = Any
 
 _WORDS = {
@@ -33,12 +32,11 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
     from multiprocessing import parent_process
 
     outermost = _OUTERMOST.acquire(blocking=False)
+    shown = progress is True or (progress is None and outermost and parent_process() is None)
+    given: Any = nullcontext(progress or None)
     try:
-        if progress is True or (progress is None and outermost and parent_process() is None):
-            with ProgressBar() as bar:
-                yield bar
-        else:
-            yield progress or None
+        with ProgressBar() if shown else given as report_to:
+            yield report_to
     finally:
         if outermost:
             _OUTERMOST.release()

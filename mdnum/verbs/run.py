@@ -81,8 +81,7 @@ def run(
         resume: continue the run in this folder, bit for bit.
         check: compare with ASE (or with plain numpy where ASE has no such potential).
         report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures; default a bar, False for
-            nothing.
+        progress: see `mdnum.verbs.frame.Keep`.
         allow_code: execute the Python that a system file names.
 
     Returns:
