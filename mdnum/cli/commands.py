@@ -186,10 +186,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
                 raise
             stopped = True
     if not hasattr(answer, "verdict"):
-        code = output.print_lists(answer.document, as_json, *answer.tables)
-        for line in () if as_json else answer.lines:
-            output.say(line)
-        return code
+        return output.print_answer(answer.document, as_json, *answer.tables, lines=answer.lines)
     output.print_lines(wrong)
     code = output.print_outcome(answer, as_json=as_json)
     return output.EXIT_STOPPED if stopped or answer.summary.get("interrupted") else code

@@ -74,20 +74,19 @@ def print_json(document: Mapping[str, Any]) -> int:
     return EXIT_FINE
 
 
-def print_document(document: Mapping[str, Any], text: str, as_json: bool) -> int:
-    """A document as JSON, or what it comes to in words; returns the exit code of one that is fine."""
+def print_answer(
+    document: Mapping[str, Any],
+    as_json: bool,
+    *tables: tuple[str, Sequence[str], Any],
+    lines: Iterable[str] = (),
+) -> int:
+    """An answer as JSON, or as tables of a title, columns and rows, and lines; returns the exit code."""
     if as_json:
         return print_json(document)
-    say(text)
-    return EXIT_FINE
-
-
-def print_lists(lists: Mapping[str, Any], as_json: bool, *tables: tuple[str, Sequence[str], Any]) -> int:
-    """Lists as JSON, or as tables of a title, columns and rows; returns the exit code of one that is fine."""
-    if as_json:
-        return print_json(lists)
     for table in tables:
         print_table(*table)
+    for line in lines:
+        say(line)
     return EXIT_FINE
 
 

@@ -60,7 +60,7 @@ def report(
 
     written = frame.finish(folder).folder / "report.html"
     output.print_lines(RunFolder.open(folder).noted())
-    return output.print_document({"folder": folder, "report": written}, f"wrote {written}", as_json)
+    return output.print_answer({"folder": folder, "report": written}, as_json, lines=[f"wrote {written}"])
 
 
 @app.command()
@@ -69,16 +69,12 @@ def doctor(as_json: bool = JSON_OPTION) -> int:
     from mdnum.doctor import diagnose
 
     diagnosis = diagnose()
-    if as_json:
-        output.print_json({"ok": diagnosis.ok, **vars(diagnosis)})
-    else:
-        rows = [(row.status, row.name, row.seen) for row in diagnosis.rows]
-        output.print_table("", ("status", "test", "seen"), rows)
-        for row in diagnosis.rows:
-            if row.remedy:
-                output.say(f"{row.name}: {row.remedy}")
-        verdict = "safe" if diagnosis.ok else "UNSAFE: do not trust numbers computed here"
-        output.say(f"this installation is {verdict} ({diagnosis.seconds:.1f} s)")
+    rows = [(row.status, row.name, row.seen) for row in diagnosis.rows]
+    verdict = "safe" if diagnosis.ok else "UNSAFE: do not trust numbers computed here"
+    lines = [f"{row.name}: {row.remedy}" for row in diagnosis.rows if row.remedy]
+    lines += [f"this installation is {verdict} ({diagnosis.seconds:.1f} s)"]
+    document = {"ok": diagnosis.ok, **vars(diagnosis)}
+    output.print_answer(document, as_json, ("", ("status", "test", "seen"), rows), lines=lines)
     return output.EXIT_FINE if diagnosis.ok else output.EXIT_FINDINGS
 
 
@@ -93,7 +89,7 @@ def list_systems(as_json: bool = JSON_OPTION) -> int:
     loaded = [(name, systems.load(name)) for name in systems.names()]
     rows = [{"name": name, **_size(one), "about": one.spec.about} for name, one in loaded]
     lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
-    return output.print_lists({"systems": rows}, as_json, ("", ("name", "size", "about"), lines))
+    return output.print_answer({"systems": rows}, as_json, ("", ("name", "size", "about"), lines))
 
 
 @systems.command()
@@ -102,7 +98,7 @@ def show(
 ) -> int:
     """Print a system file with every default filled in."""
     text = _load(system, settings).to_toml(beside=False)
-    return output.print_document(tomllib.loads(text), text.rstrip(), as_json)
+    return output.print_answer(tomllib.loads(text), as_json, lines=[text.rstrip()])
 
 
 @systems.command("check")
@@ -116,7 +112,7 @@ def check_system(
     found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
     document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path, "findings": found}
     words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
-    output.print_document(document, words, as_json)
+    output.print_answer(document, as_json, lines=[words])
     if not as_json:
         output.print_findings(found)
     return output.exit_code(found)
@@ -132,7 +128,7 @@ def copy(
     from mdnum import systems
 
     copied = systems.copy(system, target)
-    return output.print_document({"system": system, "path": copied}, f"wrote {copied}", as_json)
+    return output.print_answer({"system": system, "path": copied}, as_json, lines=[f"wrote {copied}"])
 
 
 def _size(system: Any) -> dict[str, int]:

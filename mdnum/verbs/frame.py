@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 import logging
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,12 +37,13 @@ from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
 from mdnum.store import Layout, RunFolder
-from mdnum.store.files import default_folder, read_text
+from mdnum.store.files import default_folder, digest, digest_of, read_text
 from mdnum.systems import code
 from mdnum.verbs import VERBS, declared, home
 from mdnum.verbs.outcome import Outcome
 from mdnum.verbs.progress import Progress as Progress
 from mdnum.verbs.progress import Wanted, reported
+from mdnum.version import __version__
 
 if TYPE_CHECKING:
     from mdnum.units import Units
@@ -168,7 +171,8 @@ def end_on_sigterm(stack: ExitStack) -> None:
 class Keep(TypedDict, total=False):
     """Keyword arguments of every question that is asked of a system."""
 
-    out: str | Path | None  # the new folder; default runs/<verb>-<name>-<n>
+    # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked
+    out: str | Path | None
     # dotted keys of the system file to values, such as {"cutoff.kind": "switched"}
     overrides: Mapping[str, Any] | None
     report: bool  # write report.html; default True
@@ -209,9 +213,49 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
                 message = f"{name or verb.__name__}() has no keyword {word!r}"
                 raise UnknownKeyword(message, remedy=f"{hint}It takes {', '.join(known)}")
         with code.allow_code(allow_code), reported(progress) as report_to:
+            if "{content}" in str(kwargs.get("out")):
+                asked = inspect.signature(verb).bind_partial(*args, **kwargs)
+                asked.apply_defaults()
+                digits = content(name or verb.__name__, asked.arguments)
+                kwargs["out"] = str(kwargs["out"]).replace("{content}", digits)
             return verb(*args, progress=report_to, **kwargs)
 
     return cast(V, checked)
+
+
+def content(verb: str, asked: Mapping[str, Any]) -> str:
+    """Sixteen hexadecimal digits for what a verb is asked: in every process the same for the same question.
+
+    A system counts by its program and structure, whatever its file is called; a file by its bytes, a run folder
+    by its manifest; everything else by its value; and the version of mdnum.
+
+    Raises:
+        InputError: something has no value, such as a function.
+    """
+    from mdnum.provenance import hashes
+    from mdnum.systems import opened
+
+    def value(one: Any) -> Any:
+        if not isinstance(one, str | Path) or not str(one):
+            return plain(one)
+        place = Path(re.split("[@:]", str(one))[0])
+        file = place / "manifest.json" if place.is_dir() else place
+        return [str(one).removeprefix(str(place)), digest(file)] if file.is_file() else str(one)
+
+    values = {**asked, **asked.get("keep", {}), **asked.get("asked", {})}
+    for name in ("keep", "asked", "out", "report", "progress"):
+        values.pop(name, None)
+    try:
+        if values.get("system") is not None:
+            system = opened(values["system"], values.pop("overrides", None))
+            values["system"] = {**hashes(system), "file": None}
+        held = {name: value(one) for name, one in values.items()}
+        text = json.dumps([__version__, verb, held], sort_keys=True)
+    except TypeError as error:
+        raise InputError(
+            f"no folder can be named by its content: {error}", remedy="Name it otherwise, or by words alone"
+        ) from error
+    return digest_of(text.encode())[:16]
 
 
 @dataclass

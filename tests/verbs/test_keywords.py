@@ -14,7 +14,7 @@ import pytest
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.verbs.frame import Keep
+from mdnum.verbs.frame import Keep, content
 
 # other names of the package take no options of a verb
 _NO_VERBS = {
@@ -130,3 +130,41 @@ def test_a_word_is_no_cutoff(asked) -> None:
 
     with pytest.raises(InputError, match="is no number"):
         rules(**asked)
+
+
+def test_a_folder_goes_by_the_content_of_what_is_asked(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    loaded = mdnum.load("pair/at-cutoff")
+    mdnum.systems.copy("pair/at-cutoff", tmp_path / "mine")
+    mine = (tmp_path / "mine/at-cutoff.toml").rename(tmp_path / "mine/another.toml")
+    same = [content("run", {"system": one, "steps": 5}) for one in ("pair/at-cutoff", loaded, mine)]
+    same += [content("run", {"system": mine, "steps": 5, "out": "x", "report": False})]
+    assert len(set(same)) == 1 and len(same[0]) == 16
+    others = [
+        content("run", {"system": mine, "steps": 6}), content("fork", {"system": mine, "steps": 5}),
+        content("run", {"system": mine, "steps": 5, "keep": {"overrides": {"dynamics.seed": 7}}}),
+        content("run", {"system": "argon/crystal-108", "steps": 5}),
+    ]  # fmt: skip
+    mine.write_text(mine.read_text().replace("timestep = ", "timestep = 1"))
+    others += [content("run", {"system": mine, "steps": 5})]
+    assert len({*same, *others}) == 6
+    # a file by its bytes, whatever its name, and which of its frames
+    for name, text in (("a.xyz", "1"), ("b.xyz", "1"), ("c.xyz", "2")):
+        (tmp_path / name).write_text(text)
+    a, b, c, frames = (
+        content("flips", {"trajectory": word, "cutoffs": [3.0]})
+        for word in ("a.xyz", tmp_path / "b.xyz", "c.xyz", "a.xyz@5:")
+    )
+    assert a == b and len({a, c, frames}) == 3
+    with pytest.raises(InputError, match="named by its content: function has no plain form"):
+        content("conform", {"pairs": lambda: None})
+
+
+def test_two_processes_choose_the_same_name_and_one_of_them_makes_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = mdnum.run("pair/at-cutoff", steps=3, out="runs/a-{content}", check=False, report=False).folder
+    code = "import mdnum; mdnum.run('pair/at-cutoff', steps=3, out='runs/a-{content}', check=False)"
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert f"{first}: already holds a run" in other.stderr
+    again = mdnum.run("pair/at-cutoff", steps=4, out="runs/a-{content}", check=False, report=False)
+    assert again.folder.parent == first.parent and again.folder != first
