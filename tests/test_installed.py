@@ -260,7 +260,7 @@ sys.meta_path.insert(0, Finder())
         "typer",
         "jax._src.numpy",
         "mdnum.doctor",
-        *(pytest.param(name, marks=pytest.mark.nightly) for name in ("mdnum.cli.verbs", "jax")),
+        *(pytest.param(name, marks=pytest.mark.nightly) for name in ("mdnum.cli.commands", "jax")),
     ],
 )
 def test_control_c_during_an_import_ends_without_a_traceback(tmp_path, name):

@@ -19,8 +19,8 @@ from typing import Any, NoReturn
 
 import typer
 
+from mdnum.cli.commands import app
 from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, is_interrupt, print_error, print_lines, say
-from mdnum.cli.verbs import app
 from mdnum.errors import InputError, MdnumError, json_escape
 
 # typer carries its own copy of click in some versions and imports click in others; either way

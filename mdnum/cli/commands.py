@@ -24,12 +24,12 @@ from mdnum.plain import beside
 from mdnum.verbs import VERBS, declared
 
 # rich's help formatting costs more than the whole of --help may take
-PLAIN: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
+_PLAIN: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 _TYPES = {"text": str, "int": int, "float": float, "path": Path, "folder": Path, "flag": bool}
 _SHARED: Mapping[str, Mapping[str, Any]] = beside(verbs.__file__)["shared"]
 
 
-class Verbs(TyperGroup):
+class _Verbs(TyperGroup):
     """The command line: verbs, those of other packages included, and the commands that it was made with."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -48,6 +48,35 @@ class Verbs(TyperGroup):
             raise broken
 
         return _made(cmd_name, str(broken), refuse, ignore_unknown_options=True, allow_extra_args=True)
+
+
+app = typer.Typer(
+    cls=_Verbs,
+    name="mdnum",
+    help="Neighbor-set flips in cutoff-based molecular dynamics: which, when, and what they did.",
+    epilog="Exit codes: 0 fine, 1 findings, 2 a mistake in what was asked, 3 time (--time) was up before a "
+    "verdict, 130 interrupted.",
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    **_PLAIN,
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from mdnum.version import __version__
+
+        typer.echo(f"mdnum {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _top(
+    version: bool = typer.Option(
+        False, "--version", callback=_show_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    pass
 
 
 class _Questions(TyperGroup):
@@ -84,7 +113,8 @@ def _of_verb(verb: str) -> Any:
         for question, said in text.get("commands", {}).items()
     }
     group = texts[verb]["group"]
-    made = _Questions(name=verb, commands=commands, help=group["help"], rich_markup_mode=None)
+    plain = {"rich_markup_mode": None, "no_args_is_help": "alone" not in group}
+    made = _Questions(name=verb, commands=commands, help=group["help"], **plain)
     made.group = group
     return made
 
@@ -101,8 +131,8 @@ def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str
         sources: dict[str, Any] = {key: ctx.get_parameter_source(key) for key in values}
         return _called(whole, {key: values[key] for key in values if sources[key].name != "DEFAULT"}, as_json)
 
-    words = {key: parameter(key, one, typer.Argument) for key, one in arguments.items()}
-    words |= {key: parameter(key, one, typer.Option) for key, one in options.items()}
+    words = {key: _parameter(key, one, typer.Argument) for key, one in arguments.items()}
+    words |= {key: _parameter(key, one, typer.Option) for key, one in options.items()}
     kinds = {"ctx": (typer.Context, inspect.Parameter.empty), **words, "as_json": (bool, output.JSON_OPTION)}
     function: Any = command
     function.__signature__ = inspect.Signature([
@@ -114,12 +144,12 @@ def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str
 
 
 def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -> Any:
-    maker = typer.Typer(**PLAIN)
+    maker = typer.Typer(**_PLAIN)
     maker.command(name, help=help, context_settings=settings)(function)
     return typer.main.get_command(maker)
 
 
-def parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
+def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
     """The type and the default of an argument or option, as typer reads those of a function.
 
     Args:
@@ -144,17 +174,11 @@ def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
     return said.get("flags", f"--{name.replace('_', '-')}").split()
 
 
-SYSTEM_ARGUMENT = parameter("system", _SHARED["a system"]["arguments"]["system"], typer.Argument)[1]
-SET_OPTION = parameter("settings", _SHARED["changed"]["options"]["settings"], typer.Option)[1]
-
-
 # -- what is done when one is called
 
 
 def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
     """Calls the function of a command with what was typed, prints its answer and returns the exit code."""
-    from mdnum.store import RunFolder
-
     typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
@@ -164,7 +188,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
         _refuse_new(said, given)
     folders = dict.fromkeys(one for name, one in given.items() if typed[name].get("type") == "folder")
     # looked at before a folder is listed anew, and said where nothing is worse
-    wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
+    wrong = [line for one in folders if one.is_dir() for line in _folder(one).noted()]
     arguments, options = [given.get(name) for name in said["arguments"]], _options(said, given)
     stopped = False
 
@@ -172,24 +196,33 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
         """What can be done about the folder of a command that was stopped and has a --resume."""
         folder = given.get("resume") or given.get("out") or progress.folder
         with suppress(MdnumError):
-            return RunFolder.open(folder).again if "resume" in typed and folder is not None else None
+            return _folder(folder).again if "resume" in typed and folder is not None else None
         return None  # it was stopped before there was one
 
+    if said.get("on_the_spot"):
+        reply = getattr(VERBS[said["entry"]], said["calls"])(*arguments, **options)
+        output.print_lines(wrong)
+        return output.print_reply(reply, as_json)
     with output.watched(again) as progress:
-        if not said.get("lists"):
-            options["progress"] = progress
         try:
-            answer: Any = getattr(VERBS[said["entry"]], said["calls"])(*arguments, **options)
+            function = getattr(VERBS[said["entry"]], said["calls"])
+            answer: Any = function(*arguments, **options, progress=progress)
         except KeyboardInterrupt as stop:
             # what was found until then may be an answer
             if (answer := getattr(stop, "outcome", None)) is None:
                 raise
             stopped = True
-    if not hasattr(answer, "verdict"):
-        return output.print_answer(answer.document, as_json, *answer.tables, lines=answer.lines)
+    if isinstance(answer, verbs.Reply):
+        return output.print_reply(answer, as_json)
     output.print_lines(wrong)
     code = output.print_outcome(answer, as_json=as_json)
     return output.EXIT_STOPPED if stopped or answer.summary.get("interrupted") else code
+
+
+def _folder(path: Path) -> Any:
+    from mdnum.store import RunFolder
+
+    return RunFolder.open(path)
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -198,7 +231,7 @@ def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")
         options |= {name.removeprefix("no_"): False} if off else {name: given[name]}
-    if "changed" not in said.get("shares", ()):
+    if not {"changed", "its keys"} & {*said.get("shares", ())}:
         return options
     overrides = output.parse_overrides(options.pop("settings", ()))
     if (potential := options.pop("potential", None)) is not None:

@@ -14,6 +14,7 @@ import typer
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
 from mdnum.plain import plain
+from mdnum.verbs import PARTIAL, UNDECIDED, Reply
 from mdnum.verbs.progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -74,20 +75,18 @@ def print_json(document: Mapping[str, Any]) -> int:
     return EXIT_FINE
 
 
-def print_answer(
-    document: Mapping[str, Any],
-    as_json: bool,
-    *tables: tuple[str, Sequence[str], Any],
-    lines: Iterable[str] = (),
-) -> int:
-    """An answer as JSON, or as tables of a title, columns and rows, and lines; returns the exit code."""
+def print_reply(reply: Reply, as_json: bool) -> int:
+    """What is said on the spot, as JSON or for people; returns the exit code."""
     if as_json:
-        return print_json(document)
-    for table in tables:
-        print_table(*table)
-    for line in lines:
-        say(line)
-    return EXIT_FINE
+        print_json(reply.document)
+    for one in () if as_json else reply.shown:
+        if isinstance(one, str):
+            say(one)
+        elif isinstance(one, tuple):
+            (print_records if len(one) == 2 else print_table)(*one)
+        else:
+            print_findings([one])
+    return exit_code([one for one in reply.shown if hasattr(one, "severity")], reply.status)
 
 
 def say(text: str, *, err: bool = False) -> None:
@@ -201,8 +200,6 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
         findings: those that are only information do not count.
         status: of summary.json; see `frame.UNDECIDED`.
     """
-    from mdnum.verbs.frame import PARTIAL, UNDECIDED
-
     if any(finding.severity in ("warning", "error") for finding in findings):
         return EXIT_FINDINGS
     fine = {"complete": EXIT_FINE, PARTIAL: EXIT_FINE, UNDECIDED: EXIT_UNDECIDED}

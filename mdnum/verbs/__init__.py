@@ -18,7 +18,8 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +47,29 @@ def _check(module: Any) -> None:
 
 #: Modules by the command that they are of, and what they are about where a command has several.
 VERBS: Registry[Any] = Registry("verb", "mdnum.verbs", check=_check)
-for _name in ("run", "ball", "grad", "flips", "audit", "conform", "fork"):
+for _name in (
+    "run", "ball", "grad", "flips", "audit", "conform", "fork", "report", "doctor", "systems", "check",
+):  # fmt: skip
     VERBS.add(_name, f"mdnum.verbs.{_name}")
 VERBS.add("ball demos", "mdnum.verbs.demos")
 VERBS.add("flips compare", "mdnum.verbs.flips_compare")
 VERBS.add("fork map", "mdnum.verbs.fork_map")
 VERBS.add("fork certify", "mdnum.verbs.fork_certify")
+
+
+#: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
+#: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
+PARTIAL, UNDECIDED = "partial", "undecided"
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a command says on the spot, without a folder."""
+
+    document: Mapping[str, Any]  # for JSON
+    # for people: lines, findings, and tables of a title, columns and rows, or of a title and records
+    shown: Sequence[Any]
+    status: str = "complete"  # as in summary.json
 
 
 def declared(name: str) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ from mdnum.errors import InputError
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
-from mdnum.verbs import frame
+from mdnum.verbs import Reply, frame
 from mdnum.verbs.ball_page import TEXTS, BallView, decision, page
 from mdnum.verbs.frame import Keep, Outcome, Progress, Verb
 
@@ -68,7 +68,7 @@ def bounce(
     return answer.outcome
 
 
-def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | frame.Listing:
+def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
     """`mdnum ball`: a ball, a demonstration, or what there is of both for somebody who named nothing.
 
     Raises:
@@ -91,7 +91,7 @@ def command(system: str | None = None, *, demo: str | None = None, **given: Any)
     scripts = [{"name": name, "about": demos.about(name)} for name in demos.names()]
     lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
     title = "\ndemonstrations: `mdnum ball --demo NAME`, or all"
-    return frame.Listing({"systems": rows, "demos": scripts}, [
+    return Reply({"systems": rows, "demos": scripts}, [
         ("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines),
         (title, ("name", "about"), [(row["name"], row["about"]) for row in scripts]),
     ])  # fmt: skip

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mdnum.plain import plain
-from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
+from mdnum.verbs import Reply
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
@@ -68,6 +70,20 @@ def check(question: str, system: Simulation | System | str | Path) -> Checked:
     report: Any = compare(simulation)
     headline = TEXTS("agrees" if report.ok else "differs", system=simulation.name)
     return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
+
+
+def _replied(question: str, system: str, overrides: Mapping[str, str] | None = None) -> Reply:
+    """`mdnum check energy SYSTEM`, or another question."""
+    from mdnum.systems import load
+
+    loaded: Any = load(system, overrides, world="md")
+    checked = check(question, loaded)
+    title = fill(TEXTS.entries["titles"][question], {**vars(loaded.units), "system": system})
+    shown = [(title, checked.report.rows()), *checked.verdict.findings, checked.verdict.headline]
+    return Reply(checked.summary, shown, "complete" if checked.report.ok else "failed")
+
+
+energy, pairs, dynamics = (partial(_replied, question) for question in ("energy", "pairs", "dynamics"))
 
 
 def structure_findings(system: System) -> Iterator[Finding]:

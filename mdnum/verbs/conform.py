@@ -24,7 +24,7 @@ from mdnum.report.section import Code, Figure, Page, Section, Table, pairs, tabl
 from mdnum.report.words import count, listed
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
-from mdnum.verbs import frame
+from mdnum.verbs import Reply, frame
 from mdnum.verbs.frame import Outcome, Verb, View, Wanted
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def conform(
         return outcome
 
 
-def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | frame.Listing:
+def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | Reply:
     """`mdnum conform`: without a list those that have a name."""
     from mdnum.references.conformance.peers import known
 
@@ -233,7 +233,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
         for row in rows
     ]
     table = ("neighbor lists that have a name here", ("list", "version", "what"), lines)
-    return frame.Listing({"lists": rows}, [table], TEXTS("own_lists").split("\n"))
+    return Reply({"lists": rows}, [table, TEXTS("own_lists")])
 
 
 def _script(code: str) -> str:

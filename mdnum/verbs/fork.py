@@ -20,7 +20,7 @@ from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count
-from mdnum.verbs import frame
+from mdnum.verbs import Reply, frame
 from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen, of_pair
@@ -257,7 +257,7 @@ def fork_benign(
     return answer.outcome
 
 
-def listed() -> frame.Listing:
+def listed() -> Reply:
     """`mdnum fork choices`: what can be varied."""
     from mdnum.forks.choices import shipped
 
@@ -269,7 +269,7 @@ def listed() -> frame.Listing:
         ]
         rows = [(row["name"], "must hold" * row["must_hold"], row["about"]) for row in document[key]]
         tables.append((f"choices{whose}: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), rows))
-    return frame.Listing(document, tables, [TEXTS("other_programs")])
+    return Reply(document, [*tables, TEXTS("other_programs")])
 
 
 # -- pages ---------------------------------------------------------------------------------------------

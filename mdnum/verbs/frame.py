@@ -39,6 +39,8 @@ from mdnum.report.words import number
 from mdnum.store import Layout, RunFolder
 from mdnum.store.files import default_folder, digest, digest_of, read_text
 from mdnum.systems import code
+from mdnum.verbs import PARTIAL as PARTIAL
+from mdnum.verbs import UNDECIDED as UNDECIDED
 from mdnum.verbs import VERBS, declared, home
 from mdnum.verbs.outcome import Outcome
 from mdnum.verbs.progress import Progress as Progress
@@ -50,10 +52,6 @@ if TYPE_CHECKING:
 
 V = TypeVar("V", bound=Callable[..., Any])
 _LOGGER = logging.getLogger(__name__)
-
-#: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
-#: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
-PARTIAL, UNDECIDED = "partial", "undecided"
 
 #: Lines of log.txt for a phase of a run that is followed step by step.
 STEPWISE = 50
@@ -115,15 +113,6 @@ class Verb:
     page: Callable[[Any, Verdict], Page]  # everything else that is shown
     view: type[View] = View  # how they read the folder
     unfinished: bool = False  # whether a folder without a summary can be judged (a run that was killed can)
-
-
-@dataclass(frozen=True)
-class Listing:
-    """What there is to name, of a command that lists it: nothing is computed, and no folder made."""
-
-    document: Mapping[str, Any]  # for JSON
-    tables: Sequence[Any]  # for people: a title, names of columns, and rows, of each
-    lines: Sequence[str] = ()  # below them
 
 
 class Interrupted(KeyboardInterrupt):
@@ -226,8 +215,8 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
 def content(verb: str, asked: Mapping[str, Any]) -> str:
     """Sixteen hexadecimal digits for what a verb is asked: in every process the same for the same question.
 
-    A system counts by its program and structure, whatever its file is called; a file by its bytes, a run folder
-    by its manifest; everything else by its value; and the version of mdnum.
+    A system counts by its program and structure, whatever its file is called; a file by its bytes; a run
+    folder by its manifest; everything else by its value; and the version of mdnum.
 
     Raises:
         InputError: something has no value, such as a function.

@@ -22,7 +22,7 @@ from command_line import Recorder, call, printed
 
 from mdnum import bounce, conform, fork_map, verbs
 from mdnum.cli import main, output
-from mdnum.cli.verbs import app
+from mdnum.cli.commands import app
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import beside, plain
 from mdnum.store import RunFolder
@@ -237,7 +237,7 @@ def test_every_option_is_a_parameter_of_what_is_called():
             parts = [said, *(shared[one] for one in said.get("shares", ()))]
             options = {name.removeprefix("no_") for part in parts for name in part.get("options", ())}
             called = inspect.unwrap(getattr(VERBS[entry], said["calls"]))
-            if called.__name__ == "command":
+            if getattr(called, "__name__", "") == "command":
                 # which passes on what it does not need
                 called = inspect.unwrap({"ball": bounce, "conform": conform, "fork map": fork_map}[entry])
                 options -= {"demo"}

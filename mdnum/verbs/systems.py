@@ -1,0 +1,54 @@
+"""`mdnum systems`: those that come with mdnum, and one's own, listed, shown, checked and copied."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum import systems
+from mdnum.verbs import Reply
+
+
+def listed() -> Reply:
+    """`mdnum systems list`."""
+    loaded = [(name, systems.load(name)) for name in systems.names()]
+    rows = [{"name": name, **_size(one), "about": one.spec.about} for name, one in loaded]
+    lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
+    return Reply({"systems": rows}, [("", ("name", "size", "about"), lines)])
+
+
+def show(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
+    """`mdnum systems show SYSTEM`."""
+    text = systems.load(system, overrides).to_toml(beside=False)
+    return Reply(tomllib.loads(text), [text.rstrip()])
+
+
+def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
+    """`mdnum systems check SYSTEM`."""
+    loaded: Any = systems.load(system, overrides)
+    from mdnum.verbs.check import structure_findings
+
+    found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
+    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path, "findings": found}
+    words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
+    return Reply(document, [words, *found])
+
+
+def copy(system: str, target: Path | None = None) -> Reply:
+    """`mdnum systems copy SYSTEM [DIR]`."""
+    copied = systems.copy(system, target or Path())
+    return Reply({"system": system, "path": copied}, [f"wrote {copied}"])
+
+
+def _size(system: Any) -> dict[str, int]:
+    """How many there are of what the system is made of."""
+    atoms = getattr(system, "atoms", None)
+    return {"balls": system.balls} if atoms is None else {"atoms": len(atoms)}
+
+
+def _sized(row: Mapping[str, Any]) -> str:
+    noun = "atom" if "atoms" in row else "ball"
+    number = row[f"{noun}s"]
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
