@@ -25,7 +25,7 @@ terms = {
 simulation = mdnum.simulation(salt, terms, timestep=0.002, temperature=600, name="screened-salt")
 
 run = mdnum.run(simulation, steps=60)
-flips = mdnum.store.RunFolder(run.folder).read("flips")
+flips = mdnum.store.RunFolder.open(run.folder).read("flips")
 for term, count in zip(*np.unique(flips["terms"].astype(str), return_counts=True), strict=True):
     print(count, "flips of", term)
 print("energy budget closes:", run.summary["energy_budget_closes"])

@@ -147,6 +147,75 @@ def test_the_documented_verb_works(site, capsys):
     assert json.loads(capsys.readouterr().out)["above"] == 3.0
 
 
+RESUMED = """
+from contextlib import closing
+from dataclasses import dataclass
+
+from mdnum.report.finding import conclude
+from mdnum.store.answers import Answers, restored, take
+from mdnum.verbs import frame
+
+
+@dataclass
+class State:
+    numbers: list[float]
+    seconds: float = 0.0
+
+
+def spread(path=None, *, resume=None, stop=False, **keep):
+    if resume is None:
+        state = State([float(line) for line in open(path)])
+        with frame.new_folder("spread", "spread", keep.get("out")) as folder:
+            Answers(folder, state).save()
+            keep["progress"](1, 2, {"phase": "run", "folder": folder.path})
+            raise KeyboardInterrupt
+    with closing(take(resume, frame.layout("spread"))) as folder:
+        state = restored(folder, State)
+        folder.write_anew()
+        values = {"number": [0], "value": state.numbers[:1]}
+        frame.store(folder, {"seconds": state.seconds}, {"values": values})
+        return frame.finish(folder, report=False)
+
+
+def judge(view):
+    return conclude([], headline=f"{view.table('values')['value'][0]} comes first.")
+
+
+KINDS = {"spread": frame.Verb(judge, lambda view, verdict: view.page("Spread", "", [], []))}
+"""
+RESUMABLE = """
+[command]
+help = "Say which number comes first."
+calls = "spread"
+shares = ["of a folder"]
+resumes = "spread"
+missing = ["no file", "Name one"]
+arguments.path = { type = "path", metavar = "FILE", optional = true, new = true, help = "Numbers." }
+options.resume = { type = "folder", metavar = "DIR", help = "Go on with that." }
+
+[kinds.spread]
+command = "spread"
+resumes_from = "answers.json"
+tables.values = "number:int64 value"
+"""
+
+
+@pytest.mark.parametrize("site", [(RESUMED, RESUMABLE)], indirect=True)
+def test_a_verb_that_was_stopped_is_resumed(site, capsys):
+    assert call("spread", "numbers.txt") == 130
+    assert "Continue it with `mdnum spread --resume runs/spread-1`" in capsys.readouterr().err
+    assert call("run", "--resume", "runs/spread-1") == 2
+    assert "is the folder of `mdnum spread`" in capsys.readouterr().err
+    for words, said in (
+        (("numbers.txt", "--resume", "runs/spread-1"), "FILE is an option of a new spread"),
+        ((), "no file"),
+    ):
+        assert call("spread", *words) == 2 and said in capsys.readouterr().err
+    assert call("spread", "--resume", "runs/spread-1") == 0
+    assert printed(capsys)[0] == "3.5 comes first."
+    assert RunFolder.open("runs/spread-1").read("values")["value"].tolist() == [3.5]
+
+
 def test_its_folder_is_one_clear_line_without_the_package(site, capsys):
     assert call("spread", "numbers.txt", "-o", "out") == 1
     capsys.readouterr()
