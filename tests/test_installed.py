@@ -203,7 +203,7 @@ def test_an_encoding_that_lacks_a_sign_is_given_its_number(monkeypatch, encoding
         verdict = conclude([], headline="2.5 σ and 3 Å")
         return Outcome(Path("x"), "md", "run", "", summary, verdict, _page=Page(""))
 
-    monkeypatch.setattr(mdnum, "run", answered, raising=False)
+    monkeypatch.setattr("mdnum.verbs.run.run", answered)
     for words in ((), ("--json",)):
         out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
         monkeypatch.setattr(sys, "stdout", out)
