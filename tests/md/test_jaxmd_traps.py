@@ -256,13 +256,6 @@ def test_cosines_are_bent_by_a_length_of_1e_minus_7(md):
     assert abs(scaled - np.sqrt(0.5)) < 1e-14
 
 
-def test_fire_steps_in_float16(md):
-    init, _ = md.minimize.fire_descent(lambda R: jnp.sum(R**2), lambda R, dR, **_: R + dR, dt_start=0.1)
-    assert init(jnp.ones((2, 3))).dt.dtype == jnp.float16, mended(
-        "keeps FIRE's time step in float16", "relax need not replace it"
-    )
-
-
 @pytest.mark.nightly
 def test_jax_md_cannot_be_imported_under_strict_promotion():
     script = """
@@ -336,41 +329,6 @@ def test_a_list_from_outside_equals_jax_mds_own(md, format):
             assert pairs[0] == pairs[1] and len(pairs[0]) > 50
     assert ours.format is theirs.format
     assert jax.tree.structure(jax.jit(lambda held: held)(ours)) == jax.tree.structure(ours)
-
-
-@pytest.mark.nightly
-def test_relaxation_finds_the_crystal_over_a_list_that_must_be_rebuilt():
-    atoms = silicon(0.25)
-    potential = tetrahedral.stillinger_weber()
-    cell, built = jnp.asarray(atoms.cell.array), []
-
-    def neighbors(positions):
-        built.append(positions)
-        return dense_list(
-            Atoms("Si64", positions=positions, cell=atoms.cell, pbc=True), potential.r_cut + 0.2
-        )
-
-    def energy(positions, neighbor):
-        return potential.energy(positions, neighbor, cell)
-
-    relaxed = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, force_tolerance=1e-8)
-    assert relaxed.converged and relaxed.force_max <= 1e-8 and len(built) > 2
-    neighbor = neighbors(relaxed.positions)
-    # each of the two bonds an atom of the crystal has to itself is worth epsilon
-    per_atom = float(energy(jnp.asarray(relaxed.positions), neighbor)) / len(atoms)
-    assert per_atom == pytest.approx(-2 * potential.epsilon, abs=1e-4)
-    short = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, max_steps=3)
-    assert short.steps == 3 and not short.converged
-    with pytest.raises(InputError, match="needs a skin"):
-        jaxmd.relax(energy, atoms.positions, neighbors=neighbors)
-
-
-def test_relaxation_takes_forces_and_notices_nan():
-    start = np.array([[1.0, -2.0, 0.5], [0.3, 0.2, 0.1]])
-    relaxed = jaxmd.relax(lambda R: -4 * R, start, force_tolerance=1e-10)
-    assert relaxed.converged and np.abs(relaxed.positions).max() < 1e-10
-    with pytest.raises(NumericalError, match="not finite"):
-        jaxmd.relax(lambda R: jnp.sum(jnp.sqrt(R - 10)), start)
 
 
 @pytest.mark.parametrize("pbc", [ALWAYS, (True, True, False), (False, False, True), (False, False, False)])
