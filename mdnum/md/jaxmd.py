@@ -1,4 +1,4 @@
-"""The one door to jax-md: displacement, neighbor lists, pair search and FIRE, with its traps held off."""
+"""The one door to jax-md: displacement, neighbor lists and pair search, with its traps held off."""
 
 from __future__ import annotations
 

@@ -1,10 +1,12 @@
 """The fastest vibration and what lies beyond a cutoff, against closed forms and a whole matrix."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
+import mdnum
 from mdnum.rollout.adequacy import beyond_cutoff, fastest_period
 from mdnum.systems import build
 
@@ -72,3 +74,28 @@ def test_what_lies_beyond_the_cutoff_is_the_textbooks_integral():
     assert beyond_cutoff(build(make(atoms, LENNARD_JONES, HARD))) is None
     soft = {"kind": "soft-sphere", "sigma": 1.2, "epsilon": 1.0, "alpha": 2.5}
     assert beyond_cutoff(build(make(crystal(), soft, {"kind": "hard", "radius": 1.2}))) is None
+
+
+@pytest.mark.parametrize("power", [1, 2, 3, 4, 6])
+def test_what_does_not_fall_off_has_no_energy_beyond_the_cutoff(power):
+    def falling(r, strength):
+        return strength / r**power
+
+    atoms, radius = crystal(), 2.2
+    falls = mdnum.PairFunction(falling, strength=0.7)
+    simulation = mdnum.simulation(
+        atoms, falls, mdnum.Cut("hard", radius), units="lj", timestep=0.002, skin=0.1
+    )
+    found = beyond_cutoff(simulation)
+    if power <= 3:
+        assert found is None
+    else:
+        density = len(atoms) / atoms.get_volume()
+        expected = 2 * np.pi * density * 0.7 * radius ** (3 - power) / (power - 3)
+        assert found["energy"] == pytest.approx(expected, rel=1e-6)
+        assert found["pressure"] == pytest.approx(density * power / 3 * expected, rel=1e-6)
+    # of a screened one it is a number
+    screened = mdnum.PairFunction(lambda r, strength: strength * jnp.exp(-r / 0.8) / r, strength=0.7)
+    made = mdnum.simulation(atoms, screened, mdnum.Cut("hard", radius), units="lj", timestep=0.002, skin=0.1)
+    exact = 2 * np.pi * len(atoms) / atoms.get_volume() * 0.7 * 0.8 * (radius + 0.8) * np.exp(-radius / 0.8)
+    assert beyond_cutoff(made)["energy"] == pytest.approx(exact, rel=1e-6)
