@@ -30,8 +30,10 @@ from typing import Any
 from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
 
+from mdnum.md import tetrahedral
+from mdnum.md.embedded_atom import EmbeddedAtom
 from mdnum.md.manybody import EnergyFunction
-from mdnum.md.potentials import PairFunction
+from mdnum.md.potentials import LennardJones, Morse, PairFunction
 from mdnum.references.adapted import (
     EnergyOnNeighborList,
     SpeciesSum,
@@ -75,16 +77,16 @@ def reference(subject: Simulation | System) -> Reference:
         subject: a `Simulation`, or a `System`, whose box need not have room for its skin.
     """
     simulation = _objects(subject)
-    kind, species, model = simulation.potential.name, simulation.symbols, simulation.model
-    if kind == "eam":
+    species, model = simulation.symbols, simulation.model
+    if isinstance(model, EmbeddedAtom):
         return Reference("ASE EAM", True, "none", lambda: short_listed_eam(Path(model.file)))
-    if kind == "tersoff":
+    if isinstance(model, tetrahedral.Tersoff):
         constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(TersoffModel()))}
         return Reference("ASE Tersoff", True, "none", lambda: Tersoff(constants, skin=0.0))
     # a sum of terms has no class there
     plain = simulation.pairwise and "" in model.terms
-    known = _ASE_PAIR.get((kind, model.cutoff.name)) if plain else None
-    if known is None or isinstance(simulation.potential, PairFunction):
+    known = _ASE_PAIR.get((type(model.potential), model.cutoff.name)) if plain else None
+    if known is None:
         return independent(simulation)
     label, conversion, made = known
     forms = _forms(simulation)
@@ -105,14 +107,16 @@ def independent(subject: Simulation | System) -> Reference:
         subject: as for `reference`.
     """
     simulation = _objects(subject)
-    kind = simulation.potential.name
-    models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
+    models: dict[type, Callable[[], Any]] = {
+        tetrahedral.StillingerWeber: StillingerWeberModel,
+        tetrahedral.Tersoff: TersoffModel,
+    }
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, called operation by operation"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
-    make_model = models[kind] if kind in models else lambda: PairModel.of(model, simulation.symbols, compare)
+    make_model = models.get(type(model), lambda: PairModel.of(model, simulation.symbols, compare))
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
         False,
@@ -131,29 +135,29 @@ def _forms(simulation: Simulation) -> dict[tuple[str, str], PairForm]:
 
 
 #: (label, conversion, calculator) by potential and cutoff.
-_ASE_PAIR: dict[tuple[str, str], tuple[str, str, Callable[[PairForm], Calculator]]] = {
-    ("lennard-jones", "hard"): (
+_ASE_PAIR: dict[tuple[type, str], tuple[str, str, Callable[[PairForm], Calculator]]] = {
+    (LennardJones, "hard"): (
         "ASE LennardJones",
         "energy + u(r_cut) for each pair inside; forces as they are",
         lambda form: StepAtCutoff(lennard_jones(form), form, form.at_cutoff[0]),
     ),
-    ("lennard-jones", "shifted"): ("ASE LennardJones", "none", lennard_jones),
-    ("lennard-jones", "switched"): (
+    (LennardJones, "shifted"): ("ASE LennardJones", "none", lennard_jones),
+    (LennardJones, "switched"): (
         "ASE LennardJones (smooth)",
         "none: ro is the onset",
         lambda form: lennard_jones(form, ro=form.r_onset, smooth=True),
     ),
-    ("morse", "hard"): (
+    (Morse, "hard"): (
         "ASE MorsePotential",
         "its own switch moved beyond the pairs listed",
         lambda form: morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut),
     ),
-    ("morse", "shifted"): (
+    (Morse, "shifted"): (
         "ASE MorsePotential",
         "its own switch moved away; energy - u(r_cut) for each pair inside",
         lambda form: StepAtCutoff(morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut), form, -form.at_cutoff[0]),
     ),
-    ("morse", "quintic"): (
+    (Morse, "quintic"): (
         "ASE MorsePotential",
         "rho0 = alpha r0, rcut1 = onset / r0, rcut2 = r_cut / r0",
         lambda form: morse(form, form.r_onset, form.r_cut),

@@ -11,7 +11,9 @@ from ase import Atoms
 from jaxtyping import Int
 from numpy import ndarray
 
+from mdnum.md.embedded_atom import EmbeddedAtom
 from mdnum.md.integrators import VelocityVerlet as OwnVerlet
+from mdnum.md.tetrahedral import Tersoff
 from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.adapted import evaluate
@@ -128,7 +130,9 @@ def check_energy(
     """
     simulation = build(subject)
     judge = reference(simulation) if judge is None else judge
-    third = independent(simulation) if judge.is_ase and simulation.potential.name != "eam" else None
+    third = (
+        independent(simulation) if judge.is_ase and not isinstance(simulation.model, EmbeddedAtom) else None
+    )
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
     compared: list[FrameComparison] = []
@@ -412,9 +416,9 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 def _forces(simulation: Simulation) -> Reference:
     """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
-    kind, judge = simulation.potential.name, reference(simulation)
-    slow = kind == "tersoff" or len(simulation.symbols) > 1
-    return independent(simulation) if slow and kind != "eam" else judge
+    judge = reference(simulation)
+    slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
+    return independent(simulation) if slow and not isinstance(simulation.model, EmbeddedAtom) else judge
 
 
 def _sudden(position: Sequence[float], floor: float) -> int | None:

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff
-from mdnum.md.potentials import Channels, CutPotential, PairPotential
+from mdnum.md.potentials import Channels, CutPotential, LennardJones, Morse, PairPotential, SoftSphere
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,6 @@ class PairForm:
     r_onset: float  # where switching starts; r_cut for cutoffs that do not switch
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
-    @property
-    def kind(self) -> str:
-        """Name of the potential."""
-        return self.potential.name
-
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
         """Whether distances count as inside, in the space and with the comparison of the system file."""
         space, comparison = self.compare.split()
@@ -153,9 +148,8 @@ class PairForm:
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """u(r) and u'(r) without any cutoff."""
-        if self.kind in _BARE:
-            return _BARE[self.kind](r, **self.constants)
-        return self.potential.reference(r, **self.constants)
+        # by class: a function of somebody's own may be called like one of them
+        return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
@@ -206,10 +200,10 @@ def _soft_sphere(r: ndarray, sigma: float, epsilon: float, alpha: float) -> tupl
     return epsilon / alpha * overlap**alpha, -epsilon / sigma * slope
 
 
-_BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
-    "lennard-jones": _lennard_jones,
-    "morse": _morse,
-    "soft-sphere": _soft_sphere,
+_BARE: dict[type, Callable[..., tuple[ndarray, ndarray]]] = {
+    LennardJones: _lennard_jones,
+    Morse: _morse,
+    SoftSphere: _soft_sphere,
 }
 
 

@@ -7,6 +7,8 @@ from dataclasses import fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from types import FunctionType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,8 @@ from mdnum.md.manybody import EnergyFunction
 from mdnum.md.pairforce import ManyBodyForce
 from mdnum.plain import plain
 from mdnum.references import energy_check
-from mdnum.references.ase_models import ENERGY, evaluate, independent, reference
+from mdnum.references.adapted import evaluate
+from mdnum.references.ase_models import ENERGY, independent, reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy, neighborhoods
 from mdnum.systems import build
 from mdnum.systems.simulation import Simulation
@@ -306,3 +309,33 @@ def test_an_energy_function_is_compared_on_ase_s_list(form: str, monkeypatch):
     jax.clear_caches()
     assert not check_energy(simulation, {"first": simulation.structure}).ok
     jax.clear_caches()
+
+
+def weak(r, strength):
+    """Not what any name says."""
+    return strength * jnp.exp(-r)
+
+
+class Other(mdnum.PairPotential):
+    """Called like one of mdnum's own, and another."""
+
+    name = "lennard-jones"
+    sigma: Any
+    epsilon: Any
+
+    def evaluate(self, r2):
+        return self.epsilon / r2, -self.epsilon / (r2 * r2)
+
+
+@pytest.mark.parametrize("name", ["morse", "tersoff", "eam", "stillinger-weber", "class", "energy"])
+def test_a_potential_is_judged_by_what_it_is_and_not_by_its_name(name: str):
+    function = FunctionType(weak.__code__, globals(), name)
+    made: Any = mdnum.PairFunction(function, strength=0.3)
+    made = Other(sigma=1.0, epsilon=0.3) if name == "class" else made
+    if name == "energy":
+        constants = {"size": jnp.asarray(1.0), "depth": jnp.asarray(1.0)}
+        made = EnergyFunction(constants, own_energy, 2.0, name="tersoff")
+    cut = None if name == "energy" else mdnum.Cut("shifted", 2.0)
+    simulation = mdnum.simulation(crystal(), made, cut, units="lj", timestep=0.002, skin=0.3)
+    report = check_energy(simulation, {"first": simulation.structure})
+    assert report.ok and not report.is_ase
