@@ -115,17 +115,18 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         return _compared(first, second, where)
 
 
-def simulation_in(folder: Path, objects: Sequence[Simulation] = ()) -> Any:
+def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bool = True) -> Any:
     """The simulation or the ball's system of a run folder.
 
     Args:
         objects: simulations, one of which ran there; needed where it was made of objects.
+        built: False leaves a system file as it is, so that code that it names is not executed.
 
     Raises:
         InputError: none of them did.
     """
     if not (folder / SIMULATION_FILE).is_file():
-        return opened(load(folder))
+        return opened(load(folder)) if built else load(folder)
     if not objects:
         remedy = "Give it from Python, made by the same code: mdnum.fork_folders(a, b, objects=[...])"
         message = "was made of objects, and no file says how to make them again"

@@ -15,7 +15,7 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
-from mdnum.verbs import Reply
+from mdnum.verbs import Reply, frame
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
@@ -42,6 +42,7 @@ class Checked:
         return plain({"ok": self.report.ok, **vars(self.report), **worst, "findings": self.verdict.findings})
 
 
+@frame.keywords_checked
 def check(question: str, system: Simulation | System | str | Path) -> Checked:
     """Compare a system with other codes.
 
@@ -52,6 +53,8 @@ def check(question: str, system: Simulation | System | str | Path) -> Checked:
     Args:
         question: "energy", "pairs" or "dynamics".
         system: a simulation, a system, a shipped name or the path of a system file.
+
+    With allow_code=True the Python that a system file names is executed.
 
     Raises:
         InputError: the system cannot be run.
@@ -72,12 +75,14 @@ def check(question: str, system: Simulation | System | str | Path) -> Checked:
     return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
 
 
-def _replied(question: str, system: str, overrides: Mapping[str, str] | None = None) -> Reply:
+def _replied(
+    question: str, system: str, overrides: Mapping[str, str] | None = None, allow_code: bool = False
+) -> Reply:
     """`mdnum check energy SYSTEM`, or another question."""
     from mdnum.systems import load
 
     loaded: Any = load(system, overrides, world="md")
-    checked = check(question, loaded)
+    checked = check(question, loaded, allow_code=allow_code)
     title = fill(TEXTS.entries["titles"][question], {**vars(loaded.units), "system": system})
     shown = [(title, checked.report.rows()), *checked.verdict.findings, checked.verdict.headline]
     return Reply(checked.summary, shown, "complete" if checked.report.ok else "failed")

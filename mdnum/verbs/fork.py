@@ -198,7 +198,7 @@ def fork_folders(
     keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
     frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
-    system: Any = simulation_in(found.a, objects)
+    system: Any = simulation_in(found.a, objects, built=replay)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:

@@ -16,7 +16,7 @@ from mdnum.verbs.frame import Answer, Keep, Outcome, Progress
 
 if TYPE_CHECKING:
     from mdnum.forks import Fork, Twin
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, System
     from mdnum.systems.simulation import Simulation
 
 #: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
@@ -91,9 +91,9 @@ def of_md(
     return loaded
 
 
-def basics(system: Simulation | BallSystem, steps: int | None) -> dict[str, Any]:
+def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[str, Any]:
     """What every summary says of the system; steps default to its own."""
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, System
 
     head: dict[str, Any] = {"system": system.name}
     if isinstance(system, BallSystem):
@@ -101,6 +101,9 @@ def basics(system: Simulation | BallSystem, steps: int | None) -> dict[str, Any]
         counted = "impacts" if own.kind == "event-located" else "iterations"
         head |= {"about": spec.about, "balls": system.balls, "contact_kind": spec.contact.kind,
                  "integrator": own.kind, "counted": counted, "units": "ball"}  # fmt: skip
+    elif isinstance(system, System):
+        own = system.spec.dynamics
+        head |= {"about": system.spec.about, "atoms": len(system.atoms), "units": system.spec.units}
     else:
         own = system
         head |= {"about": system.origin.about, "atoms": system.atoms, "units": system.units.name}

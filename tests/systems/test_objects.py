@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.build import bulk
+from command_line import call
 
 import mdnum
 from mdnum import systems
@@ -240,7 +241,7 @@ def test_a_potential_of_many_bodies_follows_the_periodicity_of_the_atoms_and_has
         mdnum.simulation(slab, potential, timestep=0.001, precision=narrow)
 
 
-def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_else(tmp_path):
+def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_else(tmp_path, capsys):
     (tmp_path / "mine.py").write_text(CODE)
     path, ran = tmp_path / "my.toml", tmp_path / "mine.py.ran"
     path.write_text(FILE)
@@ -265,6 +266,18 @@ def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_e
     assert not copied.exists()
     again = mdnum.run(None, resume=done.folder, steps=8, allow_code=True, report=False)
     assert copied.exists() and again.summary["steps"] == 8
+    # what was stored is compared without it, and followed again with it
+    copied.unlink()
+    same = mdnum.fork_folders(done.folder, done.folder, out=tmp_path / "same")
+    assert not copied.exists() and same.summary["fork"] is None and same.summary["atoms"] == 500
+    with pytest.raises(InputError, match=r"run/mine\.py:morse"):
+        mdnum.fork_folders(done.folder, done.folder, replay=True, repeats=0, out=tmp_path / "replay")
+    with pytest.raises(InputError, match=r"mine\.py:morse.*--allow-code"):
+        mdnum.check("energy", path)
+    assert not copied.exists()
+    assert mdnum.check("energy", path, allow_code=True).report.ok
+    for command in (("check", "energy"), ("fork", "compare")):
+        assert call(*command, "--help") == 0 and "--allow-code" in capsys.readouterr().out
     with mdnum.allow_code():
         assert mdnum.build(path).potential.name == "morse"
     sys.modules.pop("mdnum_code_mine", None)
