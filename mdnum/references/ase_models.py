@@ -22,7 +22,7 @@ shifted and switched forms such a pair has no energy, so only its force can diff
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,7 @@ def reference(subject: Simulation | System) -> Reference:
     if isinstance(model, EmbeddedAtom):
         return Reference("ASE EAM", True, "none", lambda: short_listed_eam(Path(model.file)))
     if isinstance(model, tetrahedral.Tersoff):
-        constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(TersoffModel()))}
+        constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(_written_again(model)))}
         return Reference("ASE Tersoff", True, "none", lambda: Tersoff(constants, skin=0.0))
     # a sum of terms has no class there
     plain = simulation.pairwise and "" in model.terms
@@ -107,23 +107,27 @@ def independent(subject: Simulation | System) -> Reference:
         subject: as for `reference`.
     """
     simulation = _objects(subject)
-    models: dict[type, Callable[[], Any]] = {
-        tetrahedral.StillingerWeber: StillingerWeberModel,
-        tetrahedral.Tersoff: TersoffModel,
-    }
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, called operation by operation"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
-    make_model = models.get(type(model), lambda: PairModel.of(model, simulation.symbols, compare))
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
         False,
         "none: the function, called pair by pair outside of the loop" if own
         else "none: the formulas of the system file, written a second time",
-        lambda: OnNeighborList(make_model()),
+        lambda: OnNeighborList(
+            PairModel.of(model, simulation.symbols, compare) if simulation.pairwise else _written_again(model)
+        ),
     )  # fmt: skip
+
+
+def _written_again(model: Any) -> StillingerWeberModel | TersoffModel:
+    """The formulas of a potential of many bodies in plain numpy, with its constants."""
+    kind = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
+    names = (one.name for one in fields(kind) if hasattr(model, one.name))
+    return kind(**{name: float(getattr(model, name)) for name in names})
 
 
 def _objects(subject: Simulation | System) -> Simulation:

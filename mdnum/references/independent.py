@@ -296,7 +296,7 @@ class StillingerWeberModel(_OneSpecies):
     epsilon: float = 2.1683
     sigma: float = 2.0951
     a: float = 1.80
-    lam: float = 21.0
+    strength: float = 21.0
     gamma: float = 1.20
     A: float = 7.049556277
     B: float = 0.6022245584
@@ -324,7 +324,7 @@ class StillingerWeberModel(_OneSpecies):
         arm = np.exp(self.gamma / (x - self.a))
         darm = -self.gamma / (x - self.a) ** 2 * arm / self.sigma
         excess = cosine - self.cos0
-        strength = self.epsilon * self.lam
+        strength = self.epsilon * self.strength
         angle = strength * arm[e] * arm[f] * excess**2
         twist = 2.0 * strength * arm[e] * arm[f] * excess
         bend = strength * excess**2

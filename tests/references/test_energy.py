@@ -339,3 +339,14 @@ def test_a_potential_is_judged_by_what_it_is_and_not_by_its_name(name: str):
     simulation = mdnum.simulation(crystal(), made, cut, units="lj", timestep=0.002, skin=0.3)
     report = check_energy(simulation, {"first": simulation.structure})
     assert report.ok and not report.is_ase
+
+
+@pytest.mark.parametrize(
+    ("name", "key"), [("tersoff", "A"), ("tersoff", "R"), ("stillinger-weber", "strength")]
+)
+def test_other_constants_of_many_bodies_are_the_judge_s_too(name: str, key: str):
+    shipped = build(f"silicon/{name}-512", {"structure.repeat": [2, 2, 2]})
+    path = f"potential.{key}"
+    changed = mdnum.changed(shipped, {path: float(mdnum.parameters(shipped)[path].value) * 1.02})
+    report = check_energy(changed, {"first": rattled("Si", "diamond", 5.431, 2)})
+    assert report.ok and report.is_ase == (name == "tersoff")
