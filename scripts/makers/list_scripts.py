@@ -3,8 +3,8 @@
     python scripts/makers/list_scripts.py          write them
     python scripts/makers/list_scripts.py --check  exit with 1 if they are not current
 
-A script begins with its question. The paragraph that begins with "Answer." says what was found, and ends
-with how long that takes.
+A script begins with its question. The paragraph that begins with "Answer." says what was found, and ends with
+how long that takes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "scripts.md"
 MARK = "<!-- written by scripts/makers/list_scripts.py -->"
+RAW = argparse.RawDescriptionHelpFormatter
 TITLES = {
     "studies": "Studies: a question, a table and a figure",
     "benchmarks": "Benchmarks: how fast",
-    "campaigns": "Campaigns: how often, over hundreds of cases; each can be continued, or has a quick form",
+    "campaigns": "Campaigns: how often, over hundreds of cases",
     "makers": "Makers of what is shipped",
 }
 
@@ -63,9 +64,7 @@ def tables() -> str:
 
 def main() -> None:
     """Write, or compare."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=RAW)
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if not current")
     asked = parser.parse_args()
     text = PAGE.read_text(encoding="utf-8")
