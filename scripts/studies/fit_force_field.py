@@ -1,5 +1,8 @@
 """Can a force field be recovered from what a liquid shows, through a hard cutoff?
 
+Answer. Yes: from 10 % off, descent with event-aware gradients ends within a hundredth of the true sigma and
+epsilon. The plain gradient arrives by another path. It takes minutes.
+
 Argon's sigma and epsilon are sought, starting 10 % off, by gradient descent (optax) on a radial
 distribution function and a diffusion constant. Both are averages over short rollouts of the liquid, of
 replicas that differ in velocities and thermal noise; the target is made of the same replicas with the true

@@ -1,7 +1,7 @@
 """How far can a gradient through a liquid be trusted, and what ends it?
 
 Answer. In a Lennard-Jones liquid of 256 atoms float32 agrees with float64 for 400 to 480 steps, and other
-starts disagree after some 350: average over starts. It takes minutes.
+starts disagree after some 350: average over starts. It takes some minutes.
 
 The derivative of the mean squared displacement by sigma is followed with the horizon, from one run and one
 tangent pass for each precision. A run in float32 is compared with one in float64, a run in float64 with

@@ -1,5 +1,8 @@
 """Does a gradient of a liquid with a hard cutoff need what the flips add?
 
+Answer. Yes: without it the gradient is off by many standard errors, and by the cutoff radius it is exactly
+0; with it, gradients agree with differences within about two. It takes minutes.
+
 The same loss is differentiated in three ways, over replicas that differ in their velocities: by the steps
 that ran (plain), with what moving the time of every flip adds (event-aware), and by differences of runs at
 shifted parameters, over steps so wide that many flips change the step at which they happen. Two starts:

@@ -1,4 +1,4 @@
-"""The picture of the package and the table of its rooms are those of the source."""
+"""The picture of the package, the table of its rooms and those of the scripts are those of the source."""
 
 from __future__ import annotations
 
@@ -7,17 +7,33 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = "scripts/makers/draw_architecture.py"
 
 
-def checked(root: Path) -> tuple[int, str]:
-    done = subprocess.run([sys.executable, str(root / SCRIPT), "--check"], capture_output=True, text=True)
+def checked(root: Path, script: str = SCRIPT) -> tuple[int, str]:
+    done = subprocess.run([sys.executable, str(root / script), "--check"], capture_output=True, text=True)
     return done.returncode, done.stderr
 
 
-def test_they_are_current():
-    assert checked(ROOT) == (0, ""), f"run python {SCRIPT}"
+@pytest.mark.parametrize("script", [SCRIPT, "scripts/makers/list_scripts.py"])
+def test_they_are_current(script: str):
+    assert checked(ROOT, script) == (0, ""), f"run python {script}"
+
+
+def test_every_script_says_its_question_its_answer_and_how_long_it_takes(tmp_path: Path):
+    copy = tmp_path / "scripts"
+    shutil.copytree(ROOT / "scripts", copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "docs").mkdir()
+    shutil.copy(ROOT / "docs" / "scripts.md", tmp_path / "docs")
+    study = copy / "studies" / "skin_sensitivity.py"
+    source = study.read_text()
+    for words, other in (("?", "."), ("Answer. ", ""), (" It takes ", " It took ")):
+        study.write_text(source.replace(words, other))
+        code, said = checked(tmp_path, "scripts/makers/list_scripts.py")
+        assert code == 1 and "skin_sensitivity.py" in said
 
 
 def test_another_import_makes_them_stale(tmp_path: Path):
