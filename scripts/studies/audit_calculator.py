@@ -1,5 +1,9 @@
 """Which calculators are safe to run and to differentiate, and what is wrong with the others?
 
+Answer. Of ASE's own, Lennard-Jones with a cutoff of 6 Å is safe to run, and its force jumps there; with
+smooth=True its answers carry fewer digits than a double, and the energy of EMT jumps at its cutoff: with
+care. None is unsafe. It takes 160 s.
+
 Audits calculators one after the other (by default three of ASE's own, each with a structure that is built for
 it) and puts them side by side: two answers, the codes of what was found, and the numbers behind them. Any
 calculator can be named as for `mdnum audit`.
