@@ -55,7 +55,7 @@ def tables() -> str:
     """A table for each folder."""
     parts = []
     for folder, title in TITLES.items():
-        head = ("script", "writes") if folder == "makers" else ("script", "question", "answer", "takes")
+        head = ("script", "what it does") if folder == "makers" else ("script", "question", "answer", "takes")
         rows = [row(path) for path in sorted((ROOT / "scripts" / folder).glob("[a-z]*.py"))]
         lines = [head, ("---",) * len(head), *rows]
         parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines))

@@ -1,5 +1,9 @@
 """Which choice forks which system under which cutoff, when, and did the flips cause the split?
 
+Answer. Of argon/crystal-108 and five choices over 4,000 steps, only precision forks under a hard or shifted
+cutoff, and its flips are the cause; under a switched one three choices fork, and no flip is found to be a
+cause. It takes 110 s for these 15 cells, hours for the whole map.
+
 Every choice that `mdnum fork` can vary, for every system under every kind of cutoff: one cell each. A
 cell follows the run, its twin with the choice made otherwise, the twin's arithmetic under the first run's
 decisions, and repeats that tell a delay from chance. The map's color is the step of the fork; its letter
