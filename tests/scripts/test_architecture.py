@@ -61,7 +61,9 @@ def test_another_import_makes_them_stale(tmp_path: Path):
 def test_every_file_that_a_page_names_is_there(page: str):
     """By its place in the repository or in mdnum; a module by its name alone, beside others of its folder."""
     known = [path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*") if ".git" not in path.parts]
-    names = set(re.findall(r"`([\w./-]+(?:\.py|/[\w-]+\.(?:toml|json|md)|/))(?:::\w+)?`", (ROOT / page).read_text()))
+    names = set(
+        re.findall(r"`([\w./-]+(?:\.py|/[\w-]+\.(?:toml|json|md)|/))(?:::\w+)?`", (ROOT / page).read_text())
+    )
     meant = {name.rstrip("/") for name in names if not re.search(r"NAME|VERB|NN_", name)}
     missing = [name for name in meant if not any(f"/{path}".endswith(f"/{name}") for path in known)]
     assert len(meant) > 8 and missing == []
