@@ -20,9 +20,9 @@ from mdnum.forks.pair import Fork
 from mdnum.forks.tape import taped
 from mdnum.md.cell import HostCell
 from mdnum.numerics.verdicts import split_of
-from mdnum.rollout.compared import Apart, ReferenceFrame
+from mdnum.rollout.compared import ReferenceFrame
 from mdnum.rollout.engine import Engine, Segment
-from mdnum.rollout.lockstep import apart
+from mdnum.rollout.lockstep import beside
 from mdnum.rollout.program import pair_bound, pair_margin
 from mdnum.rollout.tracks import Track
 
@@ -139,13 +139,7 @@ def pinned(
     imposed = taped(a, last_step, lambda segment: None).pins(keys, *window)
     leader = Track(a.simulation, last_step, a.begin, flips=False)
     follower = Track(b.simulation, last_step, b.begin, flips=False, pins=imposed)
-    cell = Apart(a.simulation.cell)
-    parts = []
-    while leader.segment() is not None:
-        end = leader.ready
-        rows, _ = leader.until(end)
-        parts.append(apart(cell, rows, follower.until(end)[0]))
-    separation = np.concatenate(parts)
+    separation = np.concatenate([rows for (rows,) in beside(leader, [follower])])
     named = tuple((int(key // a.size), int(key % a.size)) for key in keys)
     return Pinned(named, *window, separation, split_of(separation, fork.tolerance), fork.dates.split)
 

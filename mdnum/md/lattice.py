@@ -39,7 +39,7 @@ from mdnum.md.decide import (
     unpacked,
 )
 from mdnum.md.integrators import ByAtom, Integrator, Langevin, VelocityVerlet
-from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, other_than, symmetric
+from mdnum.md.pairforce import Forces, Guarded, PairForce, other_than
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
 from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_norm, zero_bits
@@ -561,22 +561,9 @@ class LatticeForce(PairForce):
         )
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
-        """As `PairForce`, in plain float64: the stress of one configuration."""
-        judge = self.judge(positions)
-        law, spacing = self.model, self.lattice.spacing
-        at = law.at_cutoff()
-
-        def block(totals, listed):
-            j, types = listed
-            d, quantity, inside, _ = judge.group(j, types)
-            r2 = jnp.where(inside, quantity.astype(jnp.float64) * (spacing * spacing), 1.0)
-            slope = jnp.where(inside, law.evaluate(r2, types, at)[1], 0) * (spacing * spacing)
-            sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in VOIGT]
-            return tuple(total + q for total, q in zip(totals, sums, strict=True)), None
-
-        start = (jnp.zeros(judge.atoms, jnp.float64),) * 6
-        totals, _ = lax.scan(block, start, tables.groups())
-        return symmetric(-jnp.sum(total) for total in totals)
+        """As `PairForce`, at the nearest points of the lattice: the stress of one configuration."""
+        spacing = self.lattice.spacing
+        return super().virial_tensor(jnp.round(positions.astype(jnp.float64) / spacing) * spacing, tables)
 
 
 def _closest(model: CutPotential, lattice: Lattice) -> float:

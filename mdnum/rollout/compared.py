@@ -197,7 +197,7 @@ def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     return times
 
 
-# --- rows of runs beside one another: atoms put in one order, and how far the same atoms are apart ----
+# --- rows of two runs: atoms in one order, and the separation of the same atoms ------------------------
 
 
 @njit
@@ -238,18 +238,18 @@ def _largest(a, b, boxes, out):
 
 
 @njit
-def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthest):
+def _overridden(own, imposed, index, order, x, species, r_cut, boxes, count, furthest):
     atoms, listed = order.shape[0], index.shape[0] // 8
     for row in range(count.shape[0]):
         at, box = x[row], box_of(boxes, row)
         for word in range(own.shape[1]):
             any_bit = np.uint8(0)
             for column in range(atoms):
-                any_bit |= own[row, word, column] ^ told[row, word, column]
+                any_bit |= own[row, word, column] ^ imposed[row, word, column]
             if any_bit == 0:
                 continue
             for column in range(atoms):
-                bits = own[row, word, column] ^ told[row, word, column]
+                bits = own[row, word, column] ^ imposed[row, word, column]
                 for k in range(8):
                     if not (bits >> k) & 1:
                         continue
@@ -270,71 +270,45 @@ def _overridden(own, told, index, order, x, species, r_cut, boxes, count, furthe
                         furthest[row] = off
 
 
-class Apart:
-    """Distances between the same atoms of two runs, and of pairs on which they differ.
+def separations(
+    cells: Sequence[Cell], a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
+) -> Float[np.ndarray, "rows"]:
+    """Largest distance between the same atoms of two runs at each row; NaN where a position is not a number.
 
     Args:
         cells: the box, or one for each row; distances are those of nearest images.
     """
-
-    def __init__(self, *cells: Cell):
-        self._boxes = stacked(cells)
-
-    def __call__(
-        self, a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
-    ) -> Float[np.ndarray, "rows"]:
-        """At each row; NaN where a position is not a number."""
-        out = np.empty(len(a))
-        _largest(a, b, self._boxes, out)
-        return out
-
-    def overridden(
-        self,
-        own: UInt8[np.ndarray, "rows words atoms"],
-        told: UInt8[np.ndarray, "rows words atoms"],
-        table: PairTable,
-        x: Float[np.ndarray, "rows 3 atoms"],
-        species: Int[np.ndarray, "atoms"],
-        r_cut: Float[np.ndarray, "channels species species"],
-    ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-        """How many pairs are decided otherwise in two records, and the furthest of them from its cutoff.
-
-        Args:
-            own, told: packed decisions of one list.
-            table: the list.
-            x: positions in its order of atoms.
-            species: of each atom, in the user's order.
-            r_cut: cutoff of each channel by species, length.
-        """
-        count, furthest = np.zeros(len(own), np.int64), np.zeros(len(own))
-        _overridden(own, told, table.index, table.order, x, species, r_cut, self._boxes, count, furthest)
-        return count, furthest
+    out = np.empty(len(a))
+    _largest(a, b, stacked(cells), out)
+    return out
 
 
-@njit
-def _differ(a, b, out):
-    for row in range(out.shape[0]):
-        if out[row]:
-            continue
-        for axis in range(a.shape[1]):
-            for k in range(a.shape[2]):
-                if a[row, axis, k] != b[row, axis, k]:
-                    out[row] = True
-                    break
-            if out[row]:
-                break
+def overridden(
+    cells: Sequence[Cell],
+    own: UInt8[np.ndarray, "rows words atoms"],
+    imposed: UInt8[np.ndarray, "rows words atoms"],
+    table: PairTable,
+    x: Float[np.ndarray, "rows 3 atoms"],
+    species: Int[np.ndarray, "atoms"],
+    r_cut: Float[np.ndarray, "channels species species"],
+) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
+    """How many pairs are decided otherwise in two records, and the furthest of them from its cutoff.
+
+    Args:
+        cells: as for `separations`.
+        own, imposed: packed decisions of one list, the table.
+        x: positions in its order of atoms.
+        species: of each atom, in the user's order.
+        r_cut: cutoff of each channel by species, length.
+    """
+    count, furthest = np.zeros(len(own), np.int64), np.zeros(len(own))
+    order, boxes = table.order, stacked(cells)
+    _overridden(own, imposed, table.index, order, x, species, r_cut, boxes, count, furthest)
+    return count, furthest
 
 
 def differ(
-    a: Float[np.ndarray, "rows 3 atoms"],
-    b: Float[np.ndarray, "rows 3 atoms"],
-    also: Bool[np.ndarray, "rows"] | None = None,
+    a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
 ) -> Bool[np.ndarray, "rows"]:
-    """Whether any number of a row differs between two runs (one that is not a number does).
-
-    Args:
-        also: rows of which it is known already.
-    """
-    out = np.zeros(len(a), bool) if also is None else also.copy()
-    _differ(a, b, out)
-    return out
+    """Whether any number of a row differs between two runs (one that is not a number does)."""
+    return (a != b).any(axis=(1, 2))

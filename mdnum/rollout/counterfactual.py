@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from mdnum.errors import InputError
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
-from mdnum.rollout.compared import Apart, ReferenceFrame, in_user_order
+from mdnum.rollout.compared import ReferenceFrame, in_user_order, overridden
 from mdnum.rollout.engine import Engine, Segment, Start
 from mdnum.rollout.epoch import EpochRecord, EpochState, empty_record, run_epoch
 from mdnum.rollout.tracks import Rows, taken
@@ -66,7 +66,6 @@ class Counterfactual:
         self._flat = self._program(shared=self._shares)
         self._own: tuple[PairTable, Any, int] | None = None
         self._led: PairTable | None = None
-        self._apart = Apart(simulation.cell)
         self._r_cut = _by_species(simulation)
         self._record: EpochRecord | None = None
 
@@ -129,8 +128,8 @@ class Counterfactual:
         energy = (np.asarray(record.potential) + np.asarray(record.kinetic))[:count]
         own, theirs = (np.asarray(bits)[:count] for bits in (record.bits, imposed))
         cells = record.boxes(count, simulation.pbc)
-        distances = Apart(*cells) if cells else self._apart
-        noted = distances.overridden(own, theirs, table, x, simulation.species, self._r_cut)
+        boxes = cells or (simulation.cell,)
+        noted = overridden(boxes, own, theirs, table, x, simulation.species, self._r_cut)
         # copies: the record is filled anew by the next stretch
         x, v = (in_user_order(part, table.order) for part in (x, v))
         self._record = record

@@ -7,14 +7,15 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.md.cell import Cell
 from mdnum.program import PairRows
-from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, ReferenceFrame, differ
+from mdnum.rollout.compared import CrossFlip, CrossRecorder, ReferenceFrame, differ, separations
 from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.flips import AmbiguousPairs
 from mdnum.rollout.tracks import Rows, Track
@@ -29,28 +30,29 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
         imposed: "B|A", B's arithmetic under A's decisions, and "A|B", the other way around, where wanted.
     """
     tracks = {"A": leader, "B": follower}
-    a, cell = leader.simulation, Apart(leader.simulation.cell)
+    runs: dict[str, Track | Counterfactual] = {**tracks, **imposed}
+    a, cell = leader.simulation, leader.simulation.cell
     crossing: CrossRecorder | None = None
     while leader.segment() is not None:
         end = leader.ready
-        (clock, flips_a), (rows_b, flips_b) = (track.until(end) for track in tracks.values())
+        rows = {name: run.until(end) for name, run in runs.items()}
+        clock, rows_b = rows["A"], rows["B"]
         assert clock is not None
-        rows = {"A": clock, "B": rows_b, **{name: run.until(end) for name, run in imposed.items()}}
         opening: list[CrossFlip] = []
         if crossing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
             crossing = CrossRecorder(leader.first_pairs, follower.first_pairs, a.atoms)
             opening = crossing.opening()
-        cross, flips = crossing.take(clock.first, len(clock), flips_a, flips_b)
-        separation = {"B": apart(cell, clock, rows_b)}
+        cross, flips = crossing.take(clock.first, len(clock), leader.flips(end), follower.flips(end))
+        separation = {"B": separation_of(cell, clock, rows_b)}
         # in the labels and axes of the run whose decisions it acts on; distances do not mind
         if "B|A" in rows:
-            separation["B|A"] = apart(cell, clock, rows["B|A"])
-            separation["B|A from B"] = _padded(apart(cell, rows_b, rows["B|A"]), clock)
+            separation["B|A"] = separation_of(cell, clock, rows["B|A"])
+            separation["B|A from B"] = _padded(separation_of(cell, rows_b, rows["B|A"]), clock)
         if "A|B" in rows:
             under_b = None if rows["A|B"] is None else _in_frame(rows["A|B"], follower.frame)
-            separation["A|B"] = _padded(apart(cell, rows_b, under_b), clock)
-            separation["A|B from A"] = apart(cell, clock, under_b)
+            separation["A|B"] = _padded(separation_of(cell, rows_b, under_b), clock)
+            separation["A|B from A"] = separation_of(cell, clock, under_b)
         nearest = {name: _nearest(track.simulation, rows[name], clock) for name, track in tracks.items()}
         doubts = {name: track.doubts(end) for name, track in tracks.items()}
         yield PairRows(
@@ -72,34 +74,42 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
                 for name, doubt in doubts.items()
             },
             doubts,
-            {name: run.failed for name, run in (tracks | dict(imposed)).items()},
+            {name: run.failed for name, run in runs.items()},
         )
         if follower.failed or leader.failed:
             return
+
+
+def beside(
+    leader: Track, runs: Sequence[Track | Counterfactual]
+) -> Iterator[list[Float[np.ndarray, "rows"]]]:
+    """Separations of runs from one, a stretch of its steps at a time."""
+    while leader.segment() is not None:
+        rows = leader.until(end := leader.ready)
+        yield [separation_of(leader.simulation.cell, rows, run.until(end)) for run in runs]
 
 
 def _in_frame(rows: Rows, frame: ReferenceFrame) -> Rows:
     return replace(rows, x=frame.positions(rows.x), v=frame.vectors(rows.v), nearest=None)
 
 
-def apart(cell: Apart, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
+def separation_of(cell: Cell, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
     """Largest distance between the same atoms of two runs at each step; NaN where the second has ended.
 
     Nearest images are those of the first run's boxes.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
-        count = min(len(a), len(b))
-        cell = Apart(*a.cells[:count]) if a.cells[:count] else cell
-        out[:count] = cell(a.x[:count], b.x[:count])
+        rows = min(len(a), len(b))
+        out[:rows] = separations(a.cells[:rows] or (cell,), a.x[:rows], b.x[:rows])
     return out
 
 
 def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
     out = np.ones(len(a), bool)
     if b is not None:
-        count = min(len(a), len(b))
-        out[:count] = differ(a.v[:count], b.v[:count], differ(a.x[:count], b.x[:count]))
+        rows = min(len(a), len(b))
+        out[:rows] = differ(a.x[:rows], b.x[:rows]) | differ(a.v[:rows], b.v[:rows])
     return out
 
 

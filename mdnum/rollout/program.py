@@ -14,11 +14,11 @@ from jaxtyping import Float, Int, UInt64
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
-from mdnum.rollout.compared import Apart, CrossFlip, ReferenceFrame
+from mdnum.rollout.compared import CrossFlip, ReferenceFrame
 from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
-from mdnum.rollout.lockstep import apart, lockstep
+from mdnum.rollout.lockstep import beside, lockstep
 from mdnum.rollout.tracks import Track
 from mdnum.systems import parameters
 from mdnum.systems.simulation import Simulation
@@ -122,17 +122,13 @@ class MdProgram:
 
         leader = Track(a, last, self.begin, flips=False, listener=listen)
         free = [Track(b.simulation, last, b.begin, frame, flips=False) for b in others]
-        cell = Apart(a.cell)
-        parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in others]
-        while leader.segment() is not None:
-            end = leader.ready
-            rows, _ = leader.until(end)
-            for (own, under), run, counterfactual in zip(parts, free, imposed, strict=True):
-                own.append(apart(cell, rows, run.until(end)[0]))
-                under.append(apart(cell, rows, counterfactual.until(end)))
-            if all(any((rows > tolerance).any() for rows in each) for pair in parts for each in pair):
+        parts: list[list[np.ndarray]] = []
+        for stretch in beside(leader, [*free, *imposed]):
+            parts.append(stretch)
+            if all(any((rows > tolerance).any() for rows in run) for run in zip(*parts, strict=True)):
                 break
-        return [(np.concatenate(own), np.concatenate(under)) for own, under in parts]
+        whole = [np.concatenate(run) for run in zip(*parts, strict=True)]
+        return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
         """The program with its atoms displaced at random, the furthest by about `size`.
@@ -249,7 +245,7 @@ class MdProgram:
         None where it ended before."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
-            rows, _ = track.until(track.ready)
+            rows = track.until(track.ready)
             if rows is not None and rows.first + len(rows) > step:
                 row = step - rows.first
                 cell = rows.cells[row] if rows.cells else self.simulation.cell

@@ -141,14 +141,18 @@ class Track:
         """The last step that has been read."""
         return self._ahead[-1].last
 
-    def until(self, last: int) -> tuple[Rows | None, PairFlips]:
-        """The rows not yet handed out up to a step, and the flips among them; fewer where the run ends."""
+    def until(self, last: int) -> Rows | None:
+        """The rows up to a step that were not yet asked for; fewer where the run ends, None without any."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
+        return taken(self._ahead, last)
+
+    def flips(self, last: int) -> PairFlips:
+        """The flips up to a step that were not yet asked for."""
         every = PairFlips.concatenate(self._flips)
         self._flips = [every[every.step > last]]
-        return taken(self._ahead, last), every[every.step <= last]
+        return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
         """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
