@@ -170,41 +170,26 @@ class Tersoff(ManyBody):
 
 # --- named sets of constants: a system file's `parameters` --------------------------------------------
 
-_PERIODIC = (True, True, True)
-_STILLINGER_WEBER: dict[str, dict[str, Any]] = {"Si": {}}
-_TERSOFF: dict[str, dict[str, Any]] = {
-    "Si": {},
-    # silicon of the multicomponent paper: lambda3 = 0 and three constants rounded otherwise
-    "Si-1989": {
-        "lambda3": 0.0,
-        "beta": 1.1000e-6,
-        "d": 16.217,
-        "h": -0.59825,
+_SETS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
+    "stillinger-weber": (StillingerWeber, {"Si": {}}),
+    # set Si(C), "T3"; of the multicomponent paper lambda3 = 0, and three constants rounded otherwise
+    "tersoff": (Tersoff, {"Si": {}, "Si-1989": {
+        "lambda3": 0.0, "beta": 1.1000e-6, "d": 16.217, "h": -0.59825,
         "sources": ("J. Tersoff, Phys. Rev. B 39, 5566 (1989), table I, silicon",),
-    },
-}
+    }}),
+}  # fmt: skip
 
 
-def stillinger_weber(parameters: str = "Si", pbc: tuple[bool, bool, bool] = _PERIODIC) -> StillingerWeber:
-    """Stillinger-Weber with a named set of constants.
-
-    Raises:
-        InputError: no such set.
-    """
-    return StillingerWeber(**_constants("Stillinger-Weber", _STILLINGER_WEBER, parameters), pbc=pbc)
-
-
-def tersoff(parameters: str = "Si", pbc: tuple[bool, bool, bool] = _PERIODIC) -> Tersoff:
-    """Tersoff with a named set of constants: Si (1988, set Si(C), "T3") or Si-1989.
+def named(
+    kind: str, parameters: str = "Si", pbc: tuple[bool, bool, bool] = (True, True, True)
+) -> StillingerWeber | Tersoff:
+    """A potential of this name, "stillinger-weber" or "tersoff", with a named set of constants.
 
     Raises:
         InputError: no such set.
     """
-    return Tersoff(**_constants("Tersoff", _TERSOFF, parameters), pbc=pbc)
-
-
-def _constants(noun: str, sets: dict[str, dict[str, Any]], name: str) -> dict[str, Any]:
-    if name not in sets:
-        are = "are" if len(sets) > 1 else "is"
-        raise InputError(f"no {noun} constants called {name!r}; known {are} {' and '.join(sets)}")
-    return sets[name]
+    made, sets = _SETS[kind]
+    if parameters not in sets:
+        known = f"{'are' if len(sets) > 1 else 'is'} {' and '.join(sets)}"
+        raise InputError(f"no constants of {kind} called {parameters!r}; known {known}")
+    return made(**sets[parameters], pbc=pbc)

@@ -122,5 +122,4 @@ def many_body(
             f"{potential.parameters}",
             remedy="Correct the structure or the potential",
         )
-    made = tetrahedral.tersoff if potential.kind == "tersoff" else tetrahedral.stillinger_weber
-    return made(potential.parameters, pbc)
+    return tetrahedral.named(potential.kind, potential.parameters, pbc)

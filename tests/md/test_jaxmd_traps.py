@@ -197,7 +197,7 @@ def test_tersoff_forces_are_nan_beside_padding(md):
         "mdnum.md.tetrahedral may wrap jax-md's energy function, if its cosines are mended too",
     )
     cell = jnp.asarray(atoms.cell.array)
-    assert np.isfinite(np.asarray(tetrahedral.tersoff().forces(positions, neighbor, cell))).all()
+    assert np.isfinite(np.asarray(tetrahedral.named("tersoff").forces(positions, neighbor, cell))).all()
 
 
 def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
@@ -250,7 +250,7 @@ def test_cosines_are_bent_by_a_length_of_1e_minus_7(md):
     cosine = float(md.quantity.cosine_angle_between_two_vectors(a, b))
     offset = np.sqrt(0.5) - cosine
     assert offset == pytest.approx(np.sqrt(0.5) * (1e-7 / 2.35 + 1e-7 / (2.35 * np.sqrt(2))), rel=1e-3), (
-        mended("adds 1e-7 to lengths in cosines", "the unit of length in tetrahedral.stillinger_weber may go")
+        mended("adds 1e-7 to lengths in cosines", "the unit of length in tetrahedral may go")
     )
     scaled = float(md.quantity.cosine_angle_between_two_vectors(a * 2.0**24, b * 2.0**24))
     assert abs(scaled - np.sqrt(0.5)) < 1e-14

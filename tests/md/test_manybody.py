@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -64,13 +65,14 @@ def _evaluate(potential, positions, idx, cell):
     return potential.evaluate(positions, jaxmd.as_neighbor_list(idx, positions, potential.format), cell)
 
 
+TERSOFF, STILLINGER_WEBER = (partial(tetrahedral.named, kind) for kind in ("tersoff", "stillinger-weber"))
 CASES = {
     "eam": (lambda: made_eam(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
-    "tersoff": (tetrahedral.tersoff, tersoff, "Si", 3, 0.05),
+    "tersoff": (TERSOFF, tersoff, "Si", 3, 0.05),
     # bonds inside the taper and beyond it
-    "tersoff, hot": (tetrahedral.tersoff, tersoff, "Si", 3, 0.15),
-    "stillinger-weber": (tetrahedral.stillinger_weber, stillinger_weber, "Si", 3, 0.05),
-    "stillinger-weber, hot": (tetrahedral.stillinger_weber, stillinger_weber, "Si", 3, 0.15),
+    "tersoff, hot": (TERSOFF, tersoff, "Si", 3, 0.15),
+    "stillinger-weber": (STILLINGER_WEBER, stillinger_weber, "Si", 3, 0.05),
+    "stillinger-weber, hot": (STILLINGER_WEBER, stillinger_weber, "Si", 3, 0.15),
 }
 
 
@@ -146,8 +148,8 @@ def test_triclinic_and_slab_agree_with_extended_precision():
     for atoms in (tilted, slab, free):
         pbc = tuple(bool(flag) for flag in atoms.pbc)
         for make, oracle in (
-            (tetrahedral.tersoff, tersoff),
-            (tetrahedral.stillinger_weber, stillinger_weber),
+            (TERSOFF, tersoff),
+            (STILLINGER_WEBER, stillinger_weber),
         ):
             potential = make(pbc=pbc)
             idx = jaxmd.dense_pairs(atoms.positions, atoms.cell.array, pbc, potential.r_cut + 0.3)
@@ -164,7 +166,7 @@ def test_tersoff_dimer_has_a_force_and_no_third_neighbor():
     atoms = cluster("Si", [[0, 0, 0], [2.4, 0, 0]])
     for r in (2.4, 2.8, 2.999):
         atoms.positions[1, 0] = r
-        energy, forces, _ = evaluate(tetrahedral.tersoff(), atoms)
+        energy, forces, _ = evaluate(tetrahedral.named("tersoff"), atoms)
         exact, exact_forces = energy_and_forces(tersoff(atoms), atoms.positions, [0, 1])
         assert abs(energy - exact) <= 1e-14
         np.testing.assert_allclose(forces[:2], exact_forces.astype(float), rtol=0, atol=1e-13)
@@ -254,8 +256,8 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     [
         (lambda: made_eam(COPPER, ["Cu", "Al"]), "table for Cu, .*holds Al"),
         (lambda: made_eam(COPPER.with_name("none.alloy")), "no such potential table"),
-        (lambda: tetrahedral.tersoff("Ge"), "known are Si and Si-1989"),
-        (lambda: tetrahedral.stillinger_weber("Ge"), "known is Si"),
+        (lambda: tetrahedral.named("tersoff", "Ge"), "known are Si and Si-1989"),
+        (lambda: tetrahedral.named("stillinger-weber", "Ge"), "known is Si"),
     ],
 )
 def test_another_element_and_a_missing_table_are_refused(make, message):
@@ -265,7 +267,7 @@ def test_another_element_and_a_missing_table_are_refused(make, message):
 
 def test_the_1989_constants_differ_from_those_of_1988():
     atoms = crystal("Si", 3, 0.0)
-    newer, older = tetrahedral.tersoff("Si-1989"), tetrahedral.tersoff("Si")
+    newer, older = tetrahedral.named("tersoff", "Si-1989"), tetrahedral.named("tersoff", "Si")
     per_atom = [evaluate(p, atoms)[0] / len(atoms) for p in (newer, older)]
     # cohesive energy of diamond silicon in both papers: 4.63 eV
     np.testing.assert_allclose(per_atom, -4.63, atol=5e-3)
