@@ -60,17 +60,9 @@ class StillingerWeber(ManyBody):
 
         # numbers stay Python floats here: nothing on this path downcasts them, and they take R's dtype
         _, total = upstream().energy.stillinger_weber_neighbor_list(
-            apart,
-            1.0,
-            sigma=self.sigma * _UNIT,
-            A=self.A,
-            B=self.B,
-            lam=self.strength,
-            gamma=self.gamma,
-            epsilon=self.epsilon,
-            cutoff=self.r_cut * _UNIT,
-            neighbor_list_fn=lambda *_, **__: None,
-        )
+            apart, 1.0, sigma=self.sigma * _UNIT, A=self.A, B=self.B, lam=self.strength, gamma=self.gamma,
+            epsilon=self.epsilon, cutoff=self.r_cut * _UNIT, neighbor_list_fn=lambda *_, **__: None,
+        )  # fmt: skip
         # jax-md mixes dtypes; the result has the dtype of the positions all the same
         with standard_promotion():
             return total(positions, neighbor)

@@ -162,18 +162,10 @@ class MdProgram:
             bound, inside = pair_bound(here, x, flip.i, flip.j), margin > 0
         owner = "A" if run == "start" else run
         return Decision(
-            channel="pair",
-            step=flip.step,
-            subject=(flip.i, flip.j),
-            run=run,
-            entered=entered,
-            a=int(inside),
-            b=int(not inside),
-            margins={owner: margin},
-            bounds={owner: bound},
-            separation=separation,
-            also=len(differing) - 1,
-        )
+            channel="pair", step=flip.step, subject=(flip.i, flip.j), run=run, entered=entered,
+            a=int(inside), b=int(not inside), margins={owner: margin}, bounds={owner: bound},
+            separation=separation, also=len(differing) - 1,
+        )  # fmt: skip
 
     def number(self, key: str) -> Number:
         """A number of the system, by its path."""
@@ -214,21 +206,12 @@ class MdProgram:
         place = min(range(len(pairs)), key=lambda k: max(abs(margin) for margin in margins[k]))
         inside = [bool(np.isin(keys[place], held)) for held, _, _ in sides]
         bounds = [pair_bound(here, x, *pairs[place]) for _, here, x in sides]
-        return Differing(
-            Decision(
-                channel="pair",
-                step=step,
-                subject=pairs[place],
-                run="A" if inside[0] else "B",
-                entered=True,
-                a=int(inside[0]),
-                b=int(inside[1]),
-                margins=dict(zip("AB", margins[place], strict=True)),
-                bounds=dict(zip("AB", bounds, strict=True)),
-                separation=float("nan"),
-                also=len(pairs) - 1,
-            )
-        )
+        nearest = Decision(
+            channel="pair", step=step, subject=pairs[place], run="A" if inside[0] else "B", entered=True,
+            a=int(inside[0]), b=int(inside[1]), margins=dict(zip("AB", margins[place], strict=True)),
+            bounds=dict(zip("AB", bounds, strict=True)), separation=float("nan"), also=len(pairs) - 1,
+        )  # fmt: skip
+        return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
         """Keys of the pairs inside at a step, the simulation in its box then, and the positions; by the
