@@ -30,7 +30,7 @@ from mdnum.gradients.problem import Gradient, Method, Problem, Progress, scalars
 from mdnum.gradients.recorded import EventAware
 from mdnum.gradients.tape import RunTape, TapeStretch
 from mdnum.numerics import PrecisionPolicy
-from mdnum.numerics.roles import LATTICE
+from mdnum.numerics.roles import FIXED_POINT
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
 from mdnum.systems.simulation import Simulation
 
@@ -38,7 +38,7 @@ from mdnum.systems.simulation import Simulation
 #: errors of the parameter, as shares of it.
 _WIDEST, _SPACING = 1e-4, 64.0
 #: Relative rounding of a fixed-point integer state: an impulse is rounded to a share of its unit.
-_LATTICE = 2.0**-30
+_FIXED_POINT = 2.0**-30
 #: About the number of runs it takes to choose a step: for the noise, and for one or two steps.
 _CHOOSING = 15
 #: Estimates of the noise by neighboring orders that are within this factor are believed.
@@ -208,8 +208,8 @@ class FiniteDifferences(Method):
             if widest is None:
                 # a shift below the relative spacing of the numbers that a parameter is kept in is none
                 policy = problem.simulation.policy
-                narrow = policy.state == LATTICE
-                rounding = _LATTICE if narrow else float(jnp.finfo(policy.dtype("force")).eps)
+                narrow = policy.state == FIXED_POINT
+                rounding = _FIXED_POINT if narrow else float(jnp.finfo(policy.dtype("force")).eps)
                 size, noise = choose_step(at, here, _WIDEST * abs(here), _SPACING * rounding * abs(here))
                 widest, details["noise"][name] = 2 * size, noise
             found = richardson(at, here, widest, self.levels)
@@ -250,7 +250,7 @@ class ShadowDifferences(Method):
     description = "differences of the loss in float64, of a run that is made in a narrower format"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        if problem.simulation.policy.state == LATTICE:
+        if problem.simulation.policy.state == FIXED_POINT:
             return "a fixed-point integer state is another program, not a rounded one"
         if problem.simulation.policy == PrecisionPolicy():
             return "the run is in float64 throughout, and there is no wider format to shadow it in"

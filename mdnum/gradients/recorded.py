@@ -29,8 +29,8 @@ from mdnum.gradients.problem import (
 )
 from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
+from mdnum.md.fixed_point import forgotten_bits
 from mdnum.md.integrators import without_kick
-from mdnum.md.lattice import forgotten_bits
 from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.simulation import Simulation
 
@@ -178,7 +178,7 @@ class Forward(Method):
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
         simulation = problem.simulation
-        if simulation.lattice is not None:
+        if simulation.fixed_point is not None:
             return "a fixed-point integer state has no tangent; the method reversible is for it"
         if self.saltation or simulation.pairwise:
             why = pairs_only(simulation)
@@ -229,7 +229,7 @@ class Reversible(Method):
     )
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        if problem.simulation.lattice is None:
+        if problem.simulation.fixed_point is None:
             return 'only steps of a fixed-point integer state can be reversed (precision.state = "lattice")'
         return pairs_only(problem.simulation)
 
@@ -237,10 +237,10 @@ class Reversible(Method):
         simulation = problem.simulation
         tape = ReversibleTape(simulation, problem.loss, problem.steps, progress=in_phase(progress, "run"))
         made = passed(problem, names, saltation=False, tape=tape, progress=progress)
-        assert simulation.lattice is not None
+        assert simulation.fixed_point is not None
         details = {
             "stretches": tape.stretches, "returned to the start": True,
-            "lattice": simulation.lattice.to_dict(float(simulation.integrator.timestep)),
+            "lattice": simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
             "bytes that grow with the run": tape.nbytes,
             "bits forgotten by friction a step": forgotten_bits(simulation.integrator),
         }  # fmt: skip

@@ -297,7 +297,7 @@ class Unrolled(Method):
     description = "the derivative of the steps that ran, by JAX, in its own forward pass"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        if problem.simulation.lattice is not None:
+        if problem.simulation.fixed_point is not None:
             return "a fixed-point integer state has no derivative; the method reversible is for it"
         return rounded(problem.simulation)
 

@@ -16,8 +16,8 @@ ALL: Mapping[str, np.dtype] = {
     "float16": np.dtype(np.float16),
     "bfloat16": np.dtype(ml_dtypes.bfloat16),
 }
-#: The state in whole numbers: doubles that are multiples of fixed units.
-LATTICE = "lattice"
+#: The word of a fixed-point state: doubles that are whole multiples of fixed units.
+FIXED_POINT = "lattice"
 #: Roles of molecular dynamics that sixteen bits cannot play, and why.
 _TOO_SHORT: Mapping[str, str] = {
     "state": "a step moves an atom by less than the spacing of such coordinates, so nothing would move",
@@ -27,8 +27,8 @@ _TOO_SHORT: Mapping[str, str] = {
 
 
 def carrier(name: str) -> np.dtype:
-    """The dtype of the arrays that hold numbers of a policy's word: whole numbers are held by doubles."""
-    return ALL["float64" if name == LATTICE else name]
+    """The dtype of the arrays that hold numbers of a policy's word: fixed-point ones are doubles."""
+    return ALL["float64" if name == FIXED_POINT else name]
 
 
 def _refuse_unknown(role: str, word: str, known: Mapping[str, object], noun: str = "dtype") -> None:
@@ -44,7 +44,7 @@ def check_role(role: str, dtype: str) -> None:
         InputError: no dtype is called that, or it has sixteen bits and the role needs more.
     """
     known = ALL if role == "force" else WIDE
-    if role == "state" and dtype == LATTICE:
+    if role == "state" and dtype == FIXED_POINT:
         return
     if dtype in ALL and dtype not in known:
         raise InputError(
@@ -63,7 +63,7 @@ class PrecisionPolicy:
         >>> mdnum.PrecisionPolicy(force="float32")
     """
 
-    # positions and velocities as they are carried from step to step; "lattice" for whole numbers
+    # positions and velocities as they are carried from step to step; "lattice" for fixed-point numbers
     state: str = "float64"
     # distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements are those
     # of the decision, rounded, and all that follows has sixteen bits up to the sum

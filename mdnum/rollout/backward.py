@@ -1,4 +1,4 @@
-"""A rollout on a lattice taken back: from where it ended to where it began, with lists of its own.
+"""A fixed-point rollout reversed: from where it ended to where it began, with lists of its own.
 
 Every step is undone by the integers that it added, so the states that come by are those of the run, bit for
 bit. The lists are built anew at places along the way back, without looking at those of the run: sums of
@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md.decide import Tables
+from mdnum.md.fixed_point import FixedPointStep
 from mdnum.md.integrators import ByAtom, unsorted
-from mdnum.md.lattice import LatticeStep
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import EpochProgram, EpochRecord, EpochState, write_row
@@ -76,7 +76,7 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
     order = tables.order
 
     masses = program.masses[order]
-    scheme: LatticeStep = program.integrator  # type: ignore[assignment]
+    scheme: FixedPointStep = program.integrator  # type: ignore[assignment]
     half = 0.5 * scheme.timestep
     room = record.potential.shape[0]
     here = Back(back.step, *jax.tree.map(lambda a: a[:, order], back[1:]))
@@ -121,23 +121,23 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
 
 
 class BackwardRun:
-    """Takes a rollout on a lattice back.
+    """Reverses a fixed-point rollout.
 
     Args:
-        simulation: the system as objects, on a lattice.
+        simulation: the system as objects, with a fixed-point state.
         end: the state after its last step.
         baths: what was put aside, by the step before which it was.
 
     Raises:
-        InputError: the state is not in whole numbers.
+        InputError: the state is not a fixed-point one.
     """
 
     def __init__(
         self, simulation: Simulation, end: EpochState, baths: Mapping[int, np.ndarray] | None = None
     ):
-        if simulation.lattice is None:
+        if simulation.fixed_point is None:
             raise InputError(
-                "only steps in whole numbers can be taken back",
+                "only fixed-point steps can be reversed",
                 where="precision.state",
                 remedy='Use state = "lattice"',
             )

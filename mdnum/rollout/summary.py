@@ -164,8 +164,8 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
             "bound": max(tally.bound, *simulation.decider.bounds),
         },
         "lattice": None
-        if simulation.lattice is None
-        else simulation.lattice.to_dict(float(simulation.integrator.timestep)),
+        if simulation.fixed_point is None
+        else simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
         "beyond_cutoff": beyond_cutoff(simulation),
         "ase": None,
         "findings": [],

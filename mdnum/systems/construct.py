@@ -15,14 +15,14 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
+from mdnum.md.fixed_point import FixedPointDecider, FixedPointUnits
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
 from mdnum.md.potentials import Channels, CutPotential, PairPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
 from mdnum.numerics.reductions import REDUCTIONS
-from mdnum.numerics.roles import LATTICE
+from mdnum.numerics.roles import FIXED_POINT
 from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, pair_key, pair_names
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import Draw, check, smallest_distance, species_of
@@ -319,7 +319,7 @@ def assembled(
         builder: "auto" for the search that is fastest here.
 
     Raises:
-        InputError: the cutoff and skin do not fit the box, or the state cannot be one of whole numbers.
+        InputError: the cutoff and skin do not fit the box, or the state cannot be a fixed-point one.
     """
     check_not_forked()
     cell = Cell.create(np.asarray(atoms.cell), atoms.pbc)
@@ -341,7 +341,7 @@ def assembled(
         origin, atoms, units, symbols, cell, positions, velocities, masses, species, model, decider, rule,
         builder, policy, reduction, integrator, draw, steps, save_every,
     )  # fmt: skip
-    made = in_whole_numbers(made) if policy.state == LATTICE else made
+    made = in_fixed_point(made) if policy.state == FIXED_POINT else made
     if origin.system is None:
         return made
     # from now on another part is a change
@@ -388,18 +388,18 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
     )  # fmt: skip
 
 
-def in_whole_numbers(simulation: Simulation) -> Simulation:
-    """The simulation on a lattice, in a box that fits it."""
+def in_fixed_point(simulation: Simulation) -> Simulation:
+    """The simulation with a fixed-point state, in a box that fits it."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'state = "lattice" decides and sums in whole numbers, from forces in float64',
+            'state = "lattice" decides and sums in fixed-point numbers, from forces in float64',
             where="precision",
             remedy="Leave out force, decision and accumulate",
         )
     kT = units.k_B * simulation.draw.temperature
     own = masses * np.linalg.norm(simulation.velocities, axis=1)
-    lattice = Lattice.create(
+    fixed_point = FixedPointUnits.create(
         simulation.cell,
         simulation.r_cut + simulation.rule.skin,
         simulation.model,
@@ -407,7 +407,7 @@ def in_whole_numbers(simulation: Simulation) -> Simulation:
         kT,
         float(simulation.integrator.timestep),
     )
-    cell, old = lattice.cell(simulation.cell), simulation.decider
+    cell, old = fixed_point.cell(simulation.cell), simulation.decider
     atoms, origin = simulation.structure.copy(), simulation.origin
     atoms.set_cell(np.asarray(cell.matrix))
     if origin.system is not None:
@@ -417,11 +417,11 @@ def in_whole_numbers(simulation: Simulation) -> Simulation:
         origin=origin,
         structure=atoms,
         cell=cell,
-        decider=LatticeDecider(
-            old.r_cut, old.compare, "float64", cell.reach(simulation.positions), spacing=lattice.spacing
+        decider=FixedPointDecider(
+            old.r_cut, old.compare, "float64", cell.reach(simulation.positions), spacing=fixed_point.spacing
         ),
-        lattice=lattice,
+        fixed_point=fixed_point,
     )
-    # made here, so that a friction that a lattice cannot have is refused before the run
+    # made here, so that a friction that no fixed-point step can have is refused before the run
     assert made.propagator is not None
     return made

@@ -29,11 +29,11 @@ from mdnum.md.manybody import leaves_by_path, quantities_of, with_quantities
 from mdnum.md.neighbors import check_radius
 from mdnum.md.potentials import Channels, CutPotential
 from mdnum.numerics.reductions import REDUCTIONS
-from mdnum.numerics.roles import LATTICE
+from mdnum.numerics.roles import FIXED_POINT
 from mdnum.registry import nearest
 from mdnum.systems import schema, structures, toml
 from mdnum.systems.build import build
-from mdnum.systems.construct import in_whole_numbers
+from mdnum.systems.construct import in_fixed_point
 from mdnum.systems.load import System
 from mdnum.systems.simulation import Simulation
 
@@ -412,11 +412,11 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
         return replace(simulation, reduction=REDUCTIONS.parse(given))
     if table == "precision":
         policy = replace(simulation.policy, **{name: given})
-        if simulation.lattice is not None:
-            message = "a state of whole numbers cannot become another"
+        if simulation.fixed_point is not None:
+            message = "a fixed-point state cannot become another"
             raise InputError(message, where=key, remedy="Make it again")
         other = simulation.with_policy(policy)
-        return in_whole_numbers(other) if policy.state == LATTICE else other
+        return in_fixed_point(other) if policy.state == FIXED_POINT else other
     if key == "neighbors.builder":
         return replace(simulation, builder=given)
     if key.startswith("neighbors.rebuild."):

@@ -436,8 +436,8 @@ class PrecisionTable(TomlTable):
 
     state: Literal["float64", "float32", "lattice"] = Field(
         default="float64",
-        description="positions and velocities (with sixteen bits a step would move no atom); lattice: whole "
-        "numbers, whose decisions and sums have no rounding and whose steps can be taken back exactly",
+        description="positions and velocities (with sixteen bits a step would move no atom); lattice: "
+        "fixed-point numbers, decisions and sums without rounding, steps that can be reversed exactly",
     )
     force: Literal["float64", "float32", "bfloat16", "float16"] = Field(
         default="float64",

@@ -17,13 +17,13 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
+from mdnum.md.fixed_point import FixedPointForce, FixedPointStep, FixedPointUnits, fixed_point_steps
 from mdnum.md.integrators import Integrator
-from mdnum.md.lattice import Lattice, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ChannelForce, ManyBodyForce, PairForce
 from mdnum.md.potentials import Channels, CutPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
-from mdnum.numerics.roles import LATTICE, WIDE
+from mdnum.numerics.roles import FIXED_POINT, WIDE
 from mdnum.systems import describe
 from mdnum.systems.evaluate import Evaluation, Evaluator
 from mdnum.systems.schema import ONSET_FRACTION
@@ -79,7 +79,7 @@ class Simulation:
         draw: how the velocities of step 0 were made.
         steps, save_every: last step of a run, and steps from one frame of its trajectory to the next (0:
             none), unless a run is asked for others.
-        lattice: units of a state in whole numbers; None where it is one of floats.
+        fixed_point: units of a fixed-point state; None where it is one of floats.
     """
 
     origin: Origin
@@ -101,10 +101,10 @@ class Simulation:
     draw: Draw
     steps: int
     save_every: int
-    lattice: Lattice | None = None
+    fixed_point: FixedPointUnits | None = None
 
     def __post_init__(self):
-        short = self.policy.state == LATTICE or self.policy.force not in WIDE
+        short = self.policy.state == FIXED_POINT or self.policy.force not in WIDE
         if not self.pairwise and self.policy != PrecisionPolicy():
             message = "many-body potentials are evaluated in float64 only"
             raise InputError(message, where="precision", remedy="Remove the [precision] table")
@@ -170,28 +170,28 @@ class Simulation:
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
-            if self.lattice is not None:
-                return LatticeForce.on(self.lattice, *parts)
+            if self.fixed_point is not None:
+                return FixedPointForce.on(self.fixed_point, *parts)
             if self.pairwise:
                 return (PairForce if self.channels == 1 else ChannelForce).create(*parts)
             return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
 
     @cached_property
     def propagator(self) -> Integrator:
-        """The dynamics as the state needs it: the integrator, or its twin in whole numbers.
+        """The dynamics as the state needs it: the integrator, or its fixed-point twin.
 
         Raises:
-            InputError: an integrator, or a friction, that a lattice cannot have.
+            InputError: an integrator, or a friction, that no fixed-point step can have.
         """
-        if self.lattice is None:
+        if self.fixed_point is None:
             return self.integrator
         with jax.ensure_compile_time_eval():
-            return on_lattice(self.integrator, self.lattice)
+            return fixed_point_steps(self.integrator, self.fixed_point)
 
     @property
     def smooth(self) -> Simulation:
-        """The same system in floats: what is linearized, since a whole number has no derivative."""
-        return self if self.lattice is None else replace(self, lattice=None)
+        """The same system in floats: what is linearized, since an integer has no derivative."""
+        return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
     def path(self) -> Path | None:
@@ -209,13 +209,13 @@ class Simulation:
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
         """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
-        if self.lattice is None:
+        if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
-        assert isinstance(scheme, LatticeStep)
+        assert isinstance(scheme, FixedPointStep)
         v = scheme.velocity(scheme.momentum(jnp.asarray(self.velocities.T), masses), masses)
         # an integer has no negative zero
-        return self.lattice.positions(self.positions) + 0.0, np.asarray(v).T + 0.0
+        return self.fixed_point.positions(self.positions) + 0.0, np.asarray(v).T + 0.0
 
     @property
     def channels(self) -> int:
@@ -366,7 +366,7 @@ class Simulation:
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
         """The same system in floats of these roles, by default float64 throughout."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
-        return replace(self, policy=policy, decider=decider, lattice=None)
+        return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
         """The same system in the box of a row; where the integrator leaves the box as it is, itself."""
@@ -375,7 +375,7 @@ class Simulation:
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
         check_radius(cell, self.r_cut, 0.0)
-        cell = cell if self.lattice is None else self.lattice.cell(cell)
+        cell = cell if self.fixed_point is None else self.fixed_point.cell(cell)
         return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
 
     def evaluate(

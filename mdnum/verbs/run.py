@@ -210,7 +210,7 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
-    if simulation.lattice is None or simulation.integrator.random is not None:
+    if simulation.fixed_point is None or simulation.integrator.random is not None:
         return
     steps = min(int(summary["steps"]), _BESIDE)
     float64 = []

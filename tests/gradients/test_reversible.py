@@ -1,4 +1,4 @@
-"""Runs taken back: the states that come by are those of the run, and the gradient is theirs."""
+"""Runs reversed: the states that come by are those of the run, and the gradient is theirs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STEPS = 120
 
 
 def small(cutoff=HARD, potential=LENNARD_JONES, **tables):
-    """32 atoms in a box 3.6 wide, in whole numbers."""
+    """32 atoms in a box 3.6 wide, in fixed-point numbers."""
     return build(make(crystal(repeat=2), potential, cutoff, precision={"state": "lattice"}, **tables))
 
 
@@ -85,7 +85,7 @@ def test_derivatives_are_those_of_differences():
     asked = Problem(simulation, everything(simulation.atoms), 40)
     names = ("sigma", "epsilon", "timestep", "temperature")
     ours = Reversible()(asked, (*names, "x0", "v0"))
-    # steps far wider than the lattice, so that its roundings average out
+    # steps far wider than the spacing, so that its roundings average out
     theirs = FiniteDifferences(relative=1e-3, levels=3)(asked, names)
     assert ours.value == theirs.value and ours.details["returned to the start"]
     for name, value in theirs.gradient.items():
@@ -119,7 +119,7 @@ def test_a_hundred_thousand_steps_back_to_the_start(bath):
     """Lists of the way back are built independently; `backward` raises where a bit of the start is wrong."""
     gentle = {**BATH, "friction": 1.0}
     simulation = small(**({"dynamics": gentle} if bath else {}))
-    assert simulation.lattice is not None
+    assert simulation.fixed_point is not None
     # with friction a step takes three times as long, and nothing more is to be seen
     steps = 5_000 if bath else 100_000
     tape = ReversibleTape(simulation, FinalProjection(), steps)
@@ -128,7 +128,7 @@ def test_a_hundred_thousand_steps_back_to_the_start(bath):
         rows += stretch.rows
         first = stretch
     assert rows == steps + 1 and first.first == 0
-    x = simulation.lattice.positions(simulation.positions)
+    x = simulation.fixed_point.positions(simulation.positions)
     matrix = np.asarray(simulation.cell.matrix)
     back = (first.x[0] + (matrix.T @ first.images[0])).T[np.argsort(first.table.order)]
     assert np.array_equal(back, x)

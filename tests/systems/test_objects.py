@@ -106,7 +106,7 @@ def test_a_shipped_system_from_objects_is_that_of_its_file(name):
     assert len(mine) == len(its) > 5
     assert all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in zip(mine, its, strict=True))
     assert again.decider == made.decider and again.rule == made.rule and again.policy == made.policy
-    assert eqx.tree_equal(again.lattice, made.lattice) and again.units == made.units
+    assert eqx.tree_equal(again.fixed_point, made.fixed_point) and again.units == made.units
 
 
 def test_objects_leave_the_tables_and_verdicts_of_a_file_and_no_file_is_made(tmp_path, monkeypatch):

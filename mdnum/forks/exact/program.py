@@ -120,7 +120,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
             "potential.kind",
         ),
         (
-            simulation.lattice is not None,
+            simulation.fixed_point is not None,
             "a run in fixed-point integers is exact already: its decisions and sums have no rounding",
             "Use --set precision.state=float64",
             "precision.state",

@@ -13,17 +13,17 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.md.decide import CONVENTIONS
-from mdnum.md.lattice import REACH_BITS, LatticeDecider, power_of_two
+from mdnum.md.fixed_point import REACH_BITS, FixedPointDecider, power_of_two
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 
 HARD = {"kind": "hard", "radius": 1.5}
-LATTICE = {"state": "lattice"}
+FIXED_POINT = {"state": "lattice"}
 
 
 def small(**tables):
     """32 atoms in a box 3.6 wide."""
-    return build(make(crystal(repeat=2), LENNARD_JONES, HARD, **{"precision": LATTICE, **tables}))
+    return build(make(crystal(repeat=2), LENNARD_JONES, HARD, **{"precision": FIXED_POINT, **tables}))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def run(simulation, steps: int):
 @pytest.mark.parametrize("compare", CONVENTIONS)
 @pytest.mark.parametrize("radius", (1.5, 1.1, 2.0**0.5))
 def test_the_limit_is_that_of_exact_fractions(compare, radius):
-    decider = LatticeDecider((radius,), compare, spacing=2.0**-29)
+    decider = FixedPointDecider((radius,), compare, spacing=2.0**-29)
     (limit,) = decider.limits
     unit = Fraction(decider.spacing)
 
@@ -60,7 +60,7 @@ def test_the_limit_is_that_of_exact_fractions(compare, radius):
 
 
 def test_a_margin_has_the_sign_of_its_decision_where_doubles_round():
-    decider = LatticeDecider((1.5,), "r2 <", spacing=power_of_two(1.7 / 2**REACH_BITS))
+    decider = FixedPointDecider((1.5,), "r2 <", spacing=power_of_two(1.7 / 2**REACH_BITS))
     edge = round(1.5 / decider.spacing)
     for step in (-1, 0, 1):
         d = (np.array([(edge + step) * decider.spacing]), np.zeros(1), np.zeros(1))
@@ -70,11 +70,11 @@ def test_a_margin_has_the_sign_of_its_decision_where_doubles_round():
 
 def test_forces_sum_to_nothing_and_agree_with_floats(liquid):
     forces = liquid.evaluate().forces
-    counted = forces / liquid.lattice.force
+    counted = forces / liquid.fixed_point.force
     assert np.array_equal(counted, np.round(counted)) and np.abs(counted).max() > 2**30
     # exact in integers of any size
     assert [sum(int(q) for q in column) for column in counted.T] == [0, 0, 0]
-    floats = liquid.smooth.evaluate(liquid.lattice.positions(liquid.positions))
+    floats = liquid.smooth.evaluate(liquid.fixed_point.positions(liquid.positions))
     assert np.allclose(forces, floats.forces, rtol=0, atol=1e-9)
     assert liquid.evaluate().energy == pytest.approx(floats.energy, rel=1e-11)
 
@@ -84,7 +84,7 @@ def test_places_and_momenta_stay_whole_and_momentum_is_conserved(liquid):
     scheme, masses = liquid.propagator, jnp.asarray(liquid.masses)
     start = None
     for x, v, _ in rows[::20]:
-        places = x / liquid.lattice.spacing
+        places = x / liquid.fixed_point.spacing
         assert np.array_equal(places, np.round(places))
         momentum = np.asarray(scheme.momentum(jnp.asarray(v.T), masses))
         assert np.array_equal(scheme.velocity(jnp.asarray(momentum), masses), v.T)
@@ -92,7 +92,7 @@ def test_places_and_momenta_stay_whole_and_momentum_is_conserved(liquid):
         start = total if start is None else start
         assert total == start
     # the unit that a person is told: momenta are whole multiples of it, and have no larger one in common
-    told = liquid.lattice.to_dict(float(liquid.integrator.timestep))["momentum"]
+    told = liquid.fixed_point.to_dict(float(liquid.integrator.timestep))["momentum"]
     counted = liquid.masses[:, None] * rows[-1][1] / told
     whole = np.rint(counted)
     assert np.abs(counted - whole).max() < 1e-3 and math.gcd(*map(int, whole.flat)) == 1
@@ -139,21 +139,26 @@ def test_neither_lists_nor_the_order_of_sums_matter(liquid):
     for changed in (
         small(neighbors={"skin": 0.1}),
         small(neighbors={"skin": 0.2, "builder": "jax-md"}),
-        small(precision={**LATTICE, "reduction": "permuted"}),
+        small(precision={**FIXED_POINT, "reduction": "permuted"}),
     ):
         # the units are chosen by the radius of the list; the same for all of these
-        assert changed.lattice == liquid.lattice
+        assert changed.fixed_point == liquid.fixed_point
         same(plain, run(changed, 400))
 
 
 def test_an_atom_at_the_far_face_is_at_the_near_one(liquid):
     length = float(liquid.cell.matrix[0, 0])
-    x = jnp.asarray([length, 0.0, length - liquid.lattice.spacing, -liquid.lattice.spacing])
+    x = jnp.asarray([length, 0.0, length - liquid.fixed_point.spacing, -liquid.fixed_point.spacing])
     (wrapped, _, _), _ = liquid.cell.astype(np.float64).wrap(x, x, x)
-    assert wrapped.tolist() == [0.0, 0.0, length - liquid.lattice.spacing, length - liquid.lattice.spacing]
+    assert wrapped.tolist() == [
+        0.0,
+        0.0,
+        length - liquid.fixed_point.spacing,
+        length - liquid.fixed_point.spacing,
+    ]
 
 
-def test_what_a_lattice_cannot_be_is_refused():
+def test_what_a_fixed_point_state_cannot_be_is_refused():
     with pytest.raises(InputError, match="right angles"):
         build("argon/tilted-500", {"precision.state": "lattice"})
     with pytest.raises(InputError, match="Leave out force"):

@@ -61,7 +61,7 @@ def power_of_two(x: float) -> float:
 
 
 @dataclass(frozen=True)
-class Lattice:
+class FixedPointUnits:
     """The units in which a run counts."""
 
     spacing: float  # of positions, length, the same along all axes
@@ -79,7 +79,7 @@ class Lattice:
         momentum: Float[np.ndarray, "atoms"],
         kT: float,
         timestep: float,
-    ) -> Lattice:
+    ) -> FixedPointUnits:
         """Units for a box, a list and a potential.
 
         The spacing is the finest at which squared distances of listed pairs are exact; the unit of force the
@@ -115,13 +115,13 @@ class Lattice:
         """
         if not cell.orthorhombic:
             raise InputError(
-                "a lattice of whole numbers needs a box with right angles along x, y and z",
+                "a fixed-point state needs a box with right angles along x, y and z",
                 where="precision.state",
                 remedy='Use state = "float64" for a tilted box',
             )
         matrix = np.round(np.asarray(cell.matrix, np.float64) / self.spacing)
         if np.max(np.abs(matrix)) >= 2**50:
-            raise InputError("the box is too large for a lattice this fine", where="precision.state")
+            raise InputError("the box is too large for positions this fine", where="precision.state")
         made = Cell.create(matrix * self.spacing, cell.pbc)
         # an atom at the far face is at the near one: L times its inverse must not round below 1
         inverse, edges = np.array(made.inverse), np.diag(matrix * self.spacing)
@@ -131,7 +131,7 @@ class Lattice:
         return eqx.tree_at(lambda one: one.inverse, made, inverse)
 
     def positions(self, x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "atoms 3"]:
-        """The nearest points of the lattice."""
+        """The nearest whole multiples of the spacing."""
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
@@ -162,7 +162,7 @@ def _depth(model: CutPotential) -> float:
 
 
 @dataclass(frozen=True)
-class LatticeDecider(PairDecider):
+class FixedPointDecider(PairDecider):
     """Whether a pair is inside, as a comparison of two integers.
 
     The squared distance is a whole number of squared spacings. Each convention becomes `r2 < limit` with a
@@ -170,7 +170,7 @@ class LatticeDecider(PairDecider):
     and none has a rounding error.
     """
 
-    spacing: float = 1.0  # of the lattice, length
+    spacing: float = 1.0  # of positions, length
 
     @property
     def space(self) -> str:
@@ -216,19 +216,19 @@ class LatticeDecider(PairDecider):
         return (left - 0.5) * (self.spacing * self.spacing)
 
 
-# --- steps between whole numbers, forward and back ----------------------------------------------------
+# --- steps in fixed-point numbers, forward and back --------------------------------------------------
 
-# a velocity in float64 tells its integer momentum back up to here
+# a velocity in float64 gives back its integer momentum up to here
 _LARGEST = 2.0**50
 # friction is a multiple of 2^-24; the remainders may take the bits of a 64-bit integer that are left
 _SHIFT = 24
 _ROOM = 62 - _SHIFT
 
 
-class LatticeStep(Integrator):
-    """Kicks, drifts and sums in whole numbers: what the schemes on a lattice share."""
+class FixedPointStep(Integrator):
+    """Kicks, drifts and sums of integers: what the fixed-point schemes share."""
 
-    lattice: Lattice = eqx.field(static=True, kw_only=True)  # the units
+    units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # unit of momentum: that of force times half a time step
     impulse: Float[Array, ""] = eqx.field(kw_only=True)
     # spacings that an atom of unit mass moves in a step for each unit of momentum
@@ -240,7 +240,7 @@ class LatticeStep(Integrator):
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Velocities of momenta; NaN where one is too large to be told back."""
+        """Velocities of momenta; NaN where one is too large to be recovered."""
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
@@ -265,16 +265,16 @@ class LatticeStep(Integrator):
 
     def kinetic(self, v, masses):
         """The same in every order of atoms."""
-        return self.lattice.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
+        return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Places after a share of a step at given momenta; direction -1 takes it back."""
+        """Places after a share of a step at given momenta; direction -1 reverses it."""
         moved = jnp.round(p * (share * self.stride / masses))
-        return x + direction * self.lattice.spacing * moved
+        return x + direction * self.units.spacing * moved
 
 
-class LatticeVerlet(LatticeStep):
-    """NVE in whole numbers."""
+class FixedPointVerlet(FixedPointStep):
+    """NVE in fixed-point numbers."""
 
     name = "nve"
 
@@ -286,8 +286,8 @@ class LatticeVerlet(LatticeStep):
         return self.glide(x, self.momentum(v, masses), masses, 1.0, -1), v, extra
 
 
-class LatticeLangevin(LatticeStep):
-    """BAOAB in whole numbers; what friction forgets goes into the bath, its extra state."""
+class FixedPointLangevin(FixedPointStep):
+    """BAOAB in fixed-point numbers; what friction forgets goes into the bath, its extra state."""
 
     name = "langevin"
     keeps_momentum = False
@@ -333,24 +333,24 @@ class LatticeLangevin(LatticeStep):
         return self.glide(x, before, masses, 0.5, -1), self.velocity(before, masses), bath
 
 
-def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | LatticeLangevin:
-    """The scheme in whole numbers.
+def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPointStep:
+    """The scheme in fixed-point numbers.
 
     Raises:
         InputError: the friction is too small or too large for a step, or the integrator has no such twin.
     """
     if type(integrator) not in (VelocityVerlet, Langevin):
         raise InputError(
-            f"in whole numbers there are steps of nve and langevin, and none of {integrator.name}",
+            f"in fixed-point numbers there are steps of nve and langevin, and none of {integrator.name}",
             where="precision.state",
             remedy='Use state = "float64"',
         )
     timestep = float(integrator.timestep)
-    impulse = lattice.force * (0.5 * timestep)
+    impulse = units.force * (0.5 * timestep)
     common = {
-        "lattice": lattice,
+        "units": units,
         "impulse": jnp.asarray(impulse, jnp.float64),
-        "stride": jnp.asarray(timestep * impulse / lattice.spacing, jnp.float64),
+        "stride": jnp.asarray(timestep * impulse / units.spacing, jnp.float64),
         "zero": zero_bits(np.float64),
     }
     if isinstance(integrator, Langevin):
@@ -359,12 +359,12 @@ def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | Latt
         period = _period(kept)
         if period < 1:
             raise InputError(
-                f"friction x timestep = {loss:.3g}; on a lattice it must lie between 1e-7 and 10",
+                f"friction x timestep = {loss:.3g}; in fixed-point numbers it must lie between 1e-7 and 10",
                 where="dynamics.friction",
             )
         decay = kept / 2**_SHIFT
         spread = math.sqrt(float(integrator.kT) * (1 - decay * decay)) / impulse
-        return LatticeLangevin(
+        return FixedPointLangevin(
             integrator.timestep,
             key=integrator.key,
             kept=jnp.asarray(kept, jnp.int64),
@@ -372,7 +372,7 @@ def on_lattice(integrator: Integrator, lattice: Lattice) -> LatticeVerlet | Latt
             pause=jnp.asarray(period, jnp.int64),
             **common,
         )
-    return LatticeVerlet(integrator.timestep, **common)
+    return FixedPointVerlet(integrator.timestep, **common)
 
 
 def _period(kept: int) -> int:
@@ -391,7 +391,7 @@ def forgotten_bits(integrator: Integrator) -> float:
     return 0.0
 
 
-# --- pair forces between whole numbers: decided exactly, rounded pair by pair, summed without rounding ---
+# --- pair forces of integer distances: decided exactly, rounded pair by pair, summed without rounding ---
 
 # added to a double below 2^51 it leaves the nearest integer in the low bits
 _ROUND = 1.5 * 2**52
@@ -408,20 +408,22 @@ def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
 def _counted_jvp(primals, tangents):
     # a derivative of 0 would be taken for an answer
     raise InputError(
-        "a program in whole numbers has no derivative of its own",
+        "a program in fixed-point numbers has no derivative of its own",
         where="precision.state",
         remedy="Use the method reversible or symmetric, which count a rounding as the identity",
     )
 
 
-class LatticeJudge(SlotJudge):
-    """Decides as `SlotJudge` does, with integers in the units of a lattice."""
+class FixedPointJudge(SlotJudge):
+    """Decides as `SlotJudge` does, with integers, in fixed-point units."""
 
-    def __init__(self, decider: LatticeDecider, limits, cell: Cell, zero, positions, lattice: Lattice):
-        inverse = 1 / lattice.spacing
-        self.decider, self.zero, self.lattice = decider, zero, lattice
-        # powers of two, so nothing is rounded but positions that were not on the lattice
-        self.cell = Cell(cell.matrix * inverse, cell.inverse * lattice.spacing, cell.pbc, cell.orthorhombic)
+    def __init__(
+        self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits
+    ):
+        inverse = 1 / units.spacing
+        self.decider, self.zero, self.units = decider, zero, units
+        # powers of two, so nothing is rounded but positions that were no multiples of the spacing
+        self.cell = Cell(cell.matrix * inverse, cell.inverse * units.spacing, cell.pbc, cell.orthorhombic)
         self.components = tuple(jnp.round(positions.astype(jnp.float64) * inverse))
         self.atoms = positions.shape[1]
         self.value = limits
@@ -457,23 +459,23 @@ class LatticeJudge(SlotJudge):
 
     def finish(self, nearest, halves) -> Decisions:
         """The pass's decisions, two groups to a byte."""
-        unit = self.lattice.spacing * self.lattice.spacing
+        unit = self.units.spacing * self.units.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
         margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)
         return Decisions(packed(halves), margin)
 
 
-class LatticeForce(PairForce):
-    """Forces and decisions of a cut pair potential on a lattice."""
+class FixedPointForce(PairForce):
+    """Forces and decisions of a cut pair potential in fixed-point numbers."""
 
-    lattice: Lattice = eqx.field(static=True, kw_only=True)  # the units
+    units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # squared distance below which a pair leaves the range of exact sums
     closest: Float[Array, ""] = eqx.field(kw_only=True)
 
     @classmethod
     def on(
-        cls, lattice: Lattice, model: CutPotential, cell: Cell, decider, policy, reduction
-    ) -> LatticeForce:
+        cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
+    ) -> FixedPointForce:
         """The parameters in float64; sums are exact, so the reduction makes no difference."""
         return cls(
             model.astype(np.float64),
@@ -483,8 +485,8 @@ class LatticeForce(PairForce):
             decider.convention,
             policy,
             reduction,
-            lattice=lattice,
-            closest=jnp.asarray(_closest(model, lattice), jnp.float64),
+            units=units,
+            closest=jnp.asarray(_closest(model, units), jnp.float64),
         )
 
     @property
@@ -492,13 +494,13 @@ class LatticeForce(PairForce):
         """The potential with bits that no compiler changes."""
         return Guarded(self.model, self.zero, reproducible)
 
-    def judge(self, positions: Float[Array, "3 atoms"]) -> LatticeJudge:
+    def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:
         """What decides at these positions."""
-        assert isinstance(self.decider, LatticeDecider)
-        return LatticeJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.lattice)
+        assert isinstance(self.decider, FixedPointDecider)
+        return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 
     def decide(self, positions, tables):
-        """As `PairForce`, of whole numbers."""
+        """As `PairForce`, of integer distances."""
         return self.judge(positions).decide(tables)
 
     def __call__(self, positions, tables, *, decisions, given=None, where=None):
@@ -506,11 +508,11 @@ class LatticeForce(PairForce):
 
         Where a pair is so close that its force would leave the range of exact sums, the energy is NaN.
         """
-        judge, lattice = self.judge(positions), self.lattice
+        judge, units = self.judge(positions), self.units
         law, zero = self.law, self.zero
         at = law.at_cutoff()
-        unit = lattice.spacing * lattice.spacing
-        steps = lattice.spacing / lattice.force
+        unit = units.spacing * units.spacing
+        steps = units.spacing / units.force
         # what a pair outside is evaluated at
         far = jnp.max(self.model.r_cut) ** 2
 
@@ -531,7 +533,7 @@ class LatticeForce(PairForce):
             pull = slope + slope
             # worked out once: each component's loop would work it out again
             force, d = lax.optimization_barrier((pull * steps, d))
-            terms = (*(force * c for c in d), energy * (1 / lattice.energy), pull * r2 * (1 / lattice.energy))
+            terms = (*(force * c for c in d), energy * (1 / units.energy), pull * r2 * (1 / units.energy))
             added = []
             for total, term in zip(totals, terms, strict=True):
                 whole = counted(term, zero)
@@ -553,20 +555,20 @@ class LatticeForce(PairForce):
         fx, fy, fz, energy = (total.astype(jnp.float64) for total in summed)
         exact = jnp.min(close) > self.closest
         return Forces(
-            jnp.stack([fx, fy, fz]) * lattice.force,
-            jnp.where(exact, energy, jnp.nan) * (0.5 * lattice.energy),
+            jnp.stack([fx, fy, fz]) * units.force,
+            jnp.where(exact, energy, jnp.nan) * (0.5 * units.energy),
             # both ends of a pair count, and a pressure may be large: summed as integers to the end
-            jnp.sum(virial).astype(jnp.float64) * (-0.5 * lattice.energy),
+            jnp.sum(virial).astype(jnp.float64) * (-0.5 * units.energy),
             judge.finish(nearest, halves) if decisions else None,
         )
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
-        """As `PairForce`, at the nearest points of the lattice: the stress of one configuration."""
-        spacing = self.lattice.spacing
+        """As `PairForce`, at the nearest whole multiples of the spacing: the stress of one configuration."""
+        spacing = self.units.spacing
         return super().virial_tensor(jnp.round(positions.astype(jnp.float64) / spacing) * spacing, tables)
 
 
-def _closest(model: CutPotential, lattice: Lattice) -> float:
+def _closest(model: CutPotential, units: FixedPointUnits) -> float:
     """Squared distance down to which energy, force and virial of a pair are below 2^50 units."""
     r_cut, atom = np.asarray(model.r_cut, np.float64), model.at_cutoff()
     r = r_cut * np.geomspace(1, 1e-3, 4000)[:, None]
@@ -575,6 +577,6 @@ def _closest(model: CutPotential, lattice: Lattice) -> float:
     )
     with np.errstate(over="ignore", invalid="ignore"):
         force = 2 * np.abs(slope) * r
-        counts = [np.abs(energy) / lattice.energy, force / lattice.force, force * r / lattice.energy]
+        counts = [np.abs(energy) / units.energy, force / units.force, force * r / units.energy]
     beyond = ~np.all(np.stack(counts) < 2.0**50, axis=0)
     return float(np.max(np.where(beyond, r * r, 0.0)))
