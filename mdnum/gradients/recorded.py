@@ -240,7 +240,7 @@ class Reversible(Method):
         assert simulation.fixed_point is not None
         details = {
             "stretches": tape.stretches, "returned to the start": True,
-            "lattice": simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
+            "fixed_point": simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
             "bytes that grow with the run": tape.nbytes,
             "bits forgotten by friction a step": forgotten_bits(simulation.integrator),
         }  # fmt: skip

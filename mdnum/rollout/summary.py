@@ -163,7 +163,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
             "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness.order,
             "bound": max(tally.bound, *simulation.decider.bounds),
         },
-        "lattice": None
+        "fixed_point": None
         if simulation.fixed_point is None
         else simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
         "beyond_cutoff": beyond_cutoff(simulation),

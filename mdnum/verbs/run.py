@@ -220,8 +220,8 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
         float64.append(segment.rows_of("potential") + segment.rows_of("kinetic"))
     ours = run.series["total"][: steps + 1]
     for key, energy in (("energy_std", ours), ("energy_std_float64", np.concatenate(float64))):
-        summary["lattice"][key] = float(np.std(energy)) / simulation.atoms
-    summary["lattice"]["energy_steps"] = steps
+        summary["fixed_point"][key] = float(np.std(energy)) / simulation.atoms
+    summary["fixed_point"]["energy_steps"] = steps
     run.folder.write_summary(summary)
 
 

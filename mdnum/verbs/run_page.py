@@ -272,11 +272,11 @@ def _energy(run: RunView) -> Iterator[Any]:
             "drift", drift=summary["energy_drift"], without=summary.get("energy_drift_without_jumps"),
             unit=units.energy, time_unit=units.time,
         )  # fmt: skip
-    if state := summary.get("lattice"):
-        yield TEXTS("lattice", **state, length_unit=units.length, energy_unit=units.energy)
+    if state := summary.get("fixed_point"):
+        yield TEXTS("fixed_point", **state, length_unit=units.length, energy_unit=units.energy)
         if state.get("energy_std_float64") is not None:
             yield TEXTS(
-                "lattice_energy", steps=state["energy_steps"], ours=state["energy_std"], unit=units.energy,
+                "fixed_point_energy", steps=state["energy_steps"], ours=state["energy_std"], unit=units.energy,
                 float64=state["energy_std_float64"],
             )  # fmt: skip
 

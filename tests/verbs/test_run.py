@@ -436,7 +436,7 @@ def test_energy_is_set_beside_that_of_float64(tmp_path):
                   overrides={**smooth, "precision.state": state})
         for state in ("lattice", "float64")
     )  # fmt: skip
-    told = whole.summary["lattice"]
+    told = whole.summary["fixed_point"]
     assert told["energy_steps"] == 60
     for key, run in (("energy_std", whole), ("energy_std_float64", floats)):
         energy = np.asarray(RunFolder.open(run.folder).read("series")["total"])
