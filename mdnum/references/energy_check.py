@@ -139,7 +139,8 @@ def check_energy(
     sampled: set[int] = set()
     for seed, (name, atoms) in enumerate(named):
         # of some of the atoms nobody knows the weights
-        sample = simulation.pairwise and not simulation.model.weights and len(atoms) > SAMPLED
+        weighted = getattr(simulation.model, "weights", ())
+        sample = simulation.pairwise and not weighted and len(atoms) > SAMPLED
         whole, mine = _evaluated(atoms, simulation, stress=not sample)
         if not sample:
             compared.append(_compare(name, whole, mine, simulation, calculator, other))

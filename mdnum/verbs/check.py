@@ -15,7 +15,7 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
-from mdnum.verbs import Reply, frame
+from mdnum.verbs import Reply
 
 if TYPE_CHECKING:
     from mdnum.references.energy_check import DynamicsReport, EnergyReport
@@ -42,8 +42,7 @@ class Checked:
         return plain({"ok": self.report.ok, **vars(self.report), **worst, "findings": self.verdict.findings})
 
 
-@frame.keywords_checked
-def check(question: str, system: Simulation | System | str | Path) -> Checked:
+def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:
     """Compare a system with other codes.
 
     Example:
@@ -53,17 +52,17 @@ def check(question: str, system: Simulation | System | str | Path) -> Checked:
     Args:
         question: "energy", "pairs" or "dynamics".
         system: a simulation, a system, a shipped name or the path of a system file.
-
-    With allow_code=True the Python that a system file names is executed.
+        allow_code: whether Python that the system file names may be executed.
 
     Raises:
         InputError: the system cannot be run.
     """
     from mdnum.references.energy_check import check_dynamics, check_energy
     from mdnum.references.pair_check import check_pairs
-    from mdnum.systems import build
+    from mdnum.systems import build, code
 
-    simulation = build(system)
+    with code.allow_code(allow_code):
+        simulation = build(system)
     checks: Mapping[str, tuple[Callable[[Any], Any], Callable[[Any], Iterator[Finding]]]] = {
         "energy": (check_energy, energy_findings),
         "pairs": (check_pairs, pair_findings),

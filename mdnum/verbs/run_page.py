@@ -276,8 +276,8 @@ def _energy(run: RunView) -> Iterator[Any]:
         yield TEXTS("fixed_point", **state, length_unit=units.length, energy_unit=units.energy)
         if state.get("energy_std_float64") is not None:
             yield TEXTS(
-                "fixed_point_energy", steps=state["energy_steps"], ours=state["energy_std"], unit=units.energy,
-                float64=state["energy_std_float64"],
+                "fixed_point_energy", steps=state["energy_steps"], ours=state["energy_std"],
+                unit=units.energy, float64=state["energy_std_float64"],
             )  # fmt: skip
 
 
