@@ -131,7 +131,9 @@ def check_energy(
     simulation = build(subject)
     judge = reference(simulation) if judge is None else judge
     third = (
-        independent(simulation) if judge.is_ase and not isinstance(simulation.model, EmbeddedAtom) else None
+        independent(simulation)
+        if judge.is_ase and not isinstance(simulation.potential, EmbeddedAtom)
+        else None
     )
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
@@ -419,7 +421,7 @@ def _forces(simulation: Simulation) -> Reference:
     """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
-    return independent(simulation) if slow and not isinstance(simulation.model, EmbeddedAtom) else judge
+    return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
 
 
 def _sudden(position: Sequence[float], floor: float) -> int | None:

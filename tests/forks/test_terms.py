@@ -18,9 +18,11 @@ from mdnum import Cut, LennardJones, Term
 from mdnum.forks import fork
 from mdnum.forks.folders import compare_folders
 from mdnum.forks.replays import neighborhood, pinned
+from mdnum.forks.worlds import twin
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import PairRecorder
+from mdnum.store import files as manifest
 
 STEPS, RADII = 900, {"core": crystal().r_cut, "tail": 1.945}
 
@@ -114,6 +116,11 @@ def test_a_lost_pair_is_lost_in_the_term_that_it_belongs_to():
             (members.add if entered else members.discard)(key)
 
 
+def unlisted(folder):
+    """A folder that may be edited: its manifest, which would tell, lists no file."""
+    manifest.save(folder, manifest.Manifest(mdnum.store.RunFolder.open(folder).layout))
+
+
 def equal_terms(radius=RADII["core"]):
     """Both ends at one radius, so that a pair has one decision."""
     terms = {
@@ -127,7 +134,7 @@ def equal_terms(radius=RADII["core"]):
 
 def test_twins_of_which_one_shares_decisions():
     """Another radius of one of the terms: both programs are followed with a decision for each."""
-    made = mdnum.forks.worlds.twin(equal_terms(), {"terms.tail.cutoff.radius": 1.6}, "wider", "")
+    made = twin(equal_terms(), {"terms.tail.cutoff.radius": 1.6}, "wider", "")
     assert [one.simulation.channels for one in (made.a, made.b)] == [2, 2]
     found = fork(made, 40, repeats=0, split=0.5)
     assert found.dates.fork is not None and found.decision is not None
@@ -176,7 +183,8 @@ def test_flips_of_a_pair_are_followed_term_by_term(liquid):
 
 def test_folders_compare_decisions_term_by_term(liquid, tmp_path):
     copy = tmp_path / "planted"
-    shutil.copytree(liquid.folder, copy, ignore=shutil.ignore_patterns("manifest.json"))
+    shutil.copytree(liquid.folder, copy)
+    unlisted(copy)
     table = pq.ParquetFile(copy / "flips.parquet").read()
     row = len(table) // 2
     # the same flip, said of the other term
@@ -219,6 +227,6 @@ def test_folders_of_shared_and_separate_decisions(tmp_path):
     # other terms are another system
     text = (runs[1] / "simulation.json").read_text()
     (runs[1] / "simulation.json").write_text(text.replace('"lennard-jones"', '"morse"', 1))
-    (runs[1] / "manifest.json").unlink()
+    unlisted(runs[1])
     with pytest.raises(mdnum.InputError, match=r"terms\.core\.potential\.kind"):
         compare_folders(*runs)
