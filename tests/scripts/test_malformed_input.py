@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from command_line import call
 
-import mdnum
 from mdnum.errors import InputError, MdnumError, printable
 from mdnum.report.finding import Finding
 from mdnum.systems import load, toml
@@ -117,7 +116,7 @@ def test_a_backend_that_jax_does_not_have_is_one_line(monkeypatch: pytest.Monkey
         raise RuntimeError("Unable to initialize backend 'nonsense': Backend 'nonsense' is not in the list")
 
     monkeypatch.setenv("JAX_PLATFORMS", "nonsense")
-    monkeypatch.setattr(mdnum, "run", run)
+    monkeypatch.setattr("mdnum.verbs.run.run", run)
     assert call("run", "x") == 2
     said = capsys.readouterr().err
     assert said.startswith("mdnum: jax cannot use JAX_PLATFORMS='nonsense'") and said.count("\n") == 1
