@@ -38,7 +38,8 @@ class Recorder:
             "x", "about it", [Key("Fork", "step 4")], [Section("S", [Table(("a",), [(1,)])], terminal=True)]
         )
         verdict = conclude([], headline="The answer.")
-        return SimpleNamespace(folder=Path("runs/x"), summary=self.answer, verdict=verdict, page=page)
+        seen = {"summary": self.answer, "verdict": verdict, "findings": verdict.findings, "page": page}
+        return SimpleNamespace(folder=Path("runs/x"), **seen)
 
 
 @pytest.fixture
