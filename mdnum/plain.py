@@ -17,6 +17,16 @@ def beside(module: str) -> dict[str, Any]:
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
+#: What every document of an answer has, besides `schema` and `kind`.
+HEAD = ("status", "seconds", "headline", "verdict", "findings")
+
+
+def headed(kind: str, document: Mapping[str, Any]) -> dict[str, Any]:
+    """A document that says what it is: which of mdnum/schemas describes it, and its version."""
+    head = {"schema": f"mdnum/{kind}/1", "kind": kind}
+    return {**head, **document, **head}
+
+
 def plain(value: Any) -> Any:
     """value as JSON can hold it: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
 

@@ -19,7 +19,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command_line import call
+from jsonschema import Draft202012Validator
 
+import mdnum
+
+SCHEMAS = Path(mdnum.__file__).parent / "schemas"
 RECORDS = Path(__file__).parent / "goldens"
 COMMANDS = tomllib.loads((RECORDS / "commands.toml").read_text(encoding="utf-8"))
 EXACT = 1e-6
@@ -165,6 +169,22 @@ def written(value: Any, depth: int = 0) -> str:
     return f"{{\n{inner}\n{' ' * depth}}}" + "\n" * (depth == 0)
 
 
+def conforms(document: dict[str, Any]) -> None:
+    """Its schema allows a document, and does not where any of its keys has another name."""
+    kind = document["kind"]
+    validator = Draft202012Validator(json.loads((SCHEMAS / f"{kind}.json").read_text(encoding="utf-8")))
+    wrong = [
+        f"{'.'.join(map(str, each.absolute_path))}: {each.message[:300]}"
+        for each in validator.iter_errors(document)
+    ]
+    assert not wrong, kind
+    assert document["schema"] == f"mdnum/{kind}/1" and list(document)[:2] == ["schema", "kind"]
+    for name in document if kind != "systems-show" else ():
+        assert not validator.is_valid(
+            {f"{key}_" * (key == name) or key: value for key, value in document.items()}
+        ), name
+
+
 class Seen:
     """Answers of this session by name; a golden runs when it or what needs it is asked for."""
 
@@ -185,6 +205,7 @@ class Seen:
         code = call(*words)
         # the path of the checkout is no behavior
         document = json.loads(capsys.readouterr().out.replace(f"{RECORDS.parents[1]}/", ""))
+        conforms(document)
         if not isinstance(document, dict):
             document = {"rows": document}
         findings = [f"{one['severity']} {one['code']}" for one in document.get("findings") or ()]

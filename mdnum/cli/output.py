@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
-from mdnum.plain import plain
+from mdnum.plain import headed, plain
 from mdnum.verbs import PARTIAL, UNDECIDED, Reply
 from mdnum.verbs.progress import ProgressBar
 
@@ -100,7 +100,7 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
     say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
         told = {name: getattr(error, name) for name in ("message", "where", "remedy", "exit_code")}
-        print_json({"error": {"type": type(error).__name__, **told}})
+        print_json(headed("error", {"error": {"type": type(error).__name__, **told}}))
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -210,7 +210,7 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
     """What a verb answers, as JSON or for people: its page in brief. Returns the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
-        print_json({"folder": outcome.folder, **outcome.summary})
+        print_json({**outcome.summary, "folder": outcome.folder})
         return code
     out = console()
     print_prose(outcome.verdict.headline, 0, "bold")

@@ -51,7 +51,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from mdnum.plain import beside, plain
+from mdnum.plain import beside, headed, plain
 from mdnum.report import words
 from mdnum.report.browse import Browse, Column
 from mdnum.report.section import Key, Plot, Series, cell
@@ -256,11 +256,11 @@ class Verdict:
         """Headline and evidence."""
         return " ".join((self.headline, *self.evidence))
 
-    def judged(self, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """A summary with headline, findings and verdict."""
-        return {
-            **summary, "headline": self.headline, "findings": plain(self.findings), "verdict": self.text,
-        }  # fmt: skip
+    def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """A summary of a kind of folder with headline, findings and verdict; an empty one is unfinished."""
+        usual = {"status": "complete" if summary else "unfinished", "seconds": None}
+        found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
+        return headed(kind, {**usual, **summary, **found})
 
 
 def conclude(

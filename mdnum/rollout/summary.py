@@ -152,6 +152,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "energy_budget_closes": budget.closes,
         "steps_per_second": tally.steps_per_second,
         "start_up_seconds": tally.start_up_seconds,
+        "seconds": tally.start_up_seconds + tally.seconds,
         "wall_seconds": tally.seconds,
         "cutoff": {
             "kind": cutoff.name if cutoff is not None else simulation.model.name,

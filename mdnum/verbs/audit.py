@@ -205,7 +205,7 @@ def _ask_all(
         state.during = next(iter(state.left), None)
         answers.save()
         summary = plain(_summary(state))
-        folder.write_summary(_judge(AuditView(folder, summary, given=state)).judged(summary))
+        folder.write_summary(_judge(AuditView(folder, summary, given=state)).judged(folder.kind, summary))
     answers.save()
     frame.store(folder, _summary(state), _tables(state))
     outcome = frame.finish(

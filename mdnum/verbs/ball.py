@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.plain import headed
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
@@ -91,7 +92,7 @@ def command(system: str | None = None, *, demo: str | None = None, **given: Any)
     scripts = [{"name": name, "about": demos.about(name)} for name in demos.names()]
     lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
     title = "\ndemonstrations: `mdnum ball --demo NAME`, or all"
-    return Reply({"systems": rows, "demos": scripts}, [
+    return Reply(headed("ball-list", {"systems": rows, "demos": scripts}), [
         ("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines),
         (title, ("name", "about"), [(row["name"], row["about"]) for row in scripts]),
     ])  # fmt: skip

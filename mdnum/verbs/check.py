@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.plain import plain
+from mdnum.plain import headed, plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
@@ -34,12 +35,17 @@ class Checked:
 
     report: Any  # what was compared, with `ok` and rows for people
     verdict: Verdict  # its findings
+    question: str = "energy"  # or "pairs", "dynamics"
+    seconds: float | None = None  # that it took
 
     @property
     def summary(self) -> dict[str, Any]:
         """For JSON."""
         worst = {"worst": self.report.worst} if hasattr(self.report, "worst") else {}
-        return plain({"ok": self.report.ok, **vars(self.report), **worst, "findings": self.verdict.findings})
+        said = {"headline": self.verdict.headline, "verdict": self.verdict.text}
+        told = {"status": "complete" if self.report.ok else "failed", "seconds": self.seconds, **said}
+        found = {"findings": self.verdict.findings, "ok": self.report.ok}
+        return plain(headed(f"check-{self.question}", {**told, **found, **vars(self.report), **worst}))
 
 
 def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:
@@ -69,9 +75,11 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
         "dynamics": (check_dynamics, dynamics_findings),
     }
     compare, findings = checks[question]
+    began = perf_counter()
     report: Any = compare(simulation)
     headline = TEXTS("agrees" if report.ok else "differs", system=simulation.name)
-    return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
+    verdict = conclude(findings(report), headline=headline, best="good", judged=True)
+    return Checked(report, verdict, question, perf_counter() - began)
 
 
 def _replied(

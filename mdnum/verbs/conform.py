@@ -15,6 +15,7 @@ from annotated_types import Ge, Le
 
 from mdnum.deadline import Deadline
 from mdnum.errors import InputError
+from mdnum.plain import headed
 from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, CaseAnswers, Report
 from mdnum.references.conformance.lists import LIMITS, PairList
@@ -233,7 +234,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
         for row in rows
     ]
     table = ("neighbor lists that have a name here", ("list", "version", "what"), lines)
-    return Reply({"lists": rows}, [table, TEXTS("own_lists")])
+    return Reply(headed("conform-list", {"lists": rows}), [table, TEXTS("own_lists")])
 
 
 def _script(code: str) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from mdnum import doctor
+from mdnum.plain import headed
+from mdnum.report.finding import Finding
 from mdnum.verbs import Reply
 
 
@@ -11,7 +13,10 @@ def diagnose() -> Reply:
     found = doctor.diagnose()
     rows = [(row.status, row.name, row.seen) for row in found.rows]
     remedies = [f"{row.name}: {row.remedy}" for row in found.rows if row.remedy]
-    verdict = "safe" if found.ok else "UNSAFE: do not trust numbers computed here"
-    last = f"this installation is {verdict} ({found.seconds:.1f} s)"
-    shown = [("", ("status", "test", "seen"), rows), *remedies, last]
-    return Reply({"ok": found.ok, **vars(found)}, shown, "complete" if found.ok else "failed")
+    said = "safe" if found.ok else "UNSAFE: do not trust numbers computed here"
+    verdict, status = f"this installation is {said}", "complete" if found.ok else "failed"
+    shown = [("", ("status", "test", "seen"), rows), *remedies, f"{verdict} ({found.seconds:.1f} s)"]
+    unsafe = [row for row in found.rows if row.remedy]
+    findings = [Finding("UNSAFE", "error", row.name, row.seen, str(row.remedy)) for row in unsafe]
+    told = {"status": status, "headline": verdict, "verdict": verdict, "findings": findings, "ok": found.ok}
+    return Reply(headed("doctor", {**told, **vars(found)}), shown, status)

@@ -255,7 +255,7 @@ def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
         "frames": summary["slice"] or None, "box": view.box(summary["box"]), "size": size,
         "first": None if summary["frames"] < 2 else "the first frame", "between": view.between,
         "resolution": resolution(summary["resolution"], view.unit),
-        "seconds": sum(summary["seconds"].values()),
+        "seconds": summary["seconds"],
     }  # fmt: skip
     return TEXTS.rows("input", **{**summary, **values})
 

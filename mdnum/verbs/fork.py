@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.plain import plain
+from mdnum.plain import headed, plain
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Page, Section, Table, pairs, table_of
@@ -269,7 +269,7 @@ def listed() -> Reply:
         ]
         rows = [(row["name"], "must hold" * row["must_hold"], row["about"]) for row in document[key]]
         tables.append((f"choices{whose}: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), rows))
-    return Reply(document, [*tables, TEXTS("other_programs")])
+    return Reply(headed("fork-choices", document), [*tables, TEXTS("other_programs")])
 
 
 # -- pages ---------------------------------------------------------------------------------------------

@@ -360,7 +360,7 @@ def finish(
             )  # fmt: skip
         view = verb.view(folder, summary) if view is None else view
         verdict = verb.judge(view)
-        judged = plain(verdict.judged(summary))
+        judged = plain(verdict.judged(folder.kind, summary))
         if write:
             folder.write_summary(judged)
         page = verb.page(view, verdict)

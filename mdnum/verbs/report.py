@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mdnum.plain import HEAD, headed
 from mdnum.verbs import Reply
 from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
     """Judges a folder and writes its page, as the verb that made it does."""
-    written = finish(folder).folder / "report.html"
-    return Reply({"folder": folder, "report": written}, [f"wrote {written}"])
+    outcome = finish(folder)
+    written = outcome.folder / "report.html"
+    kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}
+    return Reply(headed("report", {**kept, "folder": folder, "report": written}), [f"wrote {written}"])

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mdnum import systems
+from mdnum.plain import headed
 from mdnum.verbs import Reply
 
 
@@ -16,13 +17,13 @@ def listed() -> Reply:
     loaded = [(name, systems.load(name)) for name in systems.names()]
     rows = [{"name": name, **_size(one), "about": one.spec.about} for name, one in loaded]
     lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
-    return Reply({"systems": rows}, [("", ("name", "size", "about"), lines)])
+    return Reply(headed("systems-list", {"systems": rows}), [("", ("name", "size", "about"), lines)])
 
 
 def show(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
     """`mdnum systems show SYSTEM`."""
     text = systems.load(system, overrides).to_toml(beside=False)
-    return Reply(tomllib.loads(text), [text.rstrip()])
+    return Reply(headed("systems-show", tomllib.loads(text)), [text.rstrip()])
 
 
 def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
@@ -33,13 +34,14 @@ def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
     found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
     document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path, "findings": found}
     words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
-    return Reply(document, [words, *found])
+    told = {"status": "complete", "seconds": None, "headline": words, "verdict": words}
+    return Reply(headed("systems-check", told | document), [words, *found])
 
 
 def copy(system: str, target: Path | None = None) -> Reply:
     """`mdnum systems copy SYSTEM [DIR]`."""
     copied = systems.copy(system, target or Path())
-    return Reply({"system": system, "path": copied}, [f"wrote {copied}"])
+    return Reply(headed("systems-copy", {"system": system, "path": copied}), [f"wrote {copied}"])
 
 
 def _size(system: Any) -> dict[str, int]:

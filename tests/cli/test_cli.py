@@ -324,7 +324,8 @@ def test_systems_are_shown_checked_and_copied(crystal: str, capsys: pytest.Captu
     assert shown["cutoff"]["kind"] == "shifted"
     assert shown["precision"]["decision"] == "float64", "defaults are filled in"
     assert call("systems", "show", crystal, "--set", "cutoff.kind=shifted", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == shown
+    head = {"schema": "mdnum/systems-show/1", "kind": "systems-show"}
+    assert json.loads(capsys.readouterr().out) == head | shown
     refused(capsys, "systems", "check", crystal, "--set", "cutoff.radius=12")
     assert "radius" in refused(capsys, "systems", "check", crystal, "--set", "cutoff.radus=8")
     refused(capsys, "systems", "check", "nowhere.toml")

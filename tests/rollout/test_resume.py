@@ -68,7 +68,7 @@ def assert_same(whole, other):
         if isinstance(a[name], np.ndarray):
             assert a[name].tobytes() == b[name].tobytes(), name
     assert [x.tobytes() for x in frames_of(whole[1])] == [x.tobytes() for x in frames_of(other[1])]
-    clocks = {"steps_per_second", "start_up_seconds", "wall_seconds"}
+    clocks = {"steps_per_second", "start_up_seconds", "wall_seconds", "seconds"}
     left, right = (
         {k: v for k, v in result.summary.items() if k not in clocks} for result in (whole[0], other[0])
     )
