@@ -52,7 +52,6 @@ BALL = Units("ball", "m", "m²/s²", "", "s", "", "", 1.0, 1.0, 1.0)
 #: In text, where the names of units come in when it is written.
 ENERGY, LENGTH = "{units.energy}", "{units.length}"
 FORCE = f"{ENERGY}/{LENGTH}"
-_PREFIXES = {"": 1.0, "m": 1e-3}
 
 
 def named(quantity: str, units: Mapping[str, Any]) -> str:
@@ -82,8 +81,8 @@ class Measured:
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
         """The same in a unit with a prefix ("m": meV), and with quantities as the names of a unit system."""
         unit = named(self.unit, units) or self.unit
-        parts = {name: part for name, part in vars(self).items() if isinstance(part, float)}
-        scaled = {name: part / _PREFIXES[prefix] for name, part in parts.items()}
+        size = {"": 1.0, "m": 1e3}[prefix]
+        scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}
         return replace(self, unit=prefix + unit, **scaled)
 
 

@@ -314,8 +314,7 @@ def _energy(run: RunView) -> Iterator[Finding]:
     variants = ["lost"] * bool(run.total("lost_pairs")) + ["jump"] * bool(run.jump and len(moves))
     worst = int(np.argmax(moves)) if len(moves) else 0
     yield TEXTS.finding(
-        "BUDGET_OPEN", *variants, residual=run.residual,
-        unit=run.units.energy, tolerance=run.summary.get("energy_budget_tolerance"), jump=abs(run.jump),
+        "BUDGET_OPEN", *variants, residual=run.residual, unit=run.units.energy, jump=abs(run.jump),
         largest=float(moves[worst]) if len(moves) else None, step=run.step(worst + 1) if len(moves) else None,
     )  # fmt: skip
 
@@ -422,7 +421,7 @@ def _evidence(run: RunView) -> Iterator[str]:
     if summary.get("energy_budget_closes"):
         yield TEXTS(
             "budget_closes" if run.jump else "budget_closes_smooth", residual=run.residual,
-            unit=units.energy, checks=int(summary.get("energy_budget_checks") or 0),
+            checks=int(summary.get("energy_budget_checks") or 0),
         )  # fmt: skip
     ase = run.ase
     if ase.get("ok") and ase.get("energy_rel") is not None:

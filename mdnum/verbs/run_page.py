@@ -17,6 +17,7 @@ from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Page, Plot, Section, Series, Table, curves, pairs, positive, table_of
 from mdnum.report.words import count, many, number, pair_name, plain
 from mdnum.store.tables import as_numpy
+from mdnum.units import Measured
 from mdnum.verbs.frame import View
 
 if TYPE_CHECKING:
@@ -143,10 +144,11 @@ class RunView(View):
         }
 
     @property
-    def residual(self) -> float:
+    def residual(self) -> Measured:
         """How far the budget is from closing, as the run stated it or else |E(t) - E(0) - sum of jumps|."""
         stated = self.summary.get("energy_budget_residual")
-        return float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
+        left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
+        return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
         """A count from the summary, or from the epochs where a killed run has no summary."""
@@ -196,7 +198,8 @@ def _numbers(run: RunView) -> dict[str, Any]:
     known = ("energy_drift", "energy_budget_closes", "steps_per_second")
     return {
         **vars(run.units), **run.time_step, **made, **{name: summary.get(name) for name in known},
-        "flips": made["entered"] + made["left"], "lists": len(epochs["epoch"]), "residual": run.residual,
+        "flips": made["entered"] + made["left"], "lists": len(epochs["epoch"]),
+        "residual": run.residual.value,
         "rate": run.flips.total / run.steps / atoms if atoms and run.steps else None,
         "dangerous": run.total("dangerous_builds", "dangerous"), "lost": int(epochs["lost_pairs"].sum()),
         "error": run.ase.get("energy_rel"), "sample": " of a sample" if "sampled" in run.ase else "",
@@ -266,7 +269,7 @@ def _energy(run: RunView) -> Iterator[Any]:
         moves = float(np.max(np.abs(np.diff(left))))
         yield TEXTS("one_flip", jump=abs(run.jump), unit=units.energy, moves=moves)
         if checks := summary.get("energy_budget_checks"):
-            yield TEXTS("checked_smooth", checks=checks, residual=run.residual, unit=units.energy)
+            yield TEXTS("checked_smooth", checks=checks, residual=run.residual)
     if summary.get("energy_drift") is not None:
         yield TEXTS(
             "drift", drift=summary["energy_drift"], without=summary.get("energy_drift_without_jumps"),

@@ -332,10 +332,8 @@ def _tables(
     ]
     steps = [
         {
-            "pair": "-".join(walk.pair.species),
-            f"from ({LENGTH})": walk.steps[0],
-            f"to ({LENGTH})": walk.steps[1],
-            f"everywhere, above ({FORCE})": walk.steps[3],
+            "pair": "-".join(walk.pair.species), f"from ({LENGTH})": walk.steps[0],
+            f"to ({LENGTH})": walk.steps[1], f"everywhere, above ({FORCE})": walk.steps[3],
             f"over half of the way, above ({FORCE})": walk.steps[2],
         }
         for walk in walks.walks
