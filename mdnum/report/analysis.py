@@ -90,6 +90,7 @@ class Scan:
         self._ratios: list[np.ndarray] = []
         # numbers of the terms that decide, by name
         self._terms: dict[str, int] = {"": 0}
+        self._bits = 32  # of an atom's number
         #: Rows nearest to their threshold in the order of the table, by column.
         self.nearest: dict[str, np.ndarray] = {}
 
@@ -112,9 +113,10 @@ class Scan:
         ratio = margins_in_bounds(flips)
         self._ratios.append(ratio)
         self._keep_nearest(flips, ratio)
-        pair = (flips["i"].astype(np.int64) << 28) | flips["j"].astype(np.int64)
+        # each term decides by itself, and its number takes eight of the bits of a pair
+        self._bits = 28 if "terms" in flips else 32
+        pair = (flips["i"].astype(np.int64) << self._bits) | flips["j"].astype(np.int64)
         if "terms" in flips:
-            # each term decides by itself
             names, at = np.unique(flips["terms"].astype(str), return_inverse=True)
             pair |= np.array([self._terms.setdefault(name, len(self._terms)) for name in names])[at] << 56
         self._recent.append((pair, step, came))
@@ -156,8 +158,10 @@ class Scan:
         self._follow()
         order = np.argsort(-self._count, kind="stable")
         key = self._key[order]
-        i, j, terms = key >> 28 & 0xFFFFFFF, key & 0xFFFFFFF, np.array(list(self._terms))[key >> 56]
-        return PairCounts(i, j, self._count[order], terms)
+        atom, term = (1 << self._bits) - 1, key >> 2 * self._bits if self._bits < 32 else np.zeros_like(key)
+        return PairCounts(
+            key >> self._bits & atom, key & atom, self._count[order], np.array(list(self._terms))[term]
+        )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
         """At each step, whether the table of flips has as many as the series counted there."""
