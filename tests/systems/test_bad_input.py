@@ -253,7 +253,7 @@ def test_silicon_constants_for_argon(folder: Path):
     edit(folder, CUTOFF, "")
     edit(folder, LJ, 'kind = "stillinger-weber"')
     said = refusal(folder)
-    assert " Si," in said and " Ar" in said
+    assert " Si." in said and " Ar" in said
 
 
 def test_constraints_are_not_silently_dropped(folder: Path):

@@ -311,7 +311,7 @@ def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, mo
     monkeypatch.setattr(
         MODULE,
         "followed",
-        lambda system, twin, told, asked, *_: seen.append((told["choice"], asked.steps, asked.split)),
+        lambda system, twin, told, asked, *_, **__: seen.append((told["choice"], asked.steps, asked.split)),
     )
     path = copy("pair/at-cutoff", tmp_path)
     path.write_text(path.read_text() + '\n[fork]\nvary = "reduction=exact"\nsteps = 70\nsplit = 0.01\n')
@@ -616,7 +616,7 @@ def test_every_verdict_has_its_sentence(crystal, monkeypatch, entries, tone, nam
     view, said, texts = cause(crystal, **entries), {}, fork_verdict.TEXTS
 
     class Noted(Texts):
-        entries = texts.entries
+        entries, units = texts.entries, texts.units
 
         def __call__(self, name, /, **values):
             return said.setdefault(name, texts(name, **values))

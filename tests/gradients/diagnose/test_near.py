@@ -96,7 +96,7 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted(planted, judge
     near = limit(found, "near miss")
     assert near.reached and near.horizon == 35 and found.verdict == "limited"
     assert found.turns is not None
-    (row,) = found.turns.heaviest(found.columns)
+    (row,) = found.turns.heaviest(found.columns, lambda kind: {})
     assert (row["i"], row["j"]) == (1, 2)
     # what it is beyond the cutoff by, in shorter steps, is known from the steps alone
     assert row["gap"] == pytest.approx((FARTHEST - farthest(timestep / FINER)) / 2 - 0.5 * short, rel=0.05)
