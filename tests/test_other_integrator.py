@@ -183,7 +183,7 @@ def test_a_run_that_was_killed_goes_on_with_its_state(site, tmp_path):
     path = write_system(tmp_path / "system", liquid(), dynamics={"kind": "nose-hoover", "relaxation": 0.3})
     whole = go(tmp_path / "whole", load(path), 120, save_every=10)
     code = CHILD.format(stop=60, path=str(path), out=str(tmp_path / "run"), steps=120)
-    here = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{Path(__file__).parents[1]}"}
+    here = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{Path(__file__).with_name('support')}"}
     killed = subprocess.run([sys.executable, "-c", code], env=here, capture_output=True, text=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert_same(whole, (run(None, resume=tmp_path / "run"), RunFolder.open(tmp_path / "run")))

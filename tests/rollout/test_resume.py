@@ -118,7 +118,7 @@ def assert_goes_on(whole, subject, given, part, tmp_path, monkeypatch):
 def test_a_killed_run_resumes(path, whole, tmp_path):
     out = tmp_path / "run"
     code = CHILD.format(stop=60, path=str(path), out=str(out), steps=STEPS)
-    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1] / "support")}
     killed = subprocess.run([sys.executable, "-c", code], env=here, capture_output=True, text=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     there = RunFolder.open(out)

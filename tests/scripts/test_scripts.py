@@ -47,8 +47,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
     def run(name: str, *words: str, code: int = 0) -> str:
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
-        # as Python does for a script
+        # as Python does for a script; a module beside a script of another folder may have the same name
         monkeypatch.syspath_prepend(str(WHERE[name].parent))
+        for other in {path.stem for path in SCRIPTS.glob("*/_*.py")} & sys.modules.keys():
+            monkeypatch.delitem(sys.modules, other)
         ended: object = 0
         try:
             runpy.run_path(str(WHERE[name]), run_name="__main__")
