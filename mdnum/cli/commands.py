@@ -194,7 +194,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
 
     def again() -> str | None:
         """What can be done about the folder of a command that was stopped and has a --resume."""
-        folder = given.get("resume") or given.get("out") or progress.folder
+        folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             return _folder(folder).again if "resume" in typed and folder is not None else None
         return None  # it was stopped before there was one

@@ -253,7 +253,7 @@ def load(root: Path) -> Manifest | None:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
             "is damaged, so that the other files cannot be checked against it",
-            remedy="Restore the folder from a copy, or remove this file to read the others unchecked",
+            remedy="Restore the folder from a copy; its parquet files can be read one by one",
             where=str(path),
         ) from error
 
