@@ -219,6 +219,7 @@ def test_folders_of_objects_are_replayed(liquid, tmp_path):
     assert decision["terms"] in RADII and f"of the term {decision['terms']}" in str(made.verdict)
 
 
+@pytest.mark.nightly
 def test_folders_of_shared_and_separate_decisions(tmp_path):
     """Another radius of one of the terms, which share their decisions in the first run alone."""
     runs = [mdnum.run(equal_terms(*r), steps=20, out=tmp_path / f"{len(r)}").folder for r in ((), (1.62,))]

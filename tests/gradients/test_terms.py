@@ -143,6 +143,7 @@ def test_differences_agree_on_terms(mixed):
         assert float(np.sum(by_hand.gradient[name])) == pytest.approx(expected, rel=2e-5), name
 
 
+@pytest.mark.nightly
 def test_derivatives_by_weights(mixed):
     """In a sum of three terms whose middle one has weights, and in one whose terms share a decision."""
     names, shared = ("terms.tail.weight", "terms.core.potential.epsilon"), {"terms.core.cutoff.radius": 9.2}

@@ -284,7 +284,7 @@ def own_energy(parameters, positions, neighbor, cell):
     return 0.5 * jnp.sum(jnp.where(inside, 4 * parameters["depth"] * (s6 * s6 - s6), 0.0))
 
 
-@pytest.mark.parametrize("form", ["dense", "sparse"])
+@pytest.mark.parametrize("form", ["dense", pytest.param("sparse", marks=pytest.mark.nightly)])
 def test_an_energy_function_is_compared_on_ase_s_list(form: str, monkeypatch):
     constants = {"size": jnp.asarray(1.0), "depth": jnp.asarray(1.0)}
     function = EnergyFunction(constants, own_energy, 2.0, format=form, name="mine")

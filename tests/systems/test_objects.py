@@ -125,6 +125,7 @@ def test_objects_leave_the_tables_and_verdicts_of_a_file_and_no_file_is_made(tmp
     assert second.summary["ase"] == first.summary["ase"]
 
 
+@pytest.mark.nightly
 def test_an_own_morse_has_the_ledger_and_the_verdicts_of_the_one_here(tmp_path):
     runs, forks = [], []
     for name, potential in (("own", mdnum.PairFunction(morse, **MORSE)), ("here", mdnum.Morse(**MORSE))):

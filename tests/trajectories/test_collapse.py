@@ -260,7 +260,7 @@ def test_what_was_good_before_a_coordinate_overflowed_is_kept(tmp_path):
     assert found.summary["rules"][0]["flips"] == whole.summary["rules"][0]["flips"]
 
 
-@pytest.mark.parametrize("parts", [1, 3])
+@pytest.mark.parametrize("parts", [pytest.param(1, marks=pytest.mark.nightly), 3])
 def test_the_analysis_stops_there_too_and_may_run_again(tmp_path, parts):
     frames = [Atoms("Ar40", x, cell=[SIDE] * 3, pbc=True) for x in spoiled(put(2, 50.0))]
     for atoms in frames:
