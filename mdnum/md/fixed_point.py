@@ -36,10 +36,9 @@ from mdnum.md.decide import (
     displacements,
     halves_of,
     packed,
-    unpacked,
 )
 from mdnum.md.integrators import ByAtom, Integrator, Langevin, VelocityVerlet
-from mdnum.md.pairforce import Forces, Guarded, PairForce, other_than
+from mdnum.md.pairforce import Forces, Guarded, PairForce, imposed
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
 from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_norm, zero_bits
@@ -524,8 +523,7 @@ class FixedPointForce(PairForce):
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
             if told is not None:
-                asked = other_than(inside, told)
-                inside = inside ^ (asked if pinned is None else asked & unpacked(pinned))
+                inside = imposed(inside, told, pinned)
             # the argument is masked, not only the result: a padded slot may be at distance zero
             r2 = jnp.where(inside, quantity.astype(jnp.float64) * unit, far)
             energy, slope = law.evaluate(r2, types, at)
