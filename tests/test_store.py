@@ -562,3 +562,11 @@ def test_full_disk_in_the_middle_of_a_frame_keeps_the_frames_before(tmp_path, mo
 def test_store_does_not_import_jax():
     code = "import sys, mdnum.store; assert not {'jax', 'jax_md'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_the_type_of_a_column_is_declared_with_it_and_does_not_follow_from_its_name():
+    """Names that mdnum's tables have, as text, integers and booleans, in the table of another package."""
+    layout = Layout("mine", "mine", {"values": "first step ended left entered:bool reason:word"})
+    kinds = {name: kind for name, (kind, _) in layout.columns("values").items()}
+    floats = dict.fromkeys(("first", "step", "ended", "left"), "float64")
+    assert kinds == {**floats, "entered": "bool", "reason": "word"}

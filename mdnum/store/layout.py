@@ -6,12 +6,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from functools import cache, cached_property
-from pathlib import Path
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
-
-from mdnum.plain import beside
 
 #: Types of columns, and what a value of each is in Python; a `word` is one of a few texts.
 TYPES: Mapping[str, tuple[type, ...]] = MappingProxyType({
@@ -26,17 +23,6 @@ _COLUMN = re.compile(rf"([A-Za-z_]\w{{0,63}})(\?)?(?::({'|'.join(TYPES)}))?", re
 _MOST_TABLES, _MOST_COLUMNS = 100, 1000
 
 
-@cache
-def _types() -> Mapping[str, str]:
-    declared = beside(str(Path(__file__).with_name("types")))
-    return {name: kind for kind, names in declared.items() for name in names.split()}
-
-
-def type_of(column: str) -> str:
-    """The type of a column by its name, where its table does not give it another."""
-    return _types().get(column, "float64")
-
-
 @dataclass(frozen=True)
 class Layout:
     """The kind of a folder: what makes it, what it is resumed from, and the columns of its tables.
@@ -44,10 +30,9 @@ class Layout:
     Args:
         kind: its name.
         command: that makes such folders, without `mdnum`.
-        tables: names of columns by table, with spaces between. `name:type` is a column of a type of `TYPES`;
-            without one it has that of its name in types.toml, or is float64. `name?` may be unknown to
-            who writes the table, and is null then. A folder has every table, with rows or without, but for
-            those whose own name ends in a question mark.
+        tables: names of columns by table, with spaces between. `name:type` is a column of a type of `TYPES`,
+            float64 without one. `name?` may be unknown to who writes the table, and is null then. A folder
+            has every table, with rows or without, but for those whose own name ends in a question mark.
         usual: values of columns where rows leave them out, by table.
         resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
         further: files beside tables that are read or shown, as patterns with spaces between.
@@ -101,7 +86,7 @@ class Layout:
             if len(words) > _MOST_COLUMNS or not all(matches):
                 raise ValueError(f"columns of table {table!r}: {text[:100]!r}")
             found[table.rstrip("?")] = {
-                one[1]: (one[3] or type_of(one[1]), bool(one[2])) for one in matches if one is not None
+                one[1]: (one[3] or "float64", bool(one[2])) for one in matches if one is not None
             }
         return found
 

@@ -22,7 +22,7 @@ from mdnum.errors import FolderError
 from mdnum.store import files as manifest
 from mdnum.store.columns import described
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
-from mdnum.store.layout import TYPES, Layout, type_of
+from mdnum.store.layout import TYPES, Layout
 
 _WORD = pa.dictionary(pa.int32(), pa.string())
 _ARROW = {name: _WORD if name == "word" else pa.type_for_alias(name) for name in TYPES}
@@ -153,10 +153,10 @@ class TableStream:
 
         Args:
             of: the column of indices.
-            columns: what belongs to each index, by name.
+            columns: what belongs to each index, by name: texts or integers.
         """
         for name, values in columns.items():
-            kind = _ARROW[type_of(name)]
+            kind = _WORD if isinstance(values[0], str) else pa.int64()
             self._known = {**self._known, name: kind}
             found = as_arrow(values, kind, len(values))
             self._usual[name] = lambda table, found=found: found.take(table[of])
