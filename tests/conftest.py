@@ -23,6 +23,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rewrite-goldens", action="store_true", help="write the records of tests/goldens anew")
 
 
+# further cases of a test that take half a second or more, and tests whose subject another one has too
+_NIGHTLY = Path(__file__).with_name("nightly.txt")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the cases that nightly.txt lists as nightly.
+
+    Without workers, a line that names no case of the files given is an error; the nightly looks.
+    """
+    listed = set(_NIGHTLY.read_text().splitlines())
+    for item in items:
+        if item.nodeid in listed:
+            item.add_marker("nightly")
+    if hasattr(config, "workerinput"):
+        return
+    read = {item.nodeid.split("::")[0] for item in items}
+    gone = {name for name in listed - {item.nodeid for item in items} if name.split("::")[0] in read}
+    if gone and not any("::" in word for word in config.args):
+        raise pytest.UsageError(f"{_NIGHTLY.name} lists cases that are not there: {', '.join(sorted(gone))}")
+
+
 def _share_programs() -> None:
     """Let workers and child processes of one run share what they compile, in a new folder.
 
