@@ -118,7 +118,7 @@ class Cutoff(ABC):
         from mdnum.numerics.exact import enclosed
 
         cut = enclosed(lambda r2, u, w, *at: self.cut(r2, u, w, AtCutoff(*at))[1], 7)
-        return lambda r2: 2 * cut(r2, energy(r2), pull(r2) / 2, *at)
+        return lambda r2: 2 * cut(r2, energy(r2), pull(r2) / 2, *at)[0]
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"

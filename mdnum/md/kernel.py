@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import logging
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import cache
@@ -44,7 +46,8 @@ from mdnum.md.foreign import (
     poke,
     registered,
 )
-from mdnum.numerics.exact import bound, interpreted
+from mdnum.numerics import elementary
+from mdnum.numerics.exact import bound, inlined, interpreted
 
 # atoms of a block, which is what a thread takes at a time; full vectors
 _BLOCK = 2048
@@ -55,6 +58,9 @@ _WIDE = 8
 _AHEAD = 128
 # a loop is made once, whichever thread asks
 _ONE = Lock()
+# by the name of a potential, the operation that kept it out of the loop
+_LEFT_OUT: dict[str, str] = {}
+_LOGGER = logging.getLogger(__name__)
 
 
 class PairSums(NamedTuple):
@@ -67,13 +73,18 @@ class PairSums(NamedTuple):
     decisions: Decisions | None
 
 
+_Pair = Callable[..., Sequence[Any]]
+
+
 def over_pairs(
-    pair: Callable[..., Sequence[Any]],
+    pair: _Pair,
     columns: Float[Array, "columns atoms"],
     tables: Tables,
     *,
     flags: Sequence[UInt8[Array, "words atoms"]] = (),
     margins: str | None = None,
+    inverses: bool = False,
+    name: str = "",
 ) -> PairSums | None:
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
@@ -86,16 +97,24 @@ def over_pairs(
         tables: the list.
         flags: bits of every slot, packed as decisions.
         margins: ">" or ">=": how the margin of a pair that is decided to be inside compares with 0.
+        inverses: whether several quotients by powers of one number become products with its inverse, since a
+            processor divides slowly.
+        name: of the potential, for the message about an operation that is not known (`left_out`).
 
     Returns:
-        None where the function has an operation that does not become one of vectors, as an exponential.
+        None where the function has an operation that does not become one of vectors.
 
-    Error: a rounding error for each operation; sums one after the other.
+    Error: a rounding error for each operation (with `inverses` one more for each power of the inverse), for
+    elementary functions as in `numerics.elementary`; sums one after the other.
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
     try:
-        written = _written(pair, columns.shape[0], len(flags), margins, tables.types is not None)
-    except _NotKnown:
+        written = _written(pair, columns.shape[0], len(flags), margins, tables.types is not None, inverses)
+    except _NotKnown as unknown:
+        if name and _LEFT_OUT.get(name) != str(unknown):
+            text = "%s goes through XLA's loop, in twice the time: the compiled one has no counterpart of %s"
+            _LOGGER.warning(text, name, unknown)
+            _LEFT_OUT[name] = str(unknown)
         return None
     shapes = [
         jax.ShapeDtypeStruct((written.terms, atoms), np.float64),
@@ -112,11 +131,16 @@ def over_pairs(
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
 
 
+def left_out(name: str) -> str | None:
+    """jax's name of the operation that kept a potential out of the loop in this process; None for none."""
+    return _LEFT_OUT.get(name)
+
+
 # --- the function of a pair, written down ----------------------------------------------------------------
 
 
 class _NotKnown(Exception):
-    """An operation without a counterpart."""
+    """An operation without a counterpart; its name in jax."""
 
 
 class _Value(NamedTuple):
@@ -134,41 +158,60 @@ class _Written(NamedTuple):
     terms: int
 
 
-# VEC, BOOL, BYTE and LONG are vectors of WIDE numbers, decisions, bytes and 64 bits
+# VEC, BOOL, BYTE and LONG are vectors of WIDE numbers, decisions, bytes and words of 64 bits: kinds by jax's
+# dtype, and what LLVM calls operations on two operands of a kind, and functions of a number
+_KINDS = {"float64": "VEC", "bool": "BOOL", "int64": "LONG"}
 _OPERATIONS = {
-    "add": "fadd VEC {}, {}",
-    "add_any": "fadd VEC {}, {}",
-    "sub": "fsub VEC {}, {}",
-    "mul": "fmul VEC {}, {}",
-    "div": "fdiv VEC {}, {}",
-    "neg": "fneg VEC {}",
-    "square": "fmul VEC {0}, {0}",
-    "abs": "call VEC @llvm.fabs.vWIDEf64(VEC {})",
-    "sqrt": "call VEC @llvm.sqrt.vWIDEf64(VEC {})",
-    "round": "call VEC @llvm.rint.vWIDEf64(VEC {})",
-    "select_n": "select BOOL {0}, {kind} {2}, {kind} {1}",
-    "eq": "fcmp oeq VEC {}, {}",
-    "gt": "fcmp ogt VEC {}, {}",
-    "ge": "fcmp oge VEC {}, {}",
-    "lt": "fcmp olt VEC {}, {}",
-    "le": "fcmp ole VEC {}, {}",
-    "and": "and BOOL {}, {}",
-    "or": "or BOOL {}, {}",
-    "xor": "xor BOOL {}, {}",
-    "not": "xor BOOL {}, ALL[i1 true]",
+    "VEC": {
+        "add": "fadd", "add_any": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "eq": "fcmp oeq",
+        "ne": "fcmp une", "gt": "fcmp ogt", "ge": "fcmp oge", "lt": "fcmp olt", "le": "fcmp ole",
+    },
+    "BOOL": {"and": "and", "or": "or", "xor": "xor", "ne": "xor", "eq": "icmp eq"},
+    # of the bits of numbers, in elementary functions
+    "LONG": {"add": "add", "and": "and", "or": "or", "shift_left": "shl", "shift_right_logical": "lshr"},
+}  # fmt: skip
+_INTRINSICS = {
+    "abs": "fabs", "sqrt": "sqrt", "rsqrt": "sqrt", "round": "rint", "floor": "floor", "ceil": "ceil"
+}  # fmt: skip
+# further ones, by the kind of the last operand
+_LINES = {
+    ("neg", "VEC"): "fneg VEC {}",
+    ("not", "BOOL"): "xor BOOL {}, ALL[i1 true]",
+    ("bitcast_convert_type", "VEC"): "bitcast VEC {} to LONG",
+    ("bitcast_convert_type", "LONG"): "bitcast LONG {} to VEC",
+    ("convert_element_type", "BOOL"): "uitofp BOOL {} to VEC",
+    **{("select_n", kind): f"select BOOL {{0}}, {kind} {{2}}, {kind} {{1}}" for kind in _OPERATIONS},
+    **{
+        (name, kind): f"{line} {kind} {{}}, {{}}"
+        for kind in _OPERATIONS
+        for name, line in _OPERATIONS[kind].items()
+    },
+    **{(name, "VEC"): f"call VEC @llvm.{of}.vWIDEf64(VEC {{}})" for name, of in _INTRINSICS.items()},
 }
 _COMPARISONS = {">": "ogt", ">=": "oge"}
 #: Of an array of one number they change nothing.
 _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
-def _number(value: Any) -> str:
+def _number(value: Any, kind: str = "VEC") -> str:
     """A constant in LLVM's language, the same for all atoms of a vector."""
+    if kind != "VEC":
+        return f"ALL[{'i1' if kind == 'BOOL' else 'i64'} {int(value)}]"
     return f"ALL[double 0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}]"
 
 
+def _whole_power(equation: Any, inputs: list[Any]) -> int:
+    """The exponent of a power that is made of products; 0 of anything else."""
+    name, y = equation.primitive.name, inputs[-1]
+    if name in ("square", "integer_pow"):
+        return equation.params.get("y", 2)
+    if name != "pow" or isinstance(y, _Value | Tracer | jax.Array):
+        return 0
+    return int(y) if float(y) in range(-64, 65) else 0
+
+
 def _written(
-    pair: Callable[..., Sequence[Any]], columns: int, flags: int, margins: str | None, types: bool
+    pair: _Pair, columns: int, flags: int, margins: str | None, types: bool, inverses: bool
 ) -> _Written:
     """The loop over eight slots of the atoms of a block, as a function `word`.
 
@@ -184,62 +227,107 @@ def _written(
     constants: dict[int, Any] = {}
     lines: list[str] = []
     names = count()
+    # by what a line computes: its result. Of products of one number: that, and how often. Quotients: their
+    # line, dividend and divisor
+    made: dict[str, _Value] = {}
+    powers: dict[str, tuple[str, int]] = {}
+    quotients: list[tuple[int, str, str]] = []
 
     def text(value: Any, kind: str = "VEC") -> str:
         if isinstance(value, _Value):
             if value.kind != kind:
-                raise _NotKnown("a number where a decision is expected, or the other way round")
+                raise TypeError("a number where a decision is expected, or the other way round")
             return value.name
-        if np.size(value) != 1 or kind != "VEC" or jnp.result_type(value) == np.bool_:
-            raise _NotKnown("an array, or a decision that is the same for all pairs")
-        if not isinstance(value, Tracer | jax.Array):
-            return _number(value)
+        known = not isinstance(value, Tracer | jax.Array)
+        if np.size(value) != 1 or kind not in ("VEC", "BOOL", "LONG" if known else ""):
+            raise TypeError("an array, or a number of another kind")
+        if known:
+            return _number(value, kind)
         constants.setdefault(id(value), value)
-        return f"%c{list(constants).index(id(value))}.WIDE"
+        name = f"%c{list(constants).index(id(value))}.WIDE"
+        return name if kind == "VEC" else put(f"fcmp une VEC {name}, {_number(0)}", kind).name
 
     def put(line: str, kind: str = "VEC") -> _Value:
-        name = f"%v{next(names)}.WIDE"
-        lines.append(f"{name} = {line}")
-        return _Value(name, kind)
+        if line not in made:
+            made[line] = _Value(f"%v{next(names)}.WIDE", kind)
+            lines.append(f"{made[line].name} = {line}")
+        return made[line]
+
+    def product(a: str, b: str) -> _Value:
+        value, (base, m), (other, n) = put(f"fmul VEC {a}, {b}"), powers.get(a, (a, 1)), powers.get(b, (b, 1))
+        if base == other:
+            powers[value.name] = base, m + n
+        return value
+
+    def quotient(a: str, b: str) -> _Value:
+        before, value = len(lines), put(f"fdiv VEC {a}, {b}")
+        if len(lines) > before and b.startswith("%v"):
+            quotients.append((before, a, b))
+        return value
 
     def load(row: int, kind: str, single: str, at: str = "%k.WIDE") -> _Value:
         return put(f"load {kind}, ptr {put(f'getelementptr {single}, ptr %r{row}, i64 {at}').name}, align 1")
 
     def rule(equation: Any, inputs: list[Any]) -> Sequence[Any]:
+        try:
+            return operation(equation, inputs)
+        except TypeError as error:
+            raise _NotKnown(equation.primitive.name) from error
+
+    def operation(equation: Any, inputs: list[Any]) -> Sequence[Any]:
         name, result = equation.primitive.name, equation.outvars[0].aval
+        if (inner := inlined(equation)) is not None:
+            return interpreted(inner, inputs, rule)
         if not any(isinstance(value, _Value) for value in inputs):
             # the same for all pairs: made once, outside; what is known now, such as a zero, is written down
             known = not any(isinstance(value, Tracer | jax.Array) for value in inputs)
-            try:
-                with jax.ensure_compile_time_eval() if known else nullcontext():
-                    made = bound(equation, inputs)
-                return [np.asarray(value) for value in made] if known else made
-            except TypeError as error:
-                raise _NotKnown(str(error)) from None
+            with jax.ensure_compile_time_eval() if known else nullcontext():
+                outside = bound(equation, inputs)
+            return [np.asarray(value) for value in outside] if known else outside
         if name == "dynamic_slice" and np.ndim(inputs[0]) == 1 and equation.params["slice_sizes"] == (1,):
             # the constant of the pair's type
             of, which = inputs[0], text(inputs[1])
             chosen = text(of[0])
             for k in range(1, len(of)):
-                other = put(f"fcmp oeq VEC {which}, {_number(k)}").name
+                other = put(f"fcmp oeq VEC {which}, {_number(k)}", "BOOL").name
                 chosen = put(f"select BOOL {other}, VEC {text(of[k])}, VEC {chosen}").name
             return [_Value(chosen)]
-        if name == "integer_pow":
-            power, base = equation.params["y"], text(inputs[0])
-            product = base
-            for _ in range(abs(power) - 1):
-                product = put(f"fmul VEC {product}, {base}").name
-            return [put(f"fdiv VEC {_number(1)}, {product}") if power < 0 else _Value(product)]
-        same = name == "convert_element_type" and result.dtype == equation.invars[0].aval.dtype
-        if same or name in _SHAPES:
+        if power := _whole_power(equation, inputs):
+            # by squaring, from the lowest bit, as XLA does
+            left, base, whole = abs(power), text(inputs[0]), ""
+            while left:
+                if left & 1:
+                    whole = product(whole, base).name if whole else base
+                left >>= 1
+                base = product(base, base).name if left else base
+            return [quotient(_number(1), whole) if power < 0 else _Value(whole)]
+        kind = _KINDS.get(str(result.dtype), "")
+        dtypes = [atom.aval.dtype for atom in equation.invars]
+        if name in _SHAPES or (name == "convert_element_type" and dtypes == [result.dtype]):
             return [inputs[0]]
-        halves_to_even = name != "round" or equation.params["rounding_method"] == 1
-        if name not in _OPERATIONS or not halves_to_even:
-            raise _NotKnown(name)
-        kind = "BOOL" if result.dtype == np.bool_ else "VEC"
-        decisions = len(inputs) if name in ("and", "or", "xor", "not") else int(name == "select_n")
-        kinds = ["BOOL"] * decisions + [kind if name == "select_n" else "VEC"] * (len(inputs) - decisions)
-        return [put(_OPERATIONS[name].format(*map(text, inputs, kinds), kind=kind), kind)]
+        # a pair's type is a number here
+        own = [value.kind if isinstance(value, _Value) else "" for value in inputs]
+        constant = {np.dtype(np.bool_): "BOOL", np.dtype(np.int64): "LONG" if "LONG" in own else "VEC"}
+        given = [one or constant.get(dtype, "VEC") for one, dtype in zip(own, dtypes, strict=True)]
+        if name in elementary.FUNCTIONS and "LONG" not in given:
+            before, inner = len(quotients), elementary.program(name, *[()] * len(inputs))
+            values = interpreted(inner, inputs, rule)
+            # its quotients stay what they are, and so does its bound
+            del quotients[before:]
+            return values
+        line = _LINES.get((name, given[-1]))
+        unlike = {
+            "round": equation.params.get("rounding_method") != 1,
+            "convert_element_type": kind != "VEC",
+            "select_n": given[0] != "BOOL",
+        }
+        if line is None or not kind or unlike.get(name):
+            raise TypeError("no counterpart")
+        operands = list(map(text, inputs, given))
+        if kind == "VEC" and name in ("mul", "div"):
+            return [product(*operands) if name == "mul" else quotient(*operands)]
+        value = put(line.format(*operands), kind)
+        return [quotient(_number(1), value.name) if name == "rsqrt" else value]
 
     # once for eight slots: what is summed and kept, by kind of vector and of number, row, and start
     own = [load(row, "VEC", "double") for row in range(columns)]
@@ -260,6 +348,8 @@ def _written(
     bits = [put(f"and LONG {byte}, %bit.WIDE").name for byte in told]
     given += [put(f"icmp ne LONG {bit}, zeroinitializer", "BOOL") for bit in bits]
     results = list(map(text, interpreted(program, given, rule)))
+    if inverses:
+        _divide_once(lines, quotients, powers)
     after = [put(f"fadd VEC %kept{k}.WIDE, {results[k]}").name for k in range(terms)]
     if margins:
         margin, nearest, byte = results[-1], f"%kept{terms}.WIDE", f"%kept{terms + 1}.WIDE"
@@ -313,7 +403,7 @@ def _written(
     ]
     declared = [
         _of_width(f"declare VEC @llvm.{name}.vWIDEf64(VEC)", wide)
-        for name in ("fabs", "sqrt", "rint")
+        for name in dict.fromkeys(_INTRINSICS.values())
         for wide in (_WIDE, 1)
     ]
     for wide in (_WIDE, 1):
@@ -327,6 +417,24 @@ def _written(
     )
     known = [jnp.asarray(value, jnp.float64).reshape(()) for value in constants.values()]
     return _Written(source, jnp.stack(known) if known else jnp.zeros(0), terms)
+
+
+def _divide_once(
+    lines: list[str], quotients: Sequence[tuple[int, str, str]], powers: dict[str, tuple[str, int]]
+) -> None:
+    """Make products of quotients by powers of one number, where there are several; see `_written`."""
+    divisors = [powers.get(divisor, (divisor, 1)) for _, _, divisor in quotients]
+    uses, known = Counter(base for base, _ in divisors), dict.fromkeys((base for base, _ in divisors), 0)
+    for (place, dividend, _), (base, n) in zip(quotients, divisors, strict=True):
+        if uses[base] < 2:
+            continue
+        before = []
+        for k in range(known[base] + 1, n + 1):
+            line = f"fmul VEC {base}.{k // 2}, {base}.{k - k // 2}"
+            before.append(f"{base}.{k} = " + (line if k > 1 else f"fdiv VEC {_number(1)}, {base}"))
+        known[base] = max(known[base], n)
+        name = lines[place].split(" = ")[0]
+        lines[place] = "\n  ".join([*before, f"{name} = fmul VEC {dividend}, {base}.{n}"])
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
@@ -474,11 +582,12 @@ define i64 @called(i64 %frame) {{
 
 
 @cache
-def _registered(source: str) -> str:
-    """The name by which XLA knows the loop of a source."""
-    name = f"mdnum_pairs_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+def _registered(source: str, cpu: str = "") -> str:
+    """The name by which XLA knows the loop of a source, for this processor or another by LLVM's name."""
+    name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3
+        cpu=cpu or llvm.get_host_cpu_name(), features=features, opt=3
     )
     loop, task = _driver()
     module = llvm.parse_assembly(source + _CALLED.format(loop=loop, task=task))

@@ -330,7 +330,9 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
     columns, margins = positions.astype(np.float64), force._inside if decisions else None
     if rows := force.weights(tables):
         columns = jnp.concatenate([columns, jnp.stack(rows)])
-    made = kernel.over_pairs(pair, columns, tables, flags=flags, margins=margins)
+    made = kernel.over_pairs(
+        pair, columns, tables, flags=flags, margins=margins, inverses=True, name=force.model.potential.name
+    )
     return None if made is None else _forces(tuple(made.sums), made.decisions)
 
 

@@ -9,7 +9,6 @@ every processor.
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from mdnum.numerics import elementary
 
 
 def integer_of(dtype):
@@ -80,6 +81,7 @@ def root(x: jax.Array) -> jax.Array:
 
 # what a function that is jitted by itself, as jnp.where is, looks like inside another
 _CALLS = ("jit", "pjit")
+_CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 Rule = Callable[[Any, list[Any]], Sequence[Any]]
 
 
@@ -135,6 +137,11 @@ def interpreted(
     return [value(atom) for atom in jaxpr.outvars]
 
 
+def inlined(equation: Any) -> Any:
+    """The program of a function with derivatives of its own, as jax.nn.relu, where they are not needed."""
+    return equation.params.get("call_jaxpr") if equation.primitive.name in _CUSTOM else None
+
+
 def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
     """What jax itself makes of an equation's inputs.
 
@@ -171,7 +178,7 @@ def _is_short(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.floating) and np.dtype(dtype).itemsize == 2
 
 
-def enclosed(function: Callable[..., jax.Array], arguments: int) -> Callable[..., Any]:
+def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
     """A function of float64 numbers in ball arithmetic: every number an interval that holds the exact one.
 
     Constants of the formula are the doubles that they are. A `where` whose condition holds for a part of a
@@ -179,7 +186,7 @@ def enclosed(function: Callable[..., jax.Array], arguments: int) -> Callable[...
 
     Args:
         function: of scalars; jax traces it once.
-        arguments: how many; numbers of flint.
+        arguments: how many; numbers of flint, as the results are.
 
     Raises:
         TypeError: by the function, for an operation that has no counterpart here.
@@ -197,11 +204,13 @@ def enclosed(function: Callable[..., jax.Array], arguments: int) -> Callable[...
 
     def rule(equation: Any, inputs: list[Any]) -> list[Any]:
         name = equation.primitive.name
+        if (inner := inlined(equation)) is not None:
+            return interpreted(inner, inputs, rule, enter)
         if name not in _IN_BALLS:
             raise TypeError(f"{name} has no counterpart in ball arithmetic")
         return [_IN_BALLS[name](*inputs, **equation.params)]
 
-    return lambda *balls: interpreted(program, balls, rule, enter)[0]
+    return lambda *balls: interpreted(program, balls, rule, enter)
 
 
 def _method(name: str) -> Callable[..., Any]:
@@ -220,111 +229,45 @@ def _both(a: bool | None, b: bool | None, **_: Any) -> bool | None:
     return False if a is False or b is False else None if a is None or b is None else True
 
 
+def _not(a: bool | None) -> bool | None:
+    return None if a is None else not a
+
+
 _IN_BALLS: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b, **_: a + b,
+    **dict.fromkeys(("add", "add_any"), lambda a, b, **_: a + b),
     "sub": lambda a, b, **_: a - b,
     "mul": lambda a, b, **_: a * b,
     "div": lambda a, b, **_: a / b,
     "neg": lambda a, **_: -a,
     "abs": lambda a, **_: abs(a),
-    **{name: _method(name) for name in ("sqrt", "rsqrt", "exp", "log", "sin", "cos", "tanh", "max", "min")},
+    **{name: _method(name) for name in (
+        "sqrt", "rsqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tanh", "erf", "erfc",
+    )},
+    # one of both where that is proven, which `eq` sees: jax asks for it in their derivatives
+    "max": lambda a, b, **_: a if a >= b else b if b >= a else a.max(b),
+    "min": lambda a, b, **_: a if a <= b else b if b <= a else a.min(b),
+    "logistic": lambda a, **_: 1 / (1 + (-a).exp()),
     "square": lambda a, **_: a * a,
     "pow": lambda a, b, **_: a**b,
     "integer_pow": lambda a, *, y, **_: a**y,
-    **dict.fromkeys(("convert_element_type", "broadcast_in_dim", "copy", "stop_gradient"), lambda a, **_: a),
+    **dict.fromkeys(
+        ("convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient"),
+        lambda a, **_: a,
+    ),
     "select_n": _select,
     "and": _both,
+    "or": lambda a, b, **_: _not(_both(_not(a), _not(b))),
+    "not": lambda a, **_: _not(a),
+    "eq": _compare(lambda a, b: a is b or a == b, operator.ne),
+    "ne": _compare(operator.ne, lambda a, b: a is b or a == b),
     "gt": _compare(operator.gt, operator.le),
     "ge": _compare(operator.ge, operator.lt),
     "lt": _compare(operator.lt, operator.ge),
     "le": _compare(operator.le, operator.gt),
-}
+}  # fmt: skip
 
 
-# --- elementary functions, and formulas in them, that no compiler changes -------------------------------
-#
-# A compiler's own are polynomials whose products and sums it contracts as it likes: their last bits are those
-# of an instruction set. Here every product is fenced before it is added, and IEEE 754 defines each operation.
-
-# ln 2 and π/2 in two parts; the first has zeros at its end, so that a small integer times it is exact
-_LN2 = (float.fromhex("0x1.62e42fee00000p-1"), float.fromhex("0x1.a39ef35793c76p-33"))
-_HALF_PI = (float.fromhex("0x1.921fb54400000p+0"), float.fromhex("0x1.0b4611a626331p-34"))
-_EXPONENT = 52
-_BIAS = 1023
-_MANTISSA = (1 << _EXPONENT) - 1
-
-
-def polynomial(coefficients: Sequence[float], x: jax.Array, zero: jax.Array) -> jax.Array:
-    """Horner's rule, highest coefficient first, rounded after every operation."""
-    total = jnp.full_like(x, coefficients[0])
-    for c in coefficients[1:]:
-        total = fence(total * x, zero) + c
-    return total
-
-
-def _less(x: jax.Array, n: jax.Array, parts: tuple[float, float], zero: jax.Array) -> jax.Array:
-    """x - n times a constant in two parts."""
-    return (x - fence(n * parts[0], zero)) - fence(n * parts[1], zero)
-
-
-def exp(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """The exponential of float64 numbers.
-
-    Error: below 2 ulp; results below the smallest normal number are 0.
-    """
-    # the argument may be a product, which must not be contracted into the reduction
-    x = fence(x, zero)
-    n = jnp.round(jnp.clip(fence(x * (1 / math.log(2)), zero), -2000, 2000))
-    r = _less(x, n, _LN2, zero)
-    p = polynomial([1 / math.factorial(k) for k in range(13, -1, -1)], r, zero)
-    # 2^n in two factors, each of which is a normal number
-    low = jnp.clip(n, -_BIAS + 1, _BIAS - 1)
-    rest = jnp.clip(n - low, -_BIAS + 1, _BIAS - 1)
-    value = fence(fence(p * _power_of_two(low), zero) * _power_of_two(rest), zero)
-    value = jnp.where(x < -708, 0.0, jnp.where(x > 709.78, jnp.inf, value))
-    return jnp.where(jnp.isnan(x), x, value)
-
-
-def _power_of_two(n: jax.Array) -> jax.Array:
-    return lax.bitcast_convert_type((n.astype(jnp.int64) + _BIAS) << _EXPONENT, jnp.float64)
-
-
-def log(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """The natural logarithm of positive normal float64 numbers; NaN elsewhere.
-
-    Error: below 2 ulp of the larger of the result and 1e-2.
-    """
-    bits = lax.bitcast_convert_type(x, jnp.int64)
-    exponent = (bits >> _EXPONENT) - _BIAS
-    m = lax.bitcast_convert_type((bits & _MANTISSA) | (_BIAS << _EXPONENT), jnp.float64)
-    large = m > math.sqrt(2)
-    m = jnp.where(large, 0.5 * m, m)
-    n = (exponent + large.astype(jnp.int64)).astype(jnp.float64)
-    s = (m - 1) / (m + 1)
-    square = fence(s * s, zero)
-    tail = polynomial([2 / (2 * k + 1) for k in range(11, 0, -1)], square, zero)
-    small = fence(s * fence(tail * square, zero), zero) + (s + s)
-    value = fence(n * _LN2[0], zero) + (small + fence(n * _LN2[1], zero))
-    return jnp.where(x > 0, value, jnp.nan)
-
-
-def cos_sin(x: jax.Array, zero: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Cosine and sine of float64 numbers up to some thousand.
-
-    Error: below 1e-15.
-    """
-    x = fence(x, zero)
-    n = jnp.round(fence(x * (2 / math.pi), zero))
-    r = _less(x, n, _HALF_PI, zero)
-    square = fence(r * r, zero)
-    c = polynomial([(-1) ** k / math.factorial(2 * k) for k in range(8, -1, -1)], square, zero)
-    odd = polynomial([(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)], square, zero)
-    s = fence(r * fence(odd * square, zero), zero) + r
-    quarter = n.astype(jnp.int64) & 3
-    swap, negative = quarter & 1 == 1, quarter >= 2
-    cosine, sine = jnp.where(swap, -s, c), jnp.where(swap, c, s)
-    return jnp.where(negative, -cosine, cosine), jnp.where(negative, -sine, sine)
-
+# --- programs that no compiler changes ------------------------------------------------------------------
 
 # Wichura, Applied Statistics 37, 477 (1988), algorithm AS 241 (PPND16): numerators and denominators
 _CENTER = (
@@ -358,20 +301,24 @@ def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
     """
 
     def ratio(parts, r):
-        return fence(polynomial(parts[0], r, zero) / polynomial(parts[1], r, zero), zero)
+        return elementary.polynomial(parts[0], r) / elementary.polynomial(parts[1], r)
 
-    q = 0.5 * u
-    center = fence(q * ratio(_CENTER, 0.180625 - fence(q * q, zero)), zero)
-    r = jnp.sqrt(-log(0.5 * (1 - jnp.abs(u)), zero))
-    tail = jnp.where(r <= 5, ratio(_NEAR, r - 1.6), ratio(_FAR, r - 5))
-    return jnp.where(jnp.abs(q) <= 0.425, center, jnp.where(q < 0, -tail, tail))
+    def quantile(u):
+        q = 0.5 * u
+        center = q * ratio(_CENTER, 0.180625 - q * q)
+        r = jnp.sqrt(-elementary.log(0.5 * (1 - jnp.abs(u))))
+        tail = jnp.where(r <= 5, ratio(_NEAR, r - 1.6), ratio(_FAR, r - 5))
+        return jnp.where(jnp.abs(q) <= 0.425, center, jnp.where(q < 0, -tail, tail))
 
+    return reproducible(quantile, zero)(u)
 
-# --- programs ------------------------------------------------------------------------------------------
 
 _SUMS = ("add", "sub")
 # results that are not a product or quotient, nor a rearranged one
-_SAFE = ("add", "sub", "sqrt", "abs", "max", "min", "round", "floor", "convert_element_type", "iota")
+_SAFE = (
+    "add", "sub", "sqrt", "abs", "max", "min", "round", "floor", "convert_element_type", "iota",
+    "bitcast_convert_type",
+)  # fmt: skip
 
 
 @dataclass
@@ -381,6 +328,7 @@ class _Held:
     value: Any
     safe: bool = True
     shared: bool = False
+    folds: bool = False  # the sum or product with a constant, which a compiler takes together with another
 
 
 def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
@@ -392,41 +340,28 @@ def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[...,
     """
 
     def enter(x: Any) -> _Held:
-        return _Held(x.value, x.safe) if isinstance(x, _Held) else _Held(x)
+        return _Held(x.value, x.safe, folds=x.folds) if isinstance(x, _Held) else _Held(x)
 
     def rule(equation: Any, inputs: list[_Held]) -> list[_Held]:
         name = equation.primitive.name
-        if name in _OWN and _is_float(inputs[0].value):
-            return [_Held(_OWN[name](*(x.value for x in inputs), zero=zero, **equation.params), False)]
-        for held in inputs if name in _SUMS else ():
+        if name in elementary.FUNCTIONS and _is_float(inputs[0].value):
+            # as the compiled loop has them; a compiler's own differ between instruction sets
+            inner = elementary.program(name, *(jnp.shape(x.value) for x in inputs))
+            return interpreted(inner, inputs, rule, enter)
+        folds = name in (*_SUMS, "mul") and any(isinstance(atom, Literal) for atom in equation.invars)
+        for held in inputs:
             # what has been fenced once need not be again
-            if not held.safe and _is_float(held.value):
-                held.value, held.safe = fence(held.value, zero), True
+            opaque = (held.safe or name not in _SUMS) and not (held.folds and folds)
+            if not opaque and _is_float(held.value):
+                held.value, held.safe, held.folds = fence(held.value, zero), True, False
         values = [x.value for x in inputs]
         if name == "div" and inputs[1].shared:
             # of a divisor that all entries share, XLA takes the reciprocal once
             values[1] = fence(values[1], zero)
-        return [_Held(x, name in _SAFE, name == "broadcast_in_dim") for x in bound(equation, values)]
+        return [_Held(x, name in _SAFE, name == "broadcast_in_dim", folds) for x in bound(equation, values)]
 
     return stepwise(function, rule, enter, lambda held: held.value)
 
 
 def _is_float(x: Any) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
-
-
-def _power(x: Any, y: Any, *, zero: jax.Array, **_: Any) -> jax.Array:
-    """x to the power y, for x above 0; 0 or 1 at 0."""
-    x = jnp.asarray(x)
-    y = jnp.asarray(y, x.dtype)
-    value = exp(fence(y * log(x, zero), zero), zero)
-    return jnp.where(x > 0, value, jnp.where(y == 0, jnp.ones_like(x), jnp.zeros_like(x)))
-
-
-_OWN: dict[str, Callable[..., Any]] = {
-    "exp": lambda x, zero, **_: exp(x, zero),
-    "log": lambda x, zero, **_: log(x, zero),
-    "cos": lambda x, zero, **_: cos_sin(x, zero)[0],
-    "sin": lambda x, zero, **_: cos_sin(x, zero)[1],
-    "pow": _power,
-}
