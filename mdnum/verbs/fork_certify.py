@@ -48,8 +48,8 @@ def fork_certify(
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)
 
     Args:
-        system: a simulation, a system, a shipped name or the path of a system file: Lennard-Jones, NVE, at
-            most 108 atoms; or a ball whose steps are sums and products.
+        system: a simulation, a system, a shipped name or the path of a system file: one pair potential, NVE,
+            at most 108 atoms; or a ball whose steps are sums and products.
         steps: last step; default the system's own.
         policies: precisions to rank, by name: dtypes by role, such as {"state": "float32"}; default
             `MD_POLICIES` or `BALL_POLICIES` of `mdnum.forks.exact.certify`.

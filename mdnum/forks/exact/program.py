@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,9 @@ from mdnum.forks.tape import DecisionTape
 from mdnum.md.cell import complete
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Undecided
 from mdnum.md.integrators import VelocityVerlet
-from mdnum.md.potentials import LennardJones
+from mdnum.md.potentials import LennardJones, PairPotential, SumPotential
 from mdnum.numerics import gamma
+from mdnum.numerics.exact import enclosed
 from mdnum.rollout.engine import first_state
 from mdnum.systems.simulation import Simulation
 
@@ -43,34 +45,58 @@ _U = 2.0**-53
 # --- the exact program --------------------------------------------------------------------------------
 
 
-def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: float) -> Callable[[Any], Any]:
+def pull_of(
+    potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
+) -> Callable[[Any], Any]:
     """2 du/d(r²) of a pair inside its cutoff, as a function of the ball r².
 
     The factor of the displacement x_j - x_i in the force on i. Constants are the given doubles, exactly;
     what follows from them is enclosed at the precision in force when this is called.
+
+    Raises:
+        TypeError: the potential has an operation that ball arithmetic has not.
     """
     from flint import arb
 
-    s2 = arb(sigma) * arb(sigma)
+    of = _lennard_jones if isinstance(potential, LennardJones) else partial(_enclosed, potential)
+    bare, energy = of(**{name: arb(value) for name, value in constants.items()})
+    rc = arb(r_cut)
+    at = AtCutoff(rc, arb(r_onset), energy(rc * rc), rc * bare(rc * rc))
+    return CUTOFFS.parse(cutoff).enclose(bare, energy, at)
+
+
+def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """2 du/d(r²) and u, in few operations."""
+    s2 = sigma * sigma
     s6 = s2 * s2 * s2
     # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
-    depth = 4 * arb(epsilon) * s6
+    depth = 4 * epsilon * s6
     repel, attract = 12 * depth * s6, 6 * depth
-    one = arb(1)
 
     def bare(r2):
-        inverse = one / r2
+        inverse = 1 / r2
         cube = inverse * inverse * inverse
         return (attract - repel * cube) * (cube * inverse)
 
     def energy(r2):
-        inverse = one / r2
+        inverse = 1 / r2
         cube = inverse * inverse * inverse
         return depth * cube * (s6 * cube - 1)
 
-    rc = arb(r_cut)
-    at = AtCutoff(rc, arb(r_onset), energy(rc * rc), rc * bare(rc * rc))
-    return CUTOFFS.parse(cutoff).enclose(bare, energy, at)
+    return bare, energy
+
+
+def _enclosed(
+    potential: PairPotential, **constants: Any
+) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """2 du/d(r²) and u of any potential, operation by operation."""
+
+    def evaluate(r2, *values):
+        leaves = {name: value[None] for name, value in zip(constants, values, strict=True)}
+        return potential.with_leaves(leaves).evaluate(r2[None])
+
+    both = enclosed(evaluate, 1 + len(constants))
+    return (lambda r2: 2 * both(r2, *constants.values())[1]), lambda r2: both(r2, *constants.values())[0]
 
 
 @dataclass(frozen=True)
@@ -111,12 +137,12 @@ def installed() -> bool:
 def unsupported(simulation: Simulation) -> InputError | None:
     """What keeps a system from being certified, with a remedy; None where nothing does."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
-    lennard_jones = simulation.pairwise and isinstance(simulation.potential, LennardJones)
+    alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (
         (
-            not lennard_jones,
-            f"the exact program serves Lennard-Jones potentials, not {simulation.potential.name!r}",
-            "Use a lennard-jones system",
+            not alone,
+            f"the exact program serves one pair potential, not {simulation.potential.name!r}",
+            "Use a system with one, as a lennard-jones system",
             "potential.kind",
         ),
         (
@@ -139,7 +165,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
             "system",
         ),
         (
-            lennard_jones and simulation.r_cut > half * (1 - 1e-5),
+            alone and simulation.r_cut > half * (1 - 1e-5),
             f"r_cut = {simulation.r_cut:g} is half the box ({half:g}): the nearest image cannot be proven",
             "Use a slightly smaller cutoff or a larger box",
             "cutoff.radius",
@@ -154,7 +180,33 @@ def unsupported(simulation: Simulation) -> InputError | None:
     errors = (
         InputError(message, remedy=remedy, where=key) for is_so, message, remedy, key in reasons if is_so
     )
-    return next(errors, None)
+    return next(errors, None) or _without_balls(simulation)
+
+
+def _without_balls(simulation: Simulation) -> InputError | None:
+    """An operation of the potential or its cutoff that ball arithmetic has not."""
+    from flint import arb
+
+    try:
+        for pull, r_cut in zip(_pulls(simulation), np.asarray(simulation.model.r_cut), strict=True):
+            pull(arb(float(r_cut)) ** 2)
+    except TypeError as error:
+        return InputError(
+            f"the exact program cannot evaluate {simulation.potential.name!r}: {error}",
+            remedy="Use operations that it has (docs/compiled-loop.md)",
+            where="potential.kind",
+        )
+    return None
+
+
+def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
+    """`pull_of` each pair type."""
+    model, bare = simulation.model, simulation.model.potential
+    radii = zip(np.asarray(model.r_cut), np.asarray(model.r_onset), strict=True)
+    return [
+        pull_of(bare, bare.constants(kind), simulation.cutoff.name, float(r_cut), float(r_onset))
+        for kind, (r_cut, r_onset) in enumerate(radii)
+    ]
 
 
 class ExactProgram:
@@ -176,17 +228,6 @@ class ExactProgram:
         self._v = np.asarray(begin.state.v, np.float64).T.copy()
         self.simulation = simulation
         self.atoms = atoms = simulation.atoms
-        model = simulation.model
-        self._constants = [
-            tuple(float(value) for value in row)
-            for row in zip(
-                *(
-                    np.asarray(leaf, np.float64)
-                    for leaf in (model.potential.sigma, model.potential.epsilon, model.r_cut, model.r_onset)
-                ),
-                strict=True,
-            )
-        ]
         self._timestep = float(simulation.integrator.timestep)
         self._i, self._j = np.triu_indices(atoms, 1)
         self._kind = np.asarray(simulation.type_of(self._i, self._j))
@@ -285,7 +326,7 @@ class _Run:
         program, atoms = self.program, self.program.atoms
         dt = arb(program._timestep)
         kick = [dt * dt / arb(float(mass)) for mass in program.simulation.masses]
-        pulls = [pull_of(program.simulation.cutoff.name, *row) for row in program._constants]
+        pulls = _pulls(program.simulation)
         held = [arb(value) for value in program._held]
         thresholds = [value * value if program._space == "r" else value for value in held]
         self._lattice = [[arb(float(c)) for c in row] for row in program._matrix]

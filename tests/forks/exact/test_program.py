@@ -6,6 +6,8 @@ from dataclasses import replace
 from fractions import Fraction
 from itertools import combinations, pairwise
 
+import jax
+import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import small_systems
 from ase import Atoms
 from oracles import cut_energy
 
+import mdnum
 from mdnum.errors import InputError
 from mdnum.forks.exact.program import ExactProgram, unsupported
 from mdnum.forks.tape import DecisionTape, first_difference, taped
@@ -117,6 +120,38 @@ def test_positions_against_another_library(kind: str):
     np.testing.assert_allclose(exact.x[steps], found, rtol=1e-15, atol=1e-15)
 
 
+def damped(r, strength, alpha):
+    """Operations of which ball arithmetic has an enclosure."""
+    return strength * (jax.scipy.special.erfc(alpha * r) / r + jnp.maximum(jnp.exp(-r) - r**-2.5, -1.0))
+
+
+def test_a_formula_of_ones_own_against_another_library():
+    cut = mdnum.Cut("switched", 1.55, onset=1.3)
+    potential = mdnum.PairFunction(damped, strength=0.7, alpha=1.1)
+    atoms = small_systems.crystal(2, 0.02, 1.68)
+    atoms.set_masses(np.ones(len(atoms)))
+    simulation = mdnum.simulation(
+        atoms, potential, cut, timestep=0.004, temperature=2.9, skin=0.1, units="lj"
+    )
+    exact, steps = ExactProgram(simulation).run(2, bits=256), 2
+    mpmath.mp.dps = 60
+    alpha, strength, rc, ro = map(mpmath.mpf, (1.1, 0.7, 1.55, 1.3))
+
+    def bare(r):
+        return strength * (mpmath.erfc(alpha * r) / r + max(mpmath.exp(-r) - r ** mpmath.mpf(-2.5), -1))
+
+    def energy(r):
+        return bare(r) if r <= ro else cut_energy("switched", r, rc, ro, bare, None, mpmath.cos, mpmath.pi)
+
+    def pull(r2):
+        r = mpmath.sqrt(r2)
+        return mpmath.diff(energy, r) / r if r < rc else None
+
+    *_, (x, _) = leapfrog(simulation, steps, mpmath.mpf, pull)
+    found = np.array([[float(c) for c in row] for row in x])
+    np.testing.assert_allclose(exact.x[steps], found, rtol=1e-15, atol=1e-15)
+
+
 def test_two_precisions_agree_and_a_small_one_is_raised():
     simulation = liquid()
     low, high = ExactProgram(simulation).run(80), ExactProgram(simulation).run(80, bits=600)
@@ -204,11 +239,16 @@ def test_species_masses_and_a_tilted_box():
 
 
 def test_what_cannot_be_certified_is_error():
-    morse = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
-    simulation = build(small_systems.make(small_systems.crystal(), morse, {"kind": "hard", "radius": 1.6}))
-    with pytest.raises(InputError, match=r"Lennard-Jones.*'morse'.*lennard-jones") as caught:
+    potential = mdnum.PairFunction(lambda r, a: a * jnp.sinh(-r), a=1.0)
+    simulation = mdnum.simulation(
+        small_systems.crystal(), potential, mdnum.Cut("hard", 1.6), timestep=0.004, skin=0.1, units="lj"
+    )
+    with pytest.raises(InputError, match="sinh") as caught:
         ExactProgram(simulation)
     assert caught.value.where == "potential.kind"
+    morse = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
+    cutoff = {"kind": "hard", "radius": 1.6}
+    assert unsupported(build(small_systems.make(small_systems.crystal(), morse, cutoff))) is None
     langevin = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 1}
     error = unsupported(liquid(dynamics=langevin))
     assert error is not None and error.where == "dynamics.kind"
