@@ -92,6 +92,7 @@ def run(
         NumericalError: the run blew up; what came before is in the folder, with its report.
     """
     _compile_beside()
+    from mdnum.md.kernel import left_out
     from mdnum.rollout.run import run as roll_out
     from mdnum.systems import BallSystem
 
@@ -140,6 +141,8 @@ def run(
                 _keep(view, *energies)
                 _beside_float64(view, result)
             view.summary["time_step"] = view.time_step
+            if operation := left_out(result.simulation.potential.name):
+                view.summary["not_compiled"] = operation
     return finish(folder, report=report, result=result, progress=progress, view=view)
 
 
@@ -232,7 +235,7 @@ def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
-        *_decisions(run), *_drift(run), *_cutoff(run), *_start(run),
+        *_decisions(run), *_drift(run), *_cutoff(run), *_start(run), *_loop(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
     severities = {finding.severity for finding in found}
@@ -401,6 +404,11 @@ def _cutoff(run: RunView) -> Iterator[Finding]:
         yield TEXTS.finding("HARD_CUTOFF", *own, jump=run.jump, share=share, **values)
     elif kind and force * length > NO_JUMP * run.thermal:
         yield TEXTS.finding("FORCE_JUMP", *own, *["shifted"] * (kind == "shifted"), "gradient", **values)
+
+
+def _loop(run: RunView) -> Iterator[Finding]:
+    if operation := run.summary.get("not_compiled"):
+        yield TEXTS.finding("NOT_COMPILED", operation=operation)
 
 
 def _evidence(run: RunView) -> Iterator[str]:
