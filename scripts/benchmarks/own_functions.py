@@ -1,0 +1,79 @@
+"""What does a pair function of one's own cost beside the built-in Lennard-Jones?
+
+Answer. In rational operations 1.0 to 1.2 times as much, with an exponential 1.4 to 1.6.
+
+The liquid of benchmark.py with 4,000 atoms, float64, hard cutoff, on one core: every potential makes as many
+steps as the others in turn, from the same start. Ratios are medians over the turns, of processor time.
+`--xla` leaves elementary functions to XLA's loop, as where there is no compiled one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from statistics import median
+
+import _shared  # noqa: F401  what scripts share is found by it
+from _liquid import R_CUT, SKIN, liquid
+from _output import table
+from jax.numpy import exp
+from jax.scipy.special import erfc
+
+import mdnum
+from mdnum.numerics import elementary
+from mdnum.rollout import Engine
+
+
+def morse(r, depth, alpha, r0):
+    """One exponential."""
+    e = exp(-alpha * (r - r0))
+    return depth * (e * e - 2 * e)
+
+
+OWN = mdnum.PairFunction
+POTENTIALS = {
+    "built-in Lennard-Jones": mdnum.LennardJones(sigma=1.0, epsilon=1.0),
+    "the same, u(r2)": OWN(lambda r2, e, s: 4 * e * ((s * s / r2) ** 6 - (s * s / r2) ** 3), e=1.0, s=1.0),
+    "the same, u(r)": OWN(lambda r, e, s: 4 * e * ((s / r) ** 12 - (s / r) ** 6), e=1.0, s=1.0),
+    "built-in Morse": mdnum.Morse(depth=1.0, alpha=6.0, r0=1.12),
+    "Morse, u(r)": OWN(morse, depth=1.0, alpha=6.0, r0=1.12),
+    "Buckingham, u(r)": OWN(lambda r, a, b, c: a * exp(-b * r) - c / r**6, a=2.6e5, b=12.0, c=4.0),
+    "Yukawa, u(r)": OWN(lambda r, a, kappa: a * exp(-kappa * r) / r, a=60.0, kappa=4.0),
+    "damped charge, u(r)": OWN(lambda r, q, alpha: q * erfc(alpha * r) / r, q=4.0, alpha=1.2),
+    "power n, u(r)": OWN(lambda r, n: r**-n, n=12.0),
+}
+
+
+def main() -> None:
+    """Turns, and their table."""
+    ask = argparse.ArgumentParser(description="own pair functions beside Lennard-Jones")
+    ask.add_argument("--turns", type=int, default=9)
+    ask.add_argument("--steps", type=int, default=150)
+    ask.add_argument("--xla", action="store_true", help="leave elementary functions to XLA's loop")
+    asked = ask.parse_args()
+    # one core, before XLA starts threads
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    if asked.xla:
+        elementary.FUNCTIONS.clear()
+    atoms, spent = liquid(4000).atoms, {name: [] for name in POTENTIALS}
+    rest = {"timestep": 0.002, "temperature": 0.72, "units": "lj", "skin": SKIN}
+    made = {
+        name: mdnum.simulation(atoms, u, mdnum.Cut("hard", R_CUT), **rest) for name, u in POTENTIALS.items()
+    }
+    for turn in range(asked.turns + 1):
+        for name, simulation in made.items():
+            start = time.process_time()
+            for _ in Engine(simulation, asked.steps, rows=False).segments():
+                pass
+            # the first one compiles
+            spent[name] += [time.process_time() - start] if turn else []
+    first, rows = spent["built-in Lennard-Jones"], []
+    for name, times in spent.items():
+        ratio = median(a / b for a, b in zip(times, first, strict=True))
+        rows.append([name, f"{asked.steps / median(times):.0f}", f"{ratio:.2f}"])
+    table(f"{len(atoms)} atoms", ["potential", "steps/s", "over Lennard-Jones"], rows)
+
+
+if __name__ == "__main__":
+    main()
