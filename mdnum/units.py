@@ -49,6 +49,7 @@ LJ = Units("lj", "σ", "ε", "m", "τ", "ε/k", "ε/σ³", 1.0, 1.0, 1.0)
 # energies are per mass; a ball has no temperature
 BALL = Units("ball", "m", "m²/s²", "", "s", "", "", 1.0, 1.0, 1.0)
 
+_QUANTITIES = re.compile("length|energy|mass|time|temperature|pressure|decision|loss|parameter")
 #: In text, where the names of units come in when it is written.
 ENERGY, LENGTH = "{units.energy}", "{units.length}"
 FORCE = f"{ENERGY}/{LENGTH}"
@@ -57,11 +58,13 @@ FORCE = f"{ENERGY}/{LENGTH}"
 def named(quantity: str, units: Mapping[str, Any]) -> str:
     """A unit made of quantities in the names of a unit system; empty where it lacks one of them.
 
+    A unit that is written out ("kcal/mol") is as it is.
+
     >>> named("energy/length", {"energy": "eV", "length": "Å"})
     'eV/Å'
     """
-    names = {word: str(units.get(word) or "") for word in re.findall(r"[a-z]{3,}", quantity)}
-    return re.sub(r"[a-z]{3,}", lambda word: names[word[0]], quantity) if all(names.values()) else ""
+    names = {word: str(units.get(word) or "") for word in _QUANTITIES.findall(quantity)}
+    return _QUANTITIES.sub(lambda word: names[word[0]], quantity) if all(names.values()) else ""
 
 
 @dataclass(frozen=True)

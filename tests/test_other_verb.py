@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 from command_line import call, printed
 from other_package import install
@@ -15,6 +16,7 @@ from mdnum.errors import FolderError, InputError
 from mdnum.report.section import Table
 from mdnum.safe_path import environment
 from mdnum.store import RunFolder, files
+from mdnum.store.columns import meaning
 from mdnum.verbs import frame
 
 MODULE = '''
@@ -74,6 +76,11 @@ command = "spread"
 further = "notes*.txt"
 tables.values = "number:int64 value mark:word weight?"
 
+[kinds.spread.described.values]
+number = ["", "place in the file"]
+value = "energy"
+weight = ["kcal/mol/length", "weight"]
+
 [sentences]
 headline = "{n:# number} within {far:3}."
 
@@ -112,6 +119,11 @@ def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
     lines = printed(capsys)
     assert lines[0].startswith("3 numbers within 2.25.")
     assert "1 1.25" in lines and lines[-1] == "wrote out/report.html"
+    # its columns mean what it says, whatever mdnum calls so
+    fields = {field.name: field.metadata for field in pq.read_schema("out/values.parquet")}
+    assert fields["number"] == {b"description": b"place in the file"} and not fields["mark"]
+    assert fields["value"] == {b"description": meaning("any", "energy")[1].encode()}
+    assert fields["weight"] == {b"description": b"weight"}
     # from Python, and written again from its folder
     folder = RunFolder.open("out")
     assert (folder.kind, folder.layout.command) == ("spread", "spread")

@@ -68,6 +68,7 @@ def test_every_declared_column_has_a_description_and_no_other_has_one():
     [
         ("length", "Å"), ("energy/length", "eV/Å"), ("length³", "Å³"), ("ms", "ms"), ("", ""),
         ("decision", "Å²"), ("length·√(mass/energy)", "Å·√(amu/eV)"), ("loss", ""), ("loss/length", ""),
+        ("kcal/mol", "kcal/mol"), ("kcal/mol/length", "kcal/mol/Å"),
     ],
 )  # fmt: skip
 def test_units_are_made_of_the_folders_own(quantity, expected):
@@ -133,6 +134,28 @@ def test_pandas_reads_words_flags_and_numbers(folder):
         assert isinstance(frame[name].dtype, pandas.CategoricalDtype)
     assert set(frame["residue_name_j"]) == {"SOL", "ION"}
     assert frame["step"].isna().all() and frame.groupby("rule").size().gt(0).all()
+
+
+def test_integers_with_nulls_stay_integers_with_the_documented_types(folder):
+    pd = pytest.importorskip("pandas")
+    text = (Path(__file__).parents[1] / "docs/folders.md").read_text(encoding="utf-8")
+    code = next(block for block in text.split("```python\n")[1:] if "types_mapper" in block).split("```")[0]
+    known = {"pa": pa, "pd": pd, "outcome": mdnum.read(folder)}
+    *first, last = code.strip().splitlines()
+    exec("\n".join(first), known)
+    frame = eval(last, known)
+    assert frame["step"].dtype == frame["frame"].dtype == pd.Int64Dtype() and frame["step"].isna().all()
+    assert (
+        frame["i"].dtype == pd.Int32Dtype()
+        and len(frame) == pq.read_metadata(folder / "flips.parquet").num_rows
+    )
+
+
+def test_a_folder_without_a_system_names_its_run(folder, tmp_path):
+    kept = of(pq.read_schema(folder / "flips.parquet"))["mdnum.run"]
+    assert len(kept) == 64 and kept == of(pq.read_schema(folder / "frames.parquet"))["mdnum.run"]
+    again = mdnum.flips(folder.parent / "a.extxyz", cutoffs=3.0, out=tmp_path / "b", report=False).folder
+    assert of(pq.read_schema(again / "flips.parquet"))["mdnum.run"] != kept
 
 
 def test_polars_reads_words_flags_and_numbers(folder):

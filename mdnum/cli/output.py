@@ -233,7 +233,8 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
         if below:
             print_prose(f"What may follow from it: {'; '.join(below)}.")
     report = outcome.folder / "report.html"
-    out.print(f"wrote {report if report.exists() else outcome.folder}", markup=False)
+    verb = "answered before, read from" if outcome.reused else "wrote"
+    out.print(f"{verb} {report if report.exists() else outcome.folder}", markup=False)
     return code
 
 

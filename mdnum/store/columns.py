@@ -15,34 +15,42 @@ from mdnum.units import named
 _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
-def meaning(table: str, column: str) -> Sequence[str]:
-    """(unit in quantities, description) of a column; empty words where it is not declared."""
-    for declared in (_DECLARED.get(table, {}), _DECLARED["columns"]):
-        if found := declared.get(column):
-            return found
-        if pattern := next((one for one in declared if "*" in one and fnmatchcase(column, one)), None):
-            return declared[pattern]
-    return "", ""
+def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
+    """(unit in quantities, description) of a column; empty words where it is not declared.
+
+    Args:
+        own: `Layout.described` of the folder.
+    """
+    if own is not None:
+        said = _found(own.get(table, {}), column)
+        return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")
+    return _found(_DECLARED.get(table, {}), column) or _found(_DECLARED["columns"], column) or ("", "")
+
+
+def _found(declared: Mapping[str, Any], column: str) -> Any:
+    patterns = (one for one in declared if "*" in one and fnmatchcase(column, one))
+    return declared.get(column) or next(map(declared.__getitem__, patterns), None)
 
 
 def _json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def described(schema: pa.Schema, table: str, about: Mapping[str, Any]) -> pa.Schema:
+def described(schema: pa.Schema, table: str, about: Mapping[str, Any], own: Any = None) -> pa.Schema:
     """A schema with metadata of its folder, keys `mdnum.*`, and `unit` and `description` of its columns.
 
     `mdnum.columns` has these once more, as JSON, for programs that read no metadata of columns.
 
     Args:
         about: version, kind, system, run and units of the folder; what is empty is left out.
+        own: as for `meaning`.
     """
-    fields, told = [], {}
+    fields, known = [], {}
     for field in schema:
-        quantity, text = meaning(table, field.name)
+        quantity, text = meaning(table, field.name, own)
         held = {"unit": named(quantity, about["units"]), "description": text}
-        told[field.name] = {key: word for key, word in held.items() if word}
-        fields.append(field.with_metadata(told[field.name]))
+        known[field.name] = {key: word for key, word in held.items() if word}
+        fields.append(field.with_metadata(known[field.name]))
     words = {key: value if isinstance(value, str) else _json(value) for key, value in about.items()}
-    words |= {"table": table, "columns": _json(told)}
+    words |= {"table": table, "columns": _json(known)}
     return pa.schema(fields, {f"mdnum.{key}": word for key, word in words.items() if word})

@@ -248,7 +248,10 @@ def load(root: Path) -> Manifest | None:
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
             raise ValueError("it lists files of elsewhere")
-        layout = Layout(**{one.name: held[one.name] for one in fields(Layout)}) if "kind" in held else None
+        layout = None
+        if "kind" in held:
+            # an earlier mdnum described columns of its own alone
+            layout = Layout(**{one.name: {"described": None, **held}[one.name] for one in fields(Layout)})
         return Manifest(layout, bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(

@@ -122,7 +122,7 @@ class RunFolder:
         self._asked: float | None = None
         # the state that came too soon after the last checkpoint, and the rows there were then
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
-        # what the schemas of its tables say beside what its own files do: `system`, and further `units`
+        # what the schemas of its tables say besides what its own files do: `system`, and further `units`
         self.told: dict[str, Any] = {}
 
     @classmethod
@@ -496,13 +496,16 @@ class RunFolder:
         known = vars(units.get(str(named))) if named else {}
         names = {name: known[name] for name in _QUANTITIES if name in known}
         if named and named != "ball":
-            squared = '"compare": "r2' in json.dumps(system)
+            cutoffs = [one.get("cutoff") or {} for one in (system, *(system.get("terms") or {}).values())]
+            squared = any(str(one.get("compare")).startswith("r2") for one in cutoffs)
             names["decision"] = f"{names['length']}²" if squared else names["length"]
-        run = json.dumps([made.get("hashes"), made.get("fingerprint")], sort_keys=True)
+        # without a system nothing says that two runs are equal: each is one of its own
+        own = [made.get("fingerprint")] if made.get("hashes") else [made, str(self.path.absolute())]
+        run = json.dumps([made.get("hashes"), *own], sort_keys=True)
         return {
             "version": str(made.get("versions", {}).get("mdnum") or ""), "kind": self.kind,
             "system": str(self.told.get("system") or made.get("system") or ""),
-            "run": hashlib.sha256(run.encode()).hexdigest() if made.get("hashes") else "",
+            "run": hashlib.sha256(run.encode()).hexdigest(),
             "units": {**names, **self.told.get("units", {})},
         }  # fmt: skip
 

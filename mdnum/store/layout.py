@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -36,6 +36,8 @@ class Layout:
         usual: values of columns where rows leave them out, by table.
         resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
         further: files beside tables that are read or shown, as patterns with spaces between.
+        described: [unit, description] of columns, by table, or the name of a column of store/columns.toml
+            with the same meaning; None where that file describes all of them.
 
     Raises:
         ValueError: a name, type or value is none that a folder could have.
@@ -47,6 +49,7 @@ class Layout:
     usual: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     resumes_from: str = ""
     further: str = ""
+    described: Mapping[str, Mapping[str, str | Sequence[str]]] | None = None
 
     def __post_init__(self) -> None:
         matched = (_KIND.fullmatch(self.kind), _COMMAND.fullmatch(self.command))
@@ -57,6 +60,12 @@ class Layout:
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
             raise ValueError(f"names of tables: {list(self.tables)[:3]}")
         _ = self._columns
+        for table, texts in (self.described or {}).items():
+            for column, said in texts.items():
+                if "*" not in column and column not in self.columns(table):
+                    raise ValueError(f"{table}.{column} is described, and no column")
+                if (len(said) != 2 and type(said) is not str) or len("".join(said)) > _MOST_COLUMNS:
+                    raise ValueError(f"{table}.{column}: {said!r:.100} is no [unit, description]")
         for table, values in self.usual.items():
             for column, value in values.items():
                 kind, _ = self.columns(table)[column]

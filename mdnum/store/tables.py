@@ -58,6 +58,7 @@ class TableStream:
         self._check = check
         # what the merged file says of its folder (see `columns.described`)
         self._about = about
+        self._described = None if layout is None else layout.described
         #: digests of the part files that were written, by name
         self.written: dict[str, list[str]] = {}
         declared = {} if layout is None else layout.columns(name)
@@ -231,7 +232,7 @@ class TableStream:
                 path.unlink()
 
     def close(self) -> None:
-        """Leaves a table that is not whole as it was before."""
+        """Discards the file of a table that is still being written."""
         if self._writing is not None:
             self._writing.end(whole=False)
             self._writing = None
@@ -275,7 +276,11 @@ class TableStream:
         groups = map(self._whole, _regroup(tables, _GROUP_ROWS, self._whole))
         schema = cast(pa.Schema, self._schema)
         about = None if self._about is None else self._about()
-        schema = schema.remove_metadata() if about is None else described(schema, self.name, about)
+        schema = (
+            schema.remove_metadata()
+            if about is None
+            else described(schema, self.name, about, self._described)
+        )
         self._replace(self.merged_path, groups, schema)
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:

@@ -21,7 +21,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
@@ -37,6 +37,7 @@ from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
 from mdnum.store import Layout, RunFolder
+from mdnum.store import files as manifest
 from mdnum.store.files import default_folder, digest, digest_of, read_text
 from mdnum.systems import code
 from mdnum.verbs import PARTIAL as PARTIAL
@@ -160,7 +161,8 @@ def end_on_sigterm(stack: ExitStack) -> None:
 class Keep(TypedDict, total=False):
     """Keyword arguments of every question that is asked of a system."""
 
-    # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked
+    # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked, and
+    # a folder of that name which is finished is read
     out: str | Path | None
     # dotted keys of the system file to values, such as {"cutoff.kind": "switched"}
     overrides: Mapping[str, Any] | None
@@ -206,7 +208,13 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
                 asked = inspect.signature(verb).bind_partial(*args, **kwargs)
                 asked.apply_defaults()
                 digits = content(name or verb.__name__, asked.arguments)
-                kwargs["out"] = str(kwargs["out"]).replace("{content}", digits)
+                out = kwargs["out"] = str(kwargs["out"]).replace("{content}", digits)
+                made = manifest.load(Path(out))
+                status = RunFolder.open(out).summary.get("status") if made and made.finished else "unfinished"
+                if status not in ("stopped", "unfinished"):
+                    _LOGGER.info("answered before, read from %s", printable(out))
+                    report = kwargs.get("report", True) and not Path(out, "report.html").exists()
+                    return replace(finish(out, report=report, write=False), reused=True)
             return verb(*args, progress=report_to, **kwargs)
 
     return cast(V, checked)
@@ -297,7 +305,10 @@ def layout(kind: str) -> Layout:
     Raises:
         InputError: no verb of this installation does.
     """
-    return Layout(kind, **declared(home(kind))["kinds"][kind])
+    name = home(kind)
+    # a column of another package means what that package says, whatever mdnum calls so
+    described = None if VERBS.package(name) == "mdnum" else {}
+    return Layout(kind, **{"described": described, **declared(name)["kinds"][kind]})
 
 
 @contextmanager

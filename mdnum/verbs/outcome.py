@@ -43,6 +43,7 @@ class Outcome:
     result: Any = field(default=None, compare=False)
     _page: Page | None = field(default=None, compare=False)
     _read: Any = field(default=None, compare=False)  # the function `mdnum.read`, which knows all verbs
+    reused: bool = field(default=False, compare=False)  # read: the question had been answered
     _place: Path = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -67,7 +68,7 @@ class Outcome:
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """A table of the folder; `.to_pandas()` makes a data frame of it.
+        """A table of the folder; `.to_pandas()` makes a data frame of it (docs/folders.md: nulls).
 
         Raises:
             FolderError: there is no such table (the message lists those that there are), or it is damaged.
@@ -115,7 +116,8 @@ class Outcome:
         head = f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}"
         lines = (" ".join(printable(line).split()) for line in (*head, "; ".join(numbers)) if line)
         short = (line if len(line) <= 300 else f"{line[:300]}…" for line in lines)
-        return "\n  ".join([*short, printable(str(self.path))])
+        where = f"{'answered before, read from ' * self.reused}{self.path}"
+        return "\n  ".join([*short, printable(where)])
 
     def _repr_html_(self) -> str:
         from mdnum.report.page import brief

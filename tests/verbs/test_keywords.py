@@ -6,13 +6,16 @@ import inspect
 import subprocess
 import sys
 from itertools import pairwise
+from typing import Any
 
 import MDAnalysis
 import numpy as np
 import pytest
+from command_line import call
 
 import mdnum
-from mdnum.errors import InputError
+from mdnum.errors import FolderError, InputError
+from mdnum.store import files
 from mdnum.trajectories import NeighborFlips
 from mdnum.verbs.frame import Keep, content
 
@@ -160,11 +163,26 @@ def test_a_folder_goes_by_the_content_of_what_is_asked(tmp_path, monkeypatch):
         content("conform", {"pairs": lambda: None})
 
 
-def test_two_processes_choose_the_same_name_and_one_of_them_makes_it(tmp_path, monkeypatch):
+def test_a_question_that_was_answered_is_read_and_one_that_was_stopped_is_refused(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    first = mdnum.run("pair/at-cutoff", steps=3, out="runs/a-{content}", check=False, report=False).folder
-    code = "import mdnum; mdnum.run('pair/at-cutoff', steps=3, out='runs/a-{content}', check=False)"
+    asked: Any = {"steps": 3, "out": "runs/a-{content}", "check": False, "report": False}
+    once = mdnum.run("pair/at-cutoff", **asked)
+    first, made = once.folder, (once.folder / "summary.json").stat().st_mtime_ns
+    code = "import mdnum; print(mdnum.run('pair/at-cutoff', steps=3, out='runs/a-{content}', check=False))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert f"{first}: already holds a run" in other.stderr
+    assert not other.returncode and f"answered before, read from {first}" in other.stdout
+    assert (first / "summary.json").stat().st_mtime_ns == made and (first / "report.html").exists()
+    repeated = mdnum.run("pair/at-cutoff", **asked)
+    assert repeated.reused and not once.reused and repeated.summary == once.summary
+    assert call("run", "pair/at-cutoff", "--steps", "3", "-o", "runs/b-{content}") == 0
+    capsys.readouterr()
+    assert call("run", "pair/at-cutoff", "--steps", "3", "-o", "runs/b-{content}") == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("answered before, read from runs/b-")
+    files.update(first, {}, finished=False)
+    with pytest.raises(FolderError, match="already holds a run"):
+        mdnum.run("pair/at-cutoff", **asked)
     again = mdnum.run("pair/at-cutoff", steps=4, out="runs/a-{content}", check=False, report=False)
     assert again.folder.parent == first.parent and again.folder != first
