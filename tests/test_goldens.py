@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import call
 from jsonschema import Draft202012Validator
+from schemas import closed
 
 import mdnum
 
@@ -170,12 +171,13 @@ def written(value: Any, depth: int = 0) -> str:
 
 
 def conforms(document: dict[str, Any]) -> None:
-    """Its schema allows a document, and does not where any of its keys has another name."""
+    """Its schema allows a document, names all of its keys, and allows none of them to have another name."""
     kind = document["kind"]
-    validator = Draft202012Validator(json.loads((SCHEMAS / f"{kind}.json").read_text(encoding="utf-8")))
+    schema = json.loads((SCHEMAS / f"{kind}.json").read_text(encoding="utf-8"))
+    validator = Draft202012Validator(closed(schema))
     wrong = [
         f"{'.'.join(map(str, each.absolute_path))}: {each.message[:300]}"
-        for each in validator.iter_errors(document)
+        for each in (*validator.iter_errors(document), *Draft202012Validator(schema).iter_errors(document))
     ]
     assert not wrong, kind
     assert document["schema"] == f"mdnum/{kind}/1" and list(document)[:2] == ["schema", "kind"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from command_line import call, printed
+from jsonschema import Draft202012Validator
 from other_package import install
 
 from mdnum.errors import FolderError, InputError
@@ -17,7 +18,7 @@ from mdnum.report.section import Table
 from mdnum.safe_path import environment
 from mdnum.store import RunFolder, files
 from mdnum.store.columns import meaning
-from mdnum.verbs import frame
+from mdnum.verbs import frame, schema
 
 MODULE = '''
 """`mdnum spread`: how far numbers lie apart."""
@@ -140,8 +141,25 @@ def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
     outcome = strange_spread.spread("numbers.txt", above=9.0)
     assert outcome.folder.name == "spread-1" and not outcome.verdict.findings
     assert isinstance(outcome.page.sections[0].parts[0], Table)
-    assert call("spread", "numbers.txt", "--above", "9", "--json") == 0
     capsys.readouterr()
+    assert call("spread", "numbers.txt", "--above", "9", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == schema("spread")["$id"] == "mdnum/answer/1"
+    assert Draft202012Validator(schema("spread")).is_valid(document)
+    assert not Draft202012Validator(schema("spread")).is_valid({**document, "status": "good"})
+
+
+SCHEMA = {"$id": "spread/2", "properties": {"above": {"type": "number"}}}
+OWN = TEXT.replace("[sentences]", '[schemas]\nspread = "own.json"\n\n[sentences]')
+
+
+@pytest.mark.parametrize("site", [(MODULE, OWN)], indirect=True)
+def test_its_documents_are_those_of_its_own_schema(site, capsys):
+    (site / "own.json").write_text(json.dumps(SCHEMA))
+    assert call("spread", "numbers.txt", "--above", "9", "--json", "-o", "out") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["schema"], document["kind"]) == ("spread/2", "spread")
+    assert schema("spread") == SCHEMA and Draft202012Validator(SCHEMA).is_valid(document)
 
 
 DOCUMENTED = (

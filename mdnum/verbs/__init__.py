@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -103,6 +104,21 @@ def home(kind: str) -> str:
         f"no verb of this installation makes folders of kind {kind!r}",
         remedy="Install the package that made it",
     )
+
+
+def schema(kind: str) -> dict[str, Any]:
+    """The JSON Schema of a kind's documents: mdnum's, that of the package with the kind, or answer.json.
+
+    Raises:
+        InputError: no verb of this installation makes such documents.
+    """
+    shipped = Path(__file__).parents[1] / "schemas"
+    file = shipped / f"{kind}.json"
+    if not file.exists():
+        name = home(kind)
+        own = declared(name).get("schemas", {}).get(kind)
+        file = Path(_file(name)).with_name(own) if own else shipped / "answer.json"
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
 def _file(name: str) -> str:

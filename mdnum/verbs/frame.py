@@ -42,7 +42,7 @@ from mdnum.store.files import default_folder, digest, digest_of, read_text
 from mdnum.systems import code
 from mdnum.verbs import PARTIAL as PARTIAL
 from mdnum.verbs import UNDECIDED as UNDECIDED
-from mdnum.verbs import VERBS, declared, home
+from mdnum.verbs import VERBS, declared, home, schema
 from mdnum.verbs.outcome import Outcome
 from mdnum.verbs.progress import Progress as Progress
 from mdnum.verbs.progress import Wanted, reported
@@ -372,6 +372,7 @@ def finish(
         view = verb.view(folder, summary) if view is None else view
         verdict = verb.judge(view)
         judged = plain(verdict.judged(folder.kind, summary))
+        judged["schema"] = schema(folder.kind)["$id"]
         if write:
             folder.write_summary(judged)
         page = verb.page(view, verdict)

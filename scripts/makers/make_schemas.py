@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -16,68 +17,125 @@ from typing import Any
 DECLARED = Path(__file__).with_suffix(".toml")
 SCHEMAS = Path(__file__).resolve().parents[2] / "mdnum/schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-#: What every document has, and what every answer has besides.
-HEAD, ANSWER = ("schema", "kind"), ("status", "seconds", "headline", "verdict", "findings")
+#: The common schema of answers, for kinds of folders whose package has none of its own.
+COMMON = "answer"
 
 
-def of_word(word: str) -> dict[str, Any]:
-    """The schema of a value by the word for its type; what is not known or not finite is null."""
-    return {} if word == "any" else {"type": [word, "null"]}
+class Words:
+    """Reads the types of make_schemas.toml.
 
+    Args:
+        text: words NAME:TYPE, or NAME?:TYPE of a key that may be missing.
+        records: types by their names in capitals.
+    """
 
-def properties(words: str, rows: dict[str, str]) -> dict[str, Any]:
-    """The schemas of keys, from words NAME:TYPE."""
-    found: dict[str, Any] = {}
-    for name, _, word in (each.partition(":") for each in words.split()):
-        if word == "rows":
-            found[name] = {"type": ["array", "null"], "items": record(rows[name])}
-        elif word == "record":
-            found[name] = record(rows[name])
-        else:
-            found[name] = of_word(word)
-    return found
+    def __init__(self, text: str, records: dict[str, str]):
+        self.tokens = re.findall(r"[\w*-]+\??(?=:)|[A-Za-z_]+|\S", text)
+        self.records = records
 
+    def next(self, *expected: str) -> str:
+        """The next token, which must be one of those expected where any are."""
+        token = self.tokens.pop(0) if self.tokens else ""
+        if expected and token not in expected:
+            raise ValueError(
+                f"{token!r} before {' '.join(self.tokens)[:60]!r}; expected {' or '.join(expected)}"
+            )
+        return token
 
-def record(words: str) -> dict[str, Any]:
-    """An object with these keys and no others."""
-    keys = properties(words, {})
-    return {"type": "object", "properties": keys, "required": list(keys), "additionalProperties": False}
+    def keys(self, end: str = "") -> dict[str, Any]:
+        """An object with these keys; others are allowed, so that keys can be added."""
+        made: dict[str, Any] = {"type": "object", "properties": {}, "required": []}
+        while self.tokens and self.tokens[0] != end:
+            name = self.next()
+            self.next(":")
+            if name == "*":
+                made["additionalProperties"] = self.type()
+                continue
+            made["properties"][name.rstrip("?")] = self.type()
+            made["required"] += [] if name.endswith("?") else [name]
+        if end:
+            self.next(end)
+        return made
+
+    def type(self) -> dict[str, Any]:
+        """A value; what is not known or not finite is null."""
+        made = self.bare()
+        if "anyOf" in made:
+            return {"anyOf": [*made["anyOf"], {"type": "null"}]}
+        kinds = made.get("type", [])
+        return {**made, "type": [*([kinds] if isinstance(kinds, str) else kinds), "null"]} if made else {}
+
+    def bare(self) -> dict[str, Any]:
+        """A value of one of several types, which is not null."""
+        kinds = [self.one()]
+        while self.tokens and self.tokens[0] == "|":
+            self.next()
+            kinds.append(self.one())
+        if len(kinds) == 1:
+            return kinds[0]
+        plain = all(kind.keys() == {"type"} for kind in kinds)
+        return {"type": [kind["type"] for kind in kinds]} if plain else {"anyOf": kinds}
+
+    def one(self) -> dict[str, Any]:
+        """A value of one type."""
+        token = self.next()
+        if token == "{":
+            return self.keys("}")
+        if token == "[":
+            made = {"type": "array", "items": self.type()}
+            self.next("]")
+            return made
+        if token == "<":
+            made = {"type": "object", "additionalProperties": self.type()}
+            self.next(">")
+            return made
+        if token in self.records:
+            return Words(self.records[token], self.records).bare()
+        if token not in ("any", "string", "integer", "number", "boolean"):
+            raise ValueError(f"{token!r} is no type")
+        return {} if token == "any" else {"type": token}
 
 
 def schema(kind: str, declared: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
     """The schema of a kind of document."""
-    rows = declared.get("rows", {})
-    always, sometimes = (properties(declared.get(name, ""), rows) for name in ("keys", "sometimes"))
-    head: dict[str, Any] = {"schema": {"const": f"mdnum/{kind}/1"}, "kind": {"const": kind}}
+    records = shared["records"]
+    keys = Words(declared.get("keys", ""), records).keys()
+    common = kind == COMMON
+    head: dict[str, Any] = {
+        "schema": {"type": "string"} if common else {"const": f"mdnum/{kind}/1"},
+        "kind": {"type": "string"} if common else {"const": kind},
+    }
     if declared.get("answer", True):
         findings = {"type": "array", "items": {"$ref": "#/$defs/finding"}}
         head |= {
             "status": {"enum": shared["status"].split()}, "seconds": {"type": ["number", "null"]},
             "headline": {"type": "string"}, "verdict": {"type": "string"}, "findings": findings,
         }  # fmt: skip
-    if declared.get("folder", True):
-        # where it is printed; what summary.json holds lies in it
-        sometimes = {"folder": {"type": "string"}, **sometimes}
-    finding = record(shared["finding"])
+    # where it is printed; what summary.json holds lies in it
+    folder = {"folder": {"type": "string"}} if declared.get("folder", True) else {}
+    finding = Words(shared["finding"], records).keys()
+    measured = {"type": "object", "required": ["value", "unit", "floor"]}
     finding["properties"] |= {
         "severity": {"enum": ["info", "warning", "error"]},
         # a number with a unit and a floor is a "measured"
-        "values": {"type": "object"},
+        "values": {
+            "type": "object",
+            "additionalProperties": {"if": measured, "then": {"$ref": "#/$defs/measured"}},
+        },
     }
     made: dict[str, Any] = {
         "$schema": DIALECT, "$id": f"mdnum/{kind}/1", "title": declared["about"], "type": "object",
-        "properties": {**head, **always, **sometimes}, "required": [*head],
-        "additionalProperties": declared.get("open", False),
+        "properties": {**head, **keys["properties"], **folder}, "required": [*head],
     }  # fmt: skip
+    if declared.get("open"):
+        made["additionalProperties"] = {}
     if "status" not in head:
-        return made | {"required": [*head, *always]}
-    # a run that was killed is judged as far as it came
-    unfinished = {"properties": {"status": {"const": "unfinished"}}}
-    made |= {"if": unfinished, "else": {"required": [*always]}}
-    measured = {"type": "object", "required": ["value", "unit", "floor"]}
-    with_unit = {"if": measured, "then": {"$ref": "#/$defs/measured"}}
-    finding["properties"]["values"]["additionalProperties"] = with_unit
-    return made | {"$defs": {"finding": finding, "measured": record(shared["measured"])}}
+        return made | {"required": [*head, *keys["required"]]}
+    if keys["required"]:
+        # a run that was killed is judged as far as it came
+        unfinished = {"properties": {"status": {"const": "unfinished"}}}
+        made |= {"if": unfinished, "else": {"required": keys["required"]}}
+    return made | {"$defs": {"finding": finding, "measured": Words(shared["measured"], records).keys()}}
 
 
 def made() -> dict[str, str]:
