@@ -8,7 +8,9 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, dataclass_transform
+
+T = TypeVar("T")
 
 
 @functools.cache
@@ -49,3 +51,20 @@ def plain(value: Any) -> Any:
     if isinstance(value, Iterable):
         return [plain(item) for item in value]
     raise TypeError(f"{type(value).__name__} has no plain form")
+
+
+@dataclass_transform(frozen_default=True)
+def result(kind: type[T]) -> type[T]:
+    """A frozen dataclass whose repr has its numbers and short texts, and the types of everything else."""
+
+    def __repr__(self: Any) -> str:
+        values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))
+        return f"{kind.__name__}({', '.join(f'{name}={_short(value)}' for name, value in values)})"
+
+    kind.__repr__ = __repr__
+    return dataclasses.dataclass(frozen=True)(kind)
+
+
+def _short(value: Any) -> str:
+    shown = value is None or isinstance(value, int | float | Path) or (type(value) is str and len(value) < 80)
+    return repr(value) if shown else f"<{type(value).__name__}>"

@@ -21,11 +21,12 @@ from mdnum.errors import InputError
 from mdnum.numerics.events import Ledger
 from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.rounding import gamma
+from mdnum.plain import result
 
 _CHUNK = 2**21  # balls times steps that leave the device at once
 
 
-@dataclass(frozen=True)
+@result
 class BallRun:
     """A finished rollout; row s of what belongs to a step is the step that made state s + 1.
 

@@ -32,6 +32,7 @@ from mdnum.forks.ensemble import (
     starts,
     steps_to_diverge,
 )
+from mdnum.plain import result
 from mdnum.program import Twin
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.simulation import Simulation
@@ -316,7 +317,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@result
 class Benign:
     """Whether B's runs belong to A's ensemble."""
 

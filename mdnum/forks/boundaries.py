@@ -18,6 +18,7 @@ from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
+from mdnum.plain import result
 from mdnum.program import DecisionHistory, Number, Program
 from mdnum.systems import BallSystem, opened
 
@@ -87,7 +88,7 @@ class Interval:
     gap: float
 
 
-@dataclass(frozen=True)
+@result
 class BoundaryMap:
     """A run as a piecewise function of a number."""
 

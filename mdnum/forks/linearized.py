@@ -29,6 +29,7 @@ from mdnum.errors import InputError, expect_at_least
 from mdnum.md.integrators import check_kick
 from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 from mdnum.numerics.verdicts import BLOCKS, TRANSIENT, Growth, growth_rate
+from mdnum.plain import result
 from mdnum.rollout.engine import FAILURES, Engine, Segment
 from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
@@ -314,7 +315,7 @@ class ForecastRange(NamedTuple):
     ends: str
 
 
-@dataclass(frozen=True)
+@result
 class Forecast:
     """What perturbations of the start along one direction will flip, to first order.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from mdnum.numerics.verdicts import (
     split_of,
     table,
 )
+from mdnum.plain import result
 from mdnum.program import Decision, PairRows, Twin
 from mdnum.systems import BallSystem
 
@@ -50,7 +51,7 @@ FLIPS_KEPT = 100_000
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 
-@dataclass(frozen=True)
+@result
 class Fork:
     """What became of a pair of runs.
 
@@ -312,7 +313,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 # --- all choices side by side ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@result
 class Screened:
     """What one choice did within the horizon."""
 

@@ -31,6 +31,7 @@ from jaxtyping import Float
 
 from mdnum.errors import InputError, MdnumError
 from mdnum.forks.worlds import program_of, varied
+from mdnum.plain import result
 from mdnum.safe_path import environment, python
 from mdnum.systems import BallSystem, System, opened
 from mdnum.systems.code import allow_code, is_allowed
@@ -106,7 +107,7 @@ class Ran:
         return common > 0 and self.hashes[:common] == other.hashes[:common]
 
 
-@dataclass(frozen=True)
+@result
 class Variants:
     """Variants of one system, by what they compute."""
 

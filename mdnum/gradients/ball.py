@@ -25,6 +25,7 @@ from mdnum.ball.rollout import BallRun
 from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.problem import Gradient, Method
+from mdnum.plain import result
 from mdnum.registry import Registry
 
 
@@ -65,7 +66,7 @@ for _name, _class in {
     BALL_METHODS.add(_name, f"mdnum.gradients.{_class}")
 
 
-@dataclass(frozen=True)
+@result
 class BallGradients:
     """Derivatives of one problem by several methods."""
 

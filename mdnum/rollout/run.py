@@ -19,6 +19,7 @@ from mdnum import provenance, ranges
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.md import foreign
 from mdnum.md.ledger import FlipTable
+from mdnum.plain import result
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder
 from mdnum.rollout.summary import (
@@ -49,7 +50,7 @@ _LOG_HEADER = "    step       time      potential        kinetic          total 
 _FRAMES_APART = 25
 
 
-@dataclass(frozen=True)
+@result
 class RunResult:
     """What a run left behind."""
 

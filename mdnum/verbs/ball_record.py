@@ -163,7 +163,7 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     broken = None if finite.all() else int(np.argmin(finite)) if run.kept else run.steps
     flips, stops = int(ambiguous_flips(run).sum()), int(ambiguous_stops(run).sum())
     return {
-        "world": "ball", "system": simulation.system.name, "balls": run.balls, "steps": run.steps,
+        "system": simulation.system.name, "balls": run.balls, "steps": run.steps,
         "steps_asked": run.steps, "time": run.steps * run.h, "contact_kind": spec.contact.kind,
         "integrator": spec.integrator.kind, "loss_kind": spec.loss.kind, "flips_entered": entered,
         "flips_left": len(run.contacts) - entered, "first_contact": int(first.min()) if len(first) else None,

@@ -270,7 +270,6 @@ def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
     why = {area: sorted(tally.why.items(), key=lambda one: -one[1]) for area, tally in found.areas.items()}
     return {
-        "world": "conform",
         "question": "conform",
         "system": tested.name,
         "about": tested.description,

@@ -251,7 +251,6 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
             "heaviest": turns.heaviest(found.trust.columns, simulation.terms_of),
         }  # fmt: skip
     return basics(simulation, problem.steps) | {
-        "world": "grad",
         "loss": {
             "word": loss.name, "about": loss.label, "unit": loss.unit.format_map(vars(simulation.units)),
         },
@@ -405,7 +404,6 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
     base = right or made[reference]
     power = "²" if spec.loss.kind == "residual-penetration" or spec.loss.target is not None else ""
     answer.summary = basics(system, None) | {
-        "world": "grad",
         "loss": {"word": spec.loss.kind, "about": spec.loss.kind.replace("-", " "), "unit": f"m{power}"},
         "value": rows[0]["value"],
         "parameters": [

@@ -44,7 +44,7 @@ def _headline(view: View) -> str:
         names = next((names for names in judgments if one["name"] in names), ())
         verdict = TEXTS("note_{verdict}".format_map(judgments[names]), **judgments[names]) if names else ""
         note = ", ".join(filter(None, (verdict, digits_note(summary, one["name"]))))
-        short = one["name"].partition(".")[2]
+        short = one["name"].partition(".")[2] or one["name"]
         parts.append(f"d {summary['loss']['word']} / d {short} = {value}{f' ({note})' if note else ''}")
     # verdicts that differ stand behind their derivatives
     name = "unasked" if len(judgments) > 1 else trust.get("verdict") or "unasked"

@@ -197,7 +197,7 @@ def summary(**changes: Any) -> dict[str, Any]:
     """Three methods, of which one misses what the flips add."""
     values = ((EPSILON, "ε", 1.0), (RADIUS, "σ", 2.5), (START, "√(ε/m)", {**MANY, "norm": 17.0}))
     return {
-        "world": "grad", "system": "argon/synthetic", "about": "Nothing was simulated.", "atoms": 100,
+        "system": "argon/synthetic", "about": "Nothing was simulated.", "atoms": 100,
         "steps": STEPS, "timestep": 0.01, "units": "lj", "value": 1.5, "force_jump": 0.04,
         "loss": {"word": "msd", "about": "mean squared displacement at the last step", "unit": "σ²"},
         "parameters": [{"name": name, "unit": unit, "value": value} for name, unit, value in values],

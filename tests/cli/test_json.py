@@ -58,11 +58,12 @@ def test_the_documents_are_listed():
     assert sorted(listed) == sorted(SCHEMAS)
 
 
-#: objects of which not every key has a name of its own: by names of parameters, runs, checks, or a case's own numbers
+#: objects whose keys are names of parameters, runs and checks, or a case's own numbers
 OPEN = """
-audit:parts[].numbers audit:parts[].tables<>[] ball:gradient[].details ball:variants[].changes conform:known demos:data
-demos:demos[].data demos:demos[].numbers demos:numbers fork:reasons[] grad:comparisons[].values grad:edges
-grad:methods[].details grad:trust.by<>.limits[].values grad:trust.limits[].values systems-show:
+audit:parts[].numbers audit:parts[].tables<>[] ball:gradient[].details ball:variants[].changes
+conform:known demos:data demos:demos[].data demos:demos[].numbers demos:numbers fork:reasons[]
+grad:comparisons[].values grad:edges grad:methods[].details grad:trust.by<>.limits[].values
+grad:trust.limits[].values systems-show:
 """
 
 

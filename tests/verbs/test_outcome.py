@@ -85,6 +85,19 @@ def test_it_comes_back_from_a_pool_as_plain_data(returned, outcome):
     assert len(pickle.dumps(outcome)) < 200_000
 
 
+def test_a_headline_names_every_parameter_of_a_gradient(returned):
+    headline, steps = returned["grad"].verdict.headline, returned["grad"].summary["steps"]
+    assert f"After {steps} steps" in headline and "d final-height / d y0 = " in headline
+
+
+@pytest.mark.parametrize("kind", ["grad", "ball", "fork"])
+def test_a_result_is_shown_in_a_line_or_two(kind, tmp_path):
+    verb, words, options = ASKED[kind]
+    result = verb(*words, out=tmp_path / kind, report=False, **options).result
+    assert repr(result).startswith(f"{type(result).__name__}(") and len(repr(result)) < 700
+    assert kind != "ball" or f"steps={result.steps}, balls=1" in repr(result)
+
+
 def test_a_folder_that_is_there_is_read_and_left_as_it_is(outcome):
     before = {file: file.stat().st_mtime_ns for file in outcome.path.rglob("*")}
     read = mdnum.read(outcome.path)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
+from mdnum.plain import result
 from mdnum.program import Decision, Program
 from mdnum.systems import BallSystem, opened
 
@@ -82,7 +83,7 @@ class PolicyHorizon:
         return set(self.roles.values()) == {dtype}
 
 
-@dataclass(frozen=True)
+@result
 class Certificate:
     """The exact history of a system, and the horizons of real runs against it."""
 

@@ -34,6 +34,7 @@ from mdnum.gradients.problem import method as by_name
 from mdnum.gradients.recorded import EventAware, ReversePass, Symmetric, passed
 from mdnum.gradients.tape import pace_of
 from mdnum.numerics import unit_roundoff
+from mdnum.plain import result
 
 __all__ = [
     "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
@@ -218,7 +219,7 @@ def _meaning(
 # --- everything there is to know about one gradient, from as few runs as it takes ---------------------
 
 
-@dataclass(frozen=True)
+@result
 class GradientDiagnosis:
     """Whether a gradient can be trusted, and how far. A part that was not asked for is None.
 
