@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -80,6 +81,13 @@ class Measured:
     def found(self) -> bool:
         """Whether it is more than noise or rounding explains; nan is."""
         return self.floor is None or not abs(self.value) <= self.floor
+
+    @property
+    def digits(self) -> str:
+        """The number, with as many digits as its floor leaves; all of them where it has none."""
+        if self.floor is None or self.floor < 1e-12:
+            return repr(float(self.value))
+        return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
         """The same in a unit with a prefix ("m": meV), and with quantities as the names of a unit system."""

@@ -51,13 +51,15 @@ def test_a_measured_number_converts_its_unit_and_what_it_is_compared_with(system
     ("text", "expected"),
     [
         ("{x:3}", "0.0125 eV/Å"), ("{x:3m}", "12.5 meV/Å"), ("{x:+2}", "+0.013 eV/Å"), ("{x}", "0.0125 eV/Å"),
-        ("{x.floor:1}", "2 × 10⁻⁶"), ("{x.scale:2} {units.energy}", "0.50 eV"),
+        ("{x:=}", "0.012500 eV/Å"), ("{exact:=}", "0.1 eV"), ("{x.floor:1}", "2 × 10⁻⁶"),
+        ("{x.scale:2} {units.energy}", "0.50 eV"),
         ("{none:3}", "– eV/Å"),
     ],
 )  # fmt: skip
 def test_sentences_write_a_number_with_its_unit(text, expected):
     values: dict[str, object] = {
         "x": units.Measured(0.0125, "eV/Å", 2e-6, 0.5),
+        "exact": units.Measured(0.1, "eV", 0.0),
         "none": units.Measured(math.nan, "eV/Å"),
     }  # fmt: skip
     values["units"] = units.METAL

@@ -23,7 +23,7 @@ from mdnum.systems.structures import to_extxyz
 from mdnum.units import METAL, Units
 
 _MOST_SAVED = 20  # a calculator that fails is asked hundreds of times; this many structures are kept
-_ROOM_TEMPERATURE = 0.025852  # k_B times 300 K, eV
+_ROOM_TEMPERATURE = 300 * METAL.k_B  # eV
 #: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
 #: answers to one question that differ by more are no rounding.
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6

@@ -37,8 +37,9 @@ Where a list has several texts, the first counts whose fields all have a value; 
 out. A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3
 significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
 "2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` one
-word or the other. A `Measured` is written with its unit (`{x:3m}`: in thousandths of it, meV), `{x.floor:1}`
-without; where a verb has a unit system, `{units.energy}` is the name of a unit.
+word or the other. A `Measured` is written with its unit (`{x:3m}`: in thousandths of it, meV), `{x:=}` with
+the digits that its floor leaves, `{x.floor:1}` without; where a verb has a unit system, `{units.energy}` is
+the name of a unit.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ class _Fields(string.Formatter):
         if isinstance(value, Measured):
             digits, milli, _ = format_spec.partition("m")
             shown = value.to(milli)
-            return f"{self.format_field(shown.value, digits)} {shown.unit}".rstrip()
+            text = shown.digits if digits == "=" else self.format_field(shown.value, digits)
+            return f"{text} {shown.unit}".rstrip()
         if format_spec.startswith("#"):
             return words.many(value, *(word.replace("_", " ") for word in format_spec[1:].split()))
         if format_spec.startswith("?"):

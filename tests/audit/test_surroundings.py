@@ -104,8 +104,9 @@ def test_what_is_found_of_a_hard_cutoff():
     result = checked(walked(subject(laws.hard, dozen()), laws.hard))
     assert codes(result) == {"ENERGY_JUMP": "error"}
     told = values(result, "ENERGY_JUMP")
-    assert told["inside"] == repr(float(np.nextafter(R_CUT, 0.0))) and told["variants"] == ["among"]
-    assert told["energy"] == pytest.approx(-1e3 * law(R_CUT)[0], rel=1e-9)
+    assert told["inside"].value == float(np.nextafter(R_CUT, 0.0)) and told["variants"] == ["among"]
+    assert told["energy"].value == pytest.approx(-law(R_CUT)[0], rel=1e-9)
+    assert told["energy"].scale == laws.KT and told["at"].digits == repr(R_CUT)
     assert told["kT"] == pytest.approx(abs(law(R_CUT)[0]) / laws.KT, rel=1e-9)
     assert result.numbers["cutoffs"] == {"Ar-Ar": R_CUT}
     assert result.says[0][:3] == ["smoothness_walked", "smoothness_ends", "smoothness_jumps_energy"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from mdnum.audit.structures import FARTHEST
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.surroundings import Crowd, EnvironmentWalks, Event, crowd, walk_surroundings
 from mdnum.audit.thresholds import BESIDE, PairThreshold, PairWalk, PairWalks, find_thresholds, walk_pairs
-from mdnum.units import ENERGY, FORCE, LENGTH
+from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
 ORDERS = (
     "energy", "force", "curvature", "third derivative", "fourth derivative", "fifth derivative",
@@ -80,12 +81,12 @@ def _all(walks: PairWalks) -> list[PairThreshold]:
     return [one for walk in walks.walks for one in walk.thresholds]
 
 
-def place(threshold: PairThreshold) -> str:
-    """Its distance, with as many digits as are known."""
-    if threshold.located < 1e-12:
-        return repr(threshold.radius)
-    digits = int(np.clip(np.ceil(-np.log10(threshold.located)), 1, 15))
-    return f"{threshold.radius:.{digits}f}"
+_energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="length")
+
+
+def place(threshold: PairThreshold) -> Measured:
+    """Its distance."""
+    return _length(threshold.radius, floor=threshold.located)
 
 
 def _two(threshold: PairThreshold) -> str:
@@ -125,8 +126,9 @@ def figures(
     worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
     says = ["walked" if walks.walks else "not_walked"]
     values: dict[str, Any] = numbers | {
-        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs), "energy": 1e3 * step,
-        "kT": numbers["largest_energy_jump_kT"], "force": force, "kept": min(capped, default=0),
+        "of": len(walks.walks) + len(walks.not_walked), "cutoffs": ", ".join(cutoffs),
+        "energy": _energy(step), "kT": numbers["largest_energy_jump_kT"], "force": force,
+        "kept": min(capped, default=0),
         "derivative": ORDERS[order] if order is not None else "", "not_walked": ", ".join(walks.not_walked),
         "neighbors": numbers["neighbors_tried"], "knots": knots,
     }  # fmt: skip
@@ -163,16 +165,17 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
         more = f" and {len(rest) - 4} more" if len(rest) > 4 else ""
         size, severity = abs(worst.jumps[order]) / kT, "info"
         values: dict[str, Any] = {
-            "two": _two(worst), "inside": repr(worst.inside), "outside": repr(worst.outside),
-            "at": place(worst), "energy": 1e3 * worst.jumps[0], "kT": size, "force": worst.jumps[1],
-            "curvature": worst.jumps[2], "others": ", ".join(rest[:4]) + more,
+            "two": _two(worst), "inside": _length(worst.inside), "outside": _length(worst.outside),
+            "at": place(worst), "energy": _energy(worst.jumps[0], scale=kT), "kT": size,
+            "force": worst.jumps[1], "curvature": worst.jumps[2], "others": ", ".join(rest[:4]) + more,
         }  # fmt: skip
         among: list[float] = []
         if order == 0:
             events = (one for one in around.events if one.threshold in same and one.jump.order == 0)
             among = [abs(one.jump.energy) for one in events]
-            values |= {"among": 1e3 * max(among, default=0.0), "among_kT": max(among, default=0.0) / kT}
-            size = max([size, *(one / kT for one in among)])
+            most = max(among, default=0.0)
+            values |= {"among": _energy(most, scale=kT), "among_kT": most / kT}
+            size = max(size, most / kT)
             severity = "error" if size > _LARGE else "warning" if size > _SMALL else "info"
         elif order == 1:
             severity = "warning" if size > _SMALL_FORCE else "info"
@@ -197,8 +200,8 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
         "error" if energy > _LARGE * kT else "warning" if large else "info",
         None if worst.jump.order == 0 else "force",
         tests=("alone",), two=_two(threshold), at=place(threshold), route=worst.route, force=worst.force,
-        energy=1e3 * energy, kT=energy / kT, alone=ORDERS[threshold.order], measured=around.measured,
-        places=len(around.lower),
+        energy=_energy(energy, scale=kT), kT=energy / kT, alone=ORDERS[threshold.order],
+        measured=around.measured, places=len(around.lower),
     )  # fmt: skip
 
 
@@ -228,12 +231,12 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
         yield finding(
             "JUMP_AMONG_MANY", "error" if size > _LARGE else "warning",
             "tie" if worst.ties else None, "not_walked" if not_walked else None,
-            route=worst.route, at=f"{worst.at:.12g}", energy=1e3 * worst.jump.energy, force=worst.force, k=k,
-            atom=center, not_walked=", ".join(not_walked), places=len(sharp), routes=len(around.routes),
+            route=worst.route, at=_length(worst.at), energy=_energy(worst.jump.energy), force=worst.force,
+            k=k, atom=center, not_walked=", ".join(not_walked), places=len(sharp), routes=len(around.routes),
         )  # fmt: skip
     if bent := [one for one in around.unexplained if one.jump.order == 2]:
         worst = max(bent, key=lambda one: abs(one.jump.curvature))
-        values = {"route": worst.route, "at": f"{worst.at:.8g}", "curvature": worst.jump.curvature}
+        values = {"route": worst.route, "at": _length(worst.at), "curvature": worst.jump.curvature}
         yield finding("CURVATURE_JUMP_AMONG_MANY", "info", places=len(bent), **values)
 
 
@@ -242,7 +245,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
-        values |= {"energy": 1e3 * one.energy, "kT": one.energy / kT, "neighbors": one.neighbors}
+        values |= {"energy": _energy(one.energy), "kT": one.energy / kT, "neighbors": one.neighbors}
         energy = "energy" if one.energy else None
         if one.by_number:
             yield finding("NEIGHBOR_CAP", "error", energy, tests=("repeat", "in range"), **values)
@@ -250,7 +253,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
             yield finding("JUMP_AMONG_MANY", "warning", "crowd", energy, **values)
     if start := one.order.start:
         values |= {"neighbors": start, "fewer": start - 1, "force": one.order.force, "slug": ""}
-        values |= {"energy": 1e3 * one.order.energy, "kT": one.order.energy / kT}
+        values |= {"energy": _energy(one.order.energy), "kT": one.order.energy / kT}
         forces = None if one.order.energy else "forces"
         if one.order.by_number:
             tests = ("repeat", "place", "in range")
@@ -270,7 +273,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
         yield finding(
             "NO_CUTOFF", "info", how, pair=walk.pair.name, scanned=walk.scanned, farthest=FARTHEST,
             reached=further.reached if further else None, force=abs(further.force) if further else None,
-            left=1e3 * further.left if further else None, kT=further.left / kT if further and kT else None,
+            left=further and _energy(further.left), kT=further.left / kT if further and kT else None,
         )  # fmt: skip
     steep = _steepness(walk)
     if steep is not None and steep[0] > _STEEP:
@@ -307,7 +310,7 @@ def _tables(
 ) -> dict[str, list[dict[str, Any]]]:
     thresholds = [
         {
-            "pair": "-".join(one.species), f"distance ({LENGTH})": place(one),
+            "pair": "-".join(one.species), f"distance ({LENGTH})": place(one).digits,
             "what": "the end" if one.dies else "a change", "first to jump": ORDERS[one.order],
             f"energy (m{ENERGY})": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
             "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
