@@ -17,6 +17,9 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real, UInt64
 
+#: Called now and then with (done, of how many, {"phase": words}).
+Progress = Callable[[int, int, dict[str, Any]], None]
+
 
 class Program(Protocol):
     """One way to run one system.
@@ -106,11 +109,7 @@ class Program(Protocol):
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """What this program and another, at an adjacent value of a number, decide differently at a step.
-
-        Args:
-            steps: of their runs.
-        """
+        """What this program and another, at an adjacent value of a number, decide differently at a step."""
         ...
 
 

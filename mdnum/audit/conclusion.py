@@ -26,11 +26,7 @@ def needed_to(question: str) -> set[str]:
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
-    """An answer to each question ("run", "differentiate").
-
-    Args:
-        wanted: checks that were to be made.
-    """
+    """An answer to each question ("run", "differentiate") by the checks that were wanted."""
     return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 

@@ -89,10 +89,6 @@ class _Questions(TyperGroup):
         if "alone" in group and set(args) <= {"--json"}:
             args = [group["alone"], *args]
         elif "usual" in group and first not in self.commands and first != "--help":
-            once = group.get("once", {})
-            if word := next((one for arg in args if (one := arg.partition("=")[0]) in once), ""):
-                seen = f"{word} is no option of `mdnum {self.name}`, but a question"
-                raise InputError(seen, remedy=f"Ask `mdnum {self.name} {once[word]}`")
             if "two" in group and len(args) > 1 and not args[1].startswith("-"):
                 both, folders = " ".join(args[:2]), all(map(os.path.isdir, args[:2]))
                 remedy = f"Ask `mdnum {group['two'][0 if folders else 1]} {both}`"
@@ -150,11 +146,7 @@ def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -
 
 
 def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
-    """The type and the default of an argument or option, as typer reads those of a function.
-
-    Args:
-        make: `typer.Argument` or `typer.Option`.
-    """
+    """The type and the default of an argument or option, as typer reads those of a function."""
     types = [_TYPES[word] for word in said.get("type", "text").split()]
     kind: Any = types[0] if len(types) == 1 else tuple[tuple(types)]
     kind = list[kind] if said.get("repeatable") else kind

@@ -14,7 +14,7 @@ import typer
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
 from mdnum.plain import headed, plain
-from mdnum.verbs import PARTIAL, UNDECIDED, Reply
+from mdnum.verbs import PARTIAL, UNDECIDED, Reply, assigned
 from mdnum.verbs.progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -56,16 +56,10 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
     """
     overrides: dict[str, str] = {}
     for setting in settings or ():
-        key, equals, value = setting.partition("=")
-        key = key.strip()
-        if not equals or not key:
-            raise InputError(
-                f"--set {setting!r} is not of the form key=value",
-                remedy="Write for example --set cutoff.kind=switched",
-            )
+        key, value = assigned(setting, "--set cutoff.kind=switched")
         if key in overrides:
             raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
-        overrides[key] = value.strip()
+        overrides[key] = value
     return overrides
 
 
@@ -110,11 +104,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
-    """rich's console on stdout, made when first needed because importing rich is slow; prints nothing raw.
-
-    Args:
-        width: columns where nobody's window is known.
-    """
+    """rich's console on stdout, made when first needed, as importing rich is slow; prints nothing raw."""
     from rich.console import Console
     from rich.segment import Segment
 

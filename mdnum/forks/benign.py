@@ -13,9 +13,8 @@ over the runs of their second largest component is beyond the limit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
@@ -33,7 +32,7 @@ from mdnum.forks.ensemble import (
     steps_to_diverge,
 )
 from mdnum.plain import result
-from mdnum.program import Twin
+from mdnum.program import Progress, Twin
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.simulation import Simulation
 
@@ -63,8 +62,6 @@ FEWEST = 20
 _NAMED, _TELLING = 5, 0.02
 #: Noise of B's runs; no seed of a calibration's.
 _SEED = 1_000_003
-
-Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 # --- the rule -------------------------------------------------------------------------------------------

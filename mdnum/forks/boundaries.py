@@ -19,13 +19,11 @@ from mdnum.forks.processes import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.plain import result
-from mdnum.program import DecisionHistory, Number, Program
+from mdnum.program import DecisionHistory, Number, Program, Progress
 from mdnum.systems import BallSystem, opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
-
-Progress = Callable[[int, int, dict[str, Any]], None]
 
 #: Boundaries that are searched for, unless more are asked for: as many as a figure can name, and more of a
 #: ball, whose runs take no time.

@@ -28,7 +28,7 @@ from mdnum.numerics.verdicts import (
     table,
 )
 from mdnum.plain import result
-from mdnum.program import Decision, PairRows, Twin
+from mdnum.program import Decision, PairRows, Progress, Twin
 from mdnum.systems import BallSystem
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ _GUARD = 3.0
 _SOON, _LARGEST, _DECADES = 100, 1e-3, 100.0
 #: Cross-run flips that are kept; the counts cover all of them.
 FLIPS_KEPT = 100_000
-
-Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 @result

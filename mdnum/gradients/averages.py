@@ -267,8 +267,7 @@ class BoundaryTerm(Method):
     )
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = one_term(problem.simulation)
-        if why is not None:
+        if (why := one_term(problem.simulation)) is not None:
             return why
         if not problem.loss.of_single_frames:
             return f"{problem.loss.name} compares frames in time, and is no average over states"
@@ -341,8 +340,7 @@ class Reweighting(Method):
     description = "the derivative of the canonical average, by how the weights of the visited states change"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = one_term(problem.simulation)
-        if why is not None:
+        if (why := one_term(problem.simulation)) is not None:
             return why
         integrator = problem.simulation.integrator
         if integrator.random is None or "temperature" not in integrator.numbers():

@@ -47,6 +47,8 @@ _AGREE = 4.0
 _MOST_SHRINK = 1e-3
 #: How often the spacing is widened where all values are the same; values of which a noise is estimated.
 _WIDENINGS, _POINTS = 4, 7
+#: How often a step is changed.
+_TRIES = 4
 
 
 class Differentiated(NamedTuple):
@@ -121,15 +123,12 @@ class DifferenceStep(NamedTuple):
     noise: float
 
 
-def choose_step(
-    f: Callable[[float], float], x: float, first: float, spacing: float, tries: int = 4
-) -> DifferenceStep:
+def choose_step(f: Callable[[float], float], x: float, first: float, spacing: float) -> DifferenceStep:
     """The step at which truncation and noise of a central difference are about alike.
 
     Args:
         first: the step to begin with, which is never passed: beyond it the function may be another one.
         spacing: between the values of which the noise is estimated: some rounding errors of x.
-        tries: how often the step may be changed.
 
     Error: the truncation is estimated from differences over one and two steps, and a function that jumps in
     between may have one that is too small by chance; extrapolate and compare.
@@ -144,11 +143,11 @@ def choose_step(
     # a value has at least the rounding error of its last operation
     noise = max(noise_of(values), float(np.finfo(np.float64).eps) * abs(f(x)))
     size = first
-    for attempt in range(tries):
+    for attempt in range(_TRIES):
         one = (f(x + size) - f(x - size)) / (2 * size)
         two = (f(x + 2 * size) - f(x - 2 * size)) / (4 * size)
         truncation, rounding = abs(two - one) / 3, noise / size
-        if truncation <= 10 * rounding or rounding == 0 or attempt == tries - 1:
+        if truncation <= 10 * rounding or rounding == 0 or attempt == _TRIES - 1:
             break
         # truncation goes with the square of the step, noise with one over it
         wanted = (rounding / truncation) ** (1 / 3) if np.isfinite(truncation) else 0.0

@@ -261,8 +261,7 @@ class Surrogate(Method):
     description = "the derivative of another program, whose cutoff switches smoothly"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        why = one_term(problem.simulation)
-        if why is not None:
+        if (why := one_term(problem.simulation)) is not None:
             return why
         if problem.simulation.cutoff.switches:
             return f"the cutoff is {problem.simulation.cutoff.name}, which has no force jump to smooth"

@@ -101,11 +101,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second.
-
-    Args:
-        subject: as for `reference`.
-    """
+    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):

@@ -219,9 +219,6 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
     They are where atoms move freely through the cutoff. The density is taken from the lower
     quarter of the margins; many more ambiguous flips than this mean that something holds pairs
     at the cutoff, a crystal's shell for example.
-
-    Args:
-        ratio: what `margins_in_bounds` gave.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:

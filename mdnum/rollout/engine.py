@@ -176,11 +176,7 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Rows, a power of two above `rows`, to record them in; more where that costs little memory.
-
-    Args:
-        per_row: bytes of a row.
-    """
+    """Rows, a power of two above `rows`, to record them in; more where that costs little memory."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 

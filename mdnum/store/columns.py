@@ -16,11 +16,7 @@ _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
 def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
-    """(unit in quantities, description) of a column; empty words where it is not declared.
-
-    Args:
-        own: `Layout.described` of the folder.
-    """
+    """(unit in quantities, description) of a column, by `Layout.described`; empty where it has none."""
     if own is not None:
         said = _found(own.get(table, {}), column)
         return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")

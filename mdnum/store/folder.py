@@ -29,16 +29,8 @@ from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
-from mdnum.store.files import (
-    SIMULATION_FILE,
-    SUBFOLDERS,
-    SYSTEM_FILE,
-    disk_errors,
-    opened,
-    read_text,
-    refuse_link,
-    write_text,
-)
+from mdnum.store.columns import described
+from mdnum.store.files import SIMULATION_FILE, SUBFOLDERS, SYSTEM_FILE, disk_errors, opened, refuse_link
 from mdnum.store.layout import Layout
 from mdnum.store.tables import TableStream, as_numpy
 
@@ -75,7 +67,7 @@ def system_tables(file: Path) -> dict[str, Any]:
     Raises:
         FolderError: it is no TOML, or no JSON.
     """
-    return _parsed(file, read_text(file))
+    return _parsed(file, manifest.read_text(file))
 
 
 def _parsed(file: Path, text: str) -> Any:
@@ -271,12 +263,9 @@ class RunFolder:
         return True
 
     def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
-        """As a forced `checkpoint`, made and written by a thread beside what comes next.
+        """As a forced `checkpoint` of a state that a thread makes and writes beside what comes next.
 
         What goes wrong there is raised by the next checkpoint, or by `finalize`.
-
-        Args:
-            state: makes it, of what nobody changes meanwhile.
         """
         self._settle()
         began = time.monotonic() if self._asked is None else self._asked
@@ -437,11 +426,7 @@ class RunFolder:
         return self._reader(name).read(columns, min(self.rows(name), rows or sys.maxsize))
 
     def batches(self, name: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """The rows of `table` a part at a time, for a table that is larger than memory.
-
-        Args:
-            columns: only these.
-        """
+        """The rows of `table` a part at a time, for a table that is larger than memory."""
         left = self.rows(name)
         for batch in self._reader(name).batches(columns):
             if left <= 0:
@@ -500,12 +485,12 @@ class RunFolder:
             squared = any(str(one.get("compare")).startswith("r2") for one in cutoffs)
             names["decision"] = f"{names['length']}²" if squared else names["length"]
         # without a system nothing says that two runs are equal: each is one of its own
-        own = [made.get("fingerprint")] if made.get("hashes") else [made, str(self.path.absolute())]
-        run = json.dumps([made.get("hashes"), *own], sort_keys=True)
+        equal = [made.get("hashes"), made.get("fingerprint")]
+        run = json.dumps(equal if equal[0] else [made, str(self.path.absolute())], sort_keys=True)
         return {
             "version": str(made.get("versions", {}).get("mdnum") or ""), "kind": self.kind,
             "system": str(self.told.get("system") or made.get("system") or ""),
-            "run": hashlib.sha256(run.encode()).hexdigest(),
+            "run": hashlib.sha256(run.encode()).hexdigest() if made else "",
             "units": {**names, **self.told.get("units", {})},
         }  # fmt: skip
 
@@ -608,7 +593,9 @@ class RunFolder:
         if name not in self._streams:
             if not self.layout.columns(name):
                 raise ValueError(f"a folder of {self.kind} is declared without a table {name!r}")
-            self._streams[name] = TableStream(self.path, name, self.layout, about=lambda: self.about)
+            own = self.layout.described
+            describe = lambda schema: described(schema, name, self.about, own)  # noqa: E731
+            self._streams[name] = TableStream(self.path, name, self.layout, describe=describe)
         return self._streams[name]
 
     def _reader(self, name: str) -> TableStream:
@@ -722,11 +709,11 @@ class RunFolder:
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
         text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
-        write_text(self.path / name, text + "\n")
+        manifest.write_text(self.path / name, text + "\n")
 
     def _read_json(self, name: str) -> dict[str, Any]:
         self.check(name)
-        text = read_text(self.path / name)
+        text = manifest.read_text(self.path / name)
         held = _parsed(self.path / name, text) if text else {}
         if not isinstance(held, dict):
             raise FolderError("is damaged: holds no JSON object", where=str(self.path / name))

@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
 from mdnum.store import files as manifest
-from mdnum.store.columns import described
 from mdnum.store.files import disk_errors, opened, replacing, subfolder
 from mdnum.store.layout import TYPES, Layout
 
@@ -49,16 +48,15 @@ class TableStream:
 
     def __init__(
         self, root: Path, name: str, layout: Layout | None, check: Callable[[Path], None] | None = None,
-        about: Callable[[], Mapping[str, Any]] | None = None,
+        describe: Callable[[pa.Schema], pa.Schema] = pa.Schema.remove_metadata,
     ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
             raise FolderError(f"no table is called {name!r}", where=str(root))
         self.name = name
         self._root = root
         self._check = check
-        # what the merged file says of its folder (see `columns.described`)
-        self._about = about
-        self._described = None if layout is None else layout.described
+        # adds what the merged file says of its folder
+        self._describe = describe
         #: digests of the part files that were written, by name
         self.written: dict[str, list[str]] = {}
         declared = {} if layout is None else layout.columns(name)
@@ -274,14 +272,7 @@ class TableStream:
 
     def _write_merged(self, tables: Iterator[pa.Table]) -> None:
         groups = map(self._whole, _regroup(tables, _GROUP_ROWS, self._whole))
-        schema = cast(pa.Schema, self._schema)
-        about = None if self._about is None else self._about()
-        schema = (
-            schema.remove_metadata()
-            if about is None
-            else described(schema, self.name, about, self._described)
-        )
-        self._replace(self.merged_path, groups, schema)
+        self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows with the columns that they leave out, in order; all columns where none are named."""

@@ -73,6 +73,19 @@ class Reply:
     status: str = "complete"  # as in summary.json
 
 
+def assigned(text: str, example: str) -> tuple[str, str]:
+    """The key and the value of "key=value".
+
+    Raises:
+        InputError: it is not of that form; `example`, an option and its value, is.
+    """
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not equals or not key:
+        seen = f"{example.split()[0]} {text!r} is not of the form key=value"
+        raise InputError(seen, remedy=f"Write for example {example}")
+    return key, value
+
+
 def declared(name: str) -> Mapping[str, Any]:
     """The text file of an entry of `VERBS`.
 

@@ -14,7 +14,7 @@ from mdnum.plain import headed
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
-from mdnum.verbs import Reply, frame
+from mdnum.verbs import Reply, assigned, frame
 from mdnum.verbs.ball_page import TEXTS, BallView, decision, page
 from mdnum.verbs.frame import Keep, Outcome, Progress, Verb
 
@@ -107,18 +107,11 @@ def _loaded(
 
     system = load(system, overrides, world="ball")
     for changes in against:
-        system = system.against(_changes(changes) if isinstance(changes, str) else changes)
-    return system
-
-
-def _changes(text: str) -> dict[str, str]:
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise InputError(
-            f"--against {text!r} is not of the form key=value",
-            remedy="Write for example --against precision.state=float32",
+        one = (
+            [assigned(changes, "--against precision.state=float32")] if isinstance(changes, str) else changes
         )
-    return {key.strip(): value.strip()}
+        system = system.against(dict(one))
+    return system
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.plain import headed, plain
+from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
@@ -42,10 +42,9 @@ class Checked:
     def summary(self) -> dict[str, Any]:
         """For JSON."""
         worst = {"worst": self.report.worst} if hasattr(self.report, "worst") else {}
-        said = {"headline": self.verdict.headline, "verdict": self.verdict.text}
-        told = {"status": "complete" if self.report.ok else "failed", "seconds": self.seconds, **said}
-        found = {"findings": self.verdict.findings, "ok": self.report.ok}
-        return plain(headed(f"check-{self.question}", {**told, **found, **vars(self.report), **worst}))
+        head = {"status": "complete" if self.report.ok else "failed", "seconds": self.seconds}
+        found = {**head, "ok": self.report.ok, **vars(self.report), **worst}
+        return plain(self.verdict.judged(f"check-{self.question}", found))
 
 
 def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from mdnum import doctor
-from mdnum.plain import headed
-from mdnum.report.finding import Finding
+from mdnum.report.finding import Finding, conclude
 from mdnum.verbs import Reply
 
 
@@ -18,5 +17,5 @@ def diagnose() -> Reply:
     shown = [("", ("status", "test", "seen"), rows), *remedies, f"{verdict} ({found.seconds:.1f} s)"]
     unsafe = [row for row in found.rows if row.remedy]
     findings = [Finding("UNSAFE", "error", row.name, row.seen, str(row.remedy)) for row in unsafe]
-    told = {"status": status, "headline": verdict, "verdict": verdict, "findings": findings, "ok": found.ok}
-    return Reply(headed("doctor", {**told, **vars(found)}), shown, status)
+    document = {"status": status, "ok": found.ok, **vars(found)}
+    return Reply(conclude(findings, headline=verdict, judged=True).judged("doctor", document), shown, status)

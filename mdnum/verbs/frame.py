@@ -117,11 +117,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Somebody pressed control-C where there was an answer already, which is in its folder.
-
-    Args:
-        outcome: that answer.
-    """
+    """Somebody pressed control-C where there was an answer (`outcome`) already, which is in its folder."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)

@@ -186,11 +186,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """A method that averages over starts, over this many of them; other methods as they are.
-
-    Args:
-        horizons: whether it follows shorter runs too.
-    """
+    """A method that averages over starts, over this many of them; other methods as they are."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))

@@ -9,6 +9,7 @@ from typing import Any
 
 from mdnum import systems
 from mdnum.plain import headed
+from mdnum.report.finding import conclude
 from mdnum.verbs import Reply
 
 
@@ -32,10 +33,11 @@ def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
     from mdnum.verbs.check import structure_findings
 
     found = list(structure_findings(loaded)) if hasattr(loaded, "atoms") else []
-    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path, "findings": found}
+    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path}
     words = f"{loaded.name}: {'can be run, with a warning' if found else 'fine'}, {_sized(document)}"
-    told = {"status": "complete", "seconds": None, "headline": words, "verdict": words}
-    return Reply(headed("systems-check", told | document), [words, *found])
+    return Reply(
+        conclude(found, headline=words, judged=True).judged("systems-check", document), [words, *found]
+    )
 
 
 def copy(system: str, target: Path | None = None) -> Reply:

@@ -39,7 +39,7 @@ class Recorder:
         )
         verdict = conclude([], headline="The answer.")
         seen = {"summary": self.answer, "verdict": verdict, "findings": verdict.findings, "page": page}
-        return SimpleNamespace(folder=Path("runs/x"), **seen)
+        return SimpleNamespace(folder=Path("runs/x"), reused=False, **seen)
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("argon/crystal-108", "--vary", "presicion"), "Did you mean precision"),
         (("argon/crystal-108", "--vary", "zzz"), "'zzz'. There are precision, reduction,"),
         (("ball/drop", "--vary", "zzz"), " reduction, order, stop, max_iter, contact,"),
-        (("argon/crystal-108", "--along", "sigma=1:2"), "`mdnum fork map SYSTEM KEY=LOW:HIGH`"),
+        (("argon/crystal-108", "--along", "sigma=1:2"), "No such option: --along"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
         (("forecast", "ball/drop", "1e-6"), "that mdnum ball records"),
         (("processes", "ball/drop"), "mdnum ball --demo determinism"),

@@ -115,7 +115,7 @@ def test_effective_cutoff_of_a_planted_offset(ulps: int):
 
 
 def test_borderline_pairs_are_on_both_sides():
-    pairs = borderline_pairs(2.5, 50, 0)
+    pairs = borderline_pairs(2.5, 50)
     inside = [exactly_inside(pair, np.zeros((3, 3)), 0, 1, (0, 0, 0), 2.5) for pair in pairs]
     assert 5 < sum(inside) < 45
 

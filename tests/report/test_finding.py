@@ -115,9 +115,7 @@ def test_every_sentence_can_be_filled(path):
         parts = [(name, form or "") for _, name, form, _ in string.Formatter().parse(text) if name]
         fields = {name: 2 for name, _ in parts}
         # a number with its unit is one of which the floor is written, or thousandths
-        known = {
-            name.split(".")[0] for name, form in parts if "." in name or re.match(r"[+]?\d*m|=", form)
-        }
+        known = {name.split(".")[0] for name, form in parts if "." in name or re.match(r"[+]?\d*m|=", form)}
         known -= {"units"}
         fields |= dict.fromkeys(known, Measured(2.0, "energy", 1.0, 1.0))
         assert "{" not in fill(text, {"units": METAL, **fields})

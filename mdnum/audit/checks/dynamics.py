@@ -186,11 +186,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """What the check found.
-
-        Args:
-            unknown: why there is no threshold.
-        """
+        """What the check found; `unknown` says why there is no threshold."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)

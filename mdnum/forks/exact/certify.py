@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +13,12 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.plain import result
-from mdnum.program import Decision, Program
+from mdnum.program import Decision, Program, Progress
 from mdnum.systems import BallSystem, opened
 
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-Progress = Callable[[int, int, dict[str, Any]], None]
 Roles = Mapping[str, str]
 
 _NARROW: Roles = dict.fromkeys(ROLES["md"], "float32")

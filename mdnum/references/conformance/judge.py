@@ -309,11 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """The error of an answer that is right for a list in float32, as in `CaseResult.single`; None of another.
-
-    Args:
-        truth: for that precision.
-    """
+    """The error of an answer that is right in float32, as in `CaseResult.single`; None of another."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))

@@ -281,11 +281,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """A question at one moment.
-
-    Args:
-        most: largest number of atoms.
-    """
+    """A question at one moment, of `most` atoms at most."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))

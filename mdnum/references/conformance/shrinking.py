@@ -147,11 +147,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """A failure brought down to few atoms and calls, whose script was run where it can be.
-
-    Args:
-        before: what the process had been asked.
-    """
+    """A failure brought down to few atoms and calls, whose script was run where it can be."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
