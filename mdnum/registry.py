@@ -37,12 +37,17 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return folded[close[0]] if close else None
 
 
+def meant(word: str, known: Iterable[str]) -> str:
+    """ "Did you mean ...? " with the nearest known word; empty where none is like it."""
+    close = nearest(word, known)
+    return f"Did you mean {close}? " if close else ""
+
+
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
     """The error for a name that does not exist: what it may have meant, and what there is."""
     known = list(known)
-    close = nearest(word, known)
-    hint = f"Did you mean {close}? " if close else ""
-    return InputError(f"no {noun} {word!r}", remedy=f"{hint}Known are {', '.join(known)}", where=where)
+    remedy = f"{meant(word, known)}Known are {', '.join(known)}"
+    return InputError(f"no {noun} {word!r}", remedy=remedy, where=where)
 
 
 @functools.lru_cache

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from mdnum.errors import InputError, in_a_line
-from mdnum.registry import nearest
+from mdnum.registry import meant
 from mdnum.safe_path import executed, search_last
 
 _counter = itertools.count()
@@ -134,8 +134,7 @@ class NamedObject:
             if not hasattr(value, part):
                 names = public(value)
                 has = ", ".join(names[:8]) or "no function: give the name of one"
-                close = nearest(part, names)
-                remedy = f"Did you mean {close}?" if close else f"It has {has}"
+                remedy = meant(part, names).rstrip() or f"It has {has}"
                 raise InputError(f"{where} has no {part!r}", remedy=remedy)
             value, where = getattr(value, part), f"{where}.{part}"
         return value

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from mdnum import units as unit_systems
 from mdnum.errors import InputError, expect_path
 from mdnum.reading import whole_text
-from mdnum.registry import nearest
+from mdnum.registry import meant
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, disk_errors, replacing, write_text
 from mdnum.systems import code, pairs, schema, structures, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
@@ -94,8 +94,7 @@ def find(name: str | Path) -> tuple[str, Path]:
     if text in known:
         return text, shipped_folder() / f"{text}.toml"
     short = [one for one in known if one.split("/")[-1] == text]
-    near = short[0] if short else nearest(text, known)
-    hint = f"Did you mean {near}? " if near else ""
+    hint = meant(short[0] if short else text, known)
     raise InputError(
         f"no system called {text!r}, and no file of that name",
         remedy=f"{hint}`mdnum systems list` names those shipped; your own system is a path to a .toml file",

@@ -30,7 +30,7 @@ from mdnum.md.neighbors import check_radius
 from mdnum.md.potentials import Channels, CutPotential
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import FIXED_POINT
-from mdnum.registry import nearest
+from mdnum.registry import meant
 from mdnum.systems import schema, structures, toml
 from mdnum.systems.build import build
 from mdnum.systems.construct import in_fixed_point
@@ -353,8 +353,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             raise InputError(several, remedy="Write one of them in full")
     if entry(simulation, word).index:
         return word
-    meant = nearest(word, [*known, *(name.rpartition(".")[2] for name in known)])
-    hint = f"Did you mean {meant}? " if meant else ""
+    hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)])
     listed = ", ".join((*known, "position.ATOM.x", "velocity.ATOM.x"))
     raise InputError(f"no parameter {word!r}", where=simulation.name, remedy=f"{hint}There are {listed}")
 

@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 
 from mdnum.errors import InputError
 from mdnum.reading import CHECK_STRUCTURE, ase_images, ignored_velocities, reading
-from mdnum.registry import nearest
+from mdnum.registry import meant
 from mdnum.systems import schema
 
 if TYPE_CHECKING:
@@ -137,11 +137,8 @@ def _build(structure: schema.BuilderStructure) -> Atoms:
     from ase.data import atomic_numbers
 
     if structure.symbol not in atomic_numbers:
-        near = nearest(structure.symbol, atomic_numbers)
-        raise InputError(
-            f"structure.symbol = {structure.symbol!r} is no chemical symbol",
-            remedy=f"Did you mean {near}?" if near else "Use one such as Ar",
-        )
+        remedy = meant(structure.symbol, atomic_numbers).rstrip() or "Use one such as Ar"
+        raise InputError(f"structure.symbol = {structure.symbol!r} is no chemical symbol", remedy=remedy)
     cells = math.prod(structure.repeat)
     if cells > _MOST_ATOMS // _ATOMS_IN_CELL[structure.builder]:
         raise InputError(

@@ -23,7 +23,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic_core import PydanticCustomError, core_schema
 
 from mdnum.errors import InputError
-from mdnum.registry import nearest
+from mdnum.registry import meant
 
 Key = tuple[str, ...]
 #: Name of the system file in a folder.
@@ -436,8 +436,7 @@ def _sentence(
 
     if kind == "extra_forbidden":
         known = sorted(fields, key=lambda name: name not in ("kind", "rule"))
-        near = nearest(last, known)
-        remedy = f"Did you mean {near}?" if near else f"Known keys are {', '.join(known)}."
+        remedy = meant(last, known).rstrip() or f"Known keys are {', '.join(known)}."
         return f"unknown key {last!r} in {f'[{outer}]' if outer else 'a system file'}", remedy
     if kind == "missing":
         if models(root, key, data):
@@ -450,9 +449,8 @@ def _sentence(
     if kind in ("union_tag_invalid", "unknown_name"):
         known = context.get("known") or kinds(key[:-1], last)
         given = str(context.get("tag", seen))
-        near = nearest(given, known)
-        remedy = f"Did you mean {near}? " if near else ""
-        return f"unknown {outer} {last} {given!r}", f"{remedy}Known {last}s are {', '.join(known)}."
+        remedy = f"{meant(given, known)}Known {last}s are {', '.join(known)}."
+        return f"unknown {outer} {last} {given!r}", remedy
     if kind == "literal_error":
         options = str(context["expected"]).replace("'", '"')
         return f"{name} = {_show(seen)}; expected {options}", meaning and f"{last}: {meaning}"

@@ -16,9 +16,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
 from mdnum.plain import plain
-from mdnum.registry import nearest
+from mdnum.registry import unknown
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs, points_of
 from mdnum.report.words import typeset
@@ -149,13 +148,7 @@ def _files() -> dict[str, Path]:
 def _known(name: str) -> str:
     known = names()
     if name not in known:
-        near = nearest(name, known)
-        hint = f"Did you mean {near}? " if near else ""
-        raise InputError(
-            f"no demonstration called {name!r}",
-            remedy=f"{hint}There are {', '.join(known)}; or all",
-            where="--demo",
-        )
+        raise unknown("demonstration", name, [*known, "all"], where="--demo")
     return name
 
 
@@ -252,8 +245,8 @@ def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
 
 
 def _result(demo: Mapping[str, Any]) -> str:
-    """What a demonstration shows; folders of earlier versions have the long answer alone."""
-    return typeset(demo.get("result") or demo["answer"])
+    """What a demonstration shows."""
+    return typeset(demo["result"] or demo["answer"])
 
 
 def _table(stored: Mapping[str, Any]) -> Table:

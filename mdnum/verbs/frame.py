@@ -32,7 +32,7 @@ import numpy as np
 from mdnum import units
 from mdnum.errors import FolderError, InputError, printable
 from mdnum.plain import plain
-from mdnum.registry import nearest
+from mdnum.registry import meant
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
 from mdnum.report.words import number
@@ -195,10 +195,8 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
     def checked(*args: Any, allow_code: bool = False, progress: Wanted = None, **kwargs: Any) -> Any:
         for word in kwargs:
             if word not in known:
-                close = nearest(word, known)
-                hint = f"Did you mean {close!r}? " if close else ""
                 message = f"{name or verb.__name__}() has no keyword {word!r}"
-                raise UnknownKeyword(message, remedy=f"{hint}It takes {', '.join(known)}")
+                raise UnknownKeyword(message, remedy=f"{meant(word, known)}It takes {', '.join(known)}")
         with code.allow_code(allow_code), reported(progress) as report_to:
             if "{content}" in str(kwargs.get("out")):
                 asked = inspect.signature(verb).bind_partial(*args, **kwargs)

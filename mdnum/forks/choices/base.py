@@ -12,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import alike, changes, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
-from mdnum.registry import Registry, nearest
+from mdnum.registry import Registry, meant
 from mdnum.systems import BallSystem, System, opened
 from mdnum.systems.load import world_of
 
@@ -198,8 +198,7 @@ def parse(text: str, world: str | None = None) -> Choice:
             return kind.parse(argument, role, both or None)
     worlds = _WORLDS if world is None else (world,)
     families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
-    close = nearest(text, [*families, *(name for one in worlds for name in shipped(one))])
-    near = f"Did you mean {close}? " if close else ""
+    near = meant(text, [*families, *(name for one in worlds for name in shipped(one))])
     raise InputError(
         f"no choice {text!r}", remedy=f"{near}There are {', '.join(families)}; `mdnum fork` lists all"
     )

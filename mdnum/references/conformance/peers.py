@@ -20,7 +20,7 @@ from mdnum.errors import InputError
 from mdnum.plain import beside
 from mdnum.references.conformance.lists import LISTS, ListLimits, PairList, from_object, source_of
 from mdnum.references.load import place
-from mdnum.registry import nearest
+from mdnum.registry import meant
 
 _DECLARED: dict[str, Any] = beside(__file__)
 
@@ -407,12 +407,9 @@ def load(word: str) -> PairList:
         return listed
     where = place(word)
     if where is None:
-        close = nearest(word, by_name)
-        meant = f"Did you mean {close}? " if close else ""
-        raise InputError(
-            f"{word!r} is no list that is known here",
-            remedy=f"{meant}Give {', '.join(sorted(by_name))}, package.module:function or file.py:function",
-        )
+        further = f"Give {', '.join(sorted(by_name))}, package.module:function or file.py:function"
+        message = f"{word!r} is no list that is known here"
+        raise InputError(message, remedy=meant(word, by_name) + further)
     made = where.find()
     lines, call = where.source()
     listed = from_object(made, f"{Path(where.home).stem}:{where.call}" if where.is_file else word, lines)
