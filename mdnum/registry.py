@@ -28,19 +28,11 @@ T = TypeVar("T")
 _LONGEST_WORD = 100
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
-    """The known word most like this one, or None when none is like it."""
-    if len(word) > _LONGEST_WORD:
-        return None
-    folded = {option.lower(): option for option in known}
-    close = difflib.get_close_matches(word.lower(), list(folded), n=1)
-    return folded[close[0]] if close else None
-
-
 def meant(word: str, known: Iterable[str]) -> str:
-    """ "Did you mean ...? " with the nearest known word; empty where none is like it."""
-    close = nearest(word, known)
-    return f"Did you mean {close}? " if close else ""
+    """ "Did you mean ...? " with the known word most like this one; empty where none is."""
+    folded = {option.lower(): option for option in known if len(word) <= _LONGEST_WORD}
+    close = difflib.get_close_matches(word.lower(), folded, n=1)
+    return f"Did you mean {folded[close[0]]}? " if close else ""
 
 
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:

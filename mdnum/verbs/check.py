@@ -16,6 +16,7 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude, fill
 from mdnum.report.words import listed
 from mdnum.trajectories.frame import Box, Frame, far_out
+from mdnum.units import Measured
 from mdnum.verbs import Reply
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from mdnum.references.pair_check import PairsReport
     from mdnum.systems import System
     from mdnum.systems.simulation import Simulation
+    from mdnum.units import Units
 
 TEXTS, RUN_TEXTS = Texts(__file__), Texts(Path(__file__).with_name("run.py"))
 # ratio of temperatures from which on the one of a structure is another than the one requested
@@ -77,7 +79,8 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
     began = perf_counter()
     report: Any = compare(simulation)
     headline = TEXTS("agrees" if report.ok else "differs", system=simulation.name)
-    verdict = conclude(findings(report), headline=headline, best="good", judged=True)
+    evidence = would_show(report, simulation.units) if report.ok else ()
+    verdict = conclude(findings(report), evidence, headline=headline, best="good", judged=True)
     return Checked(report, verdict, question, perf_counter() - began)
 
 
@@ -90,7 +93,7 @@ def _replied(
     loaded: Any = load(system, overrides, world="md")
     checked = check(question, loaded, allow_code=allow_code)
     title = fill(TEXTS.entries["titles"][question], {**vars(loaded.units), "system": system})
-    shown = [(title, checked.report.rows()), *checked.verdict.findings, checked.verdict.headline]
+    shown = [(title, checked.report.rows()), *checked.verdict.findings, checked.verdict.text]
     return Reply(checked.summary, shown, "complete" if checked.report.ok else "failed")
 
 
@@ -126,6 +129,21 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
     values = {"start": start, "requested": requested, "unit": unit}
     more, factor = (["factor"], (1 / ratio) ** 0.5) if start > 0 else ([], 0.0)
     yield RUN_TEXTS.finding("OTHER_TEMPERATURE", *more, factor=factor, **values)
+
+
+def would_show(report: Any, units: Units) -> Iterator[str]:
+    """How far two evaluations differ, and from where on that would not agree."""
+    from mdnum.references.energy_check import FORCE, ROUNDINGS
+
+    if frames := getattr(report, "frames", ()):
+        worst = max(frames, key=lambda frame: frame.force_max)
+        narrow = report.precision != "float64"
+        floor = ROUNDINGS * worst.force_expected if narrow else FORCE * worst.force_scale
+        force = Measured(worst.force_max, f"{units.energy}/{units.length}", floor, worst.force_scale)
+        yield TEXTS("force_within", force=force)
+    if hasattr(report, "position"):
+        off = Measured(report.position[-1], units.length, report.tolerance)
+        yield TEXTS("position_within", off=off, steps=len(report.position) - 1)
 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:

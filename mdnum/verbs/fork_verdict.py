@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mdnum.numerics.verdicts import REPEATS
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed, pair_name
+from mdnum.units import Measured
 
 if TYPE_CHECKING:
     from mdnum.verbs.frame import View
@@ -92,7 +93,8 @@ def _evidence(view: View) -> Iterator[str]:
     for reason in summary.get("reasons") or ():
         code = reason["code"]
         size = sizes[code == "other"] if sizes and code in ("counted", "counted_any", "other") else None
-        yield TEXTS(f"reason_{code}", **reason, displacement=size, unit=unit)
+        separation: Any = Measured(reason.get("separation"), unit, summary["tolerance"])
+        yield TEXTS(f"reason_{code}", **{**reason, "separation": separation}, displacement=size, unit=unit)
         if size and code != "other":
             yield TEXTS("repeats_displaced", displacement=size, unit=unit)
     if decision is None:

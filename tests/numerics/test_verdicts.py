@@ -26,6 +26,7 @@ from mdnum.numerics.verdicts import (
     split_of,
     table,
 )
+from mdnum.units import Measured
 from mdnum.verbs.fork_verdict import TEXTS
 
 RATE, TOLERANCE, STEPS = 0.02, 0.1, 3000
@@ -35,6 +36,7 @@ def judge(*given, **options) -> ForkVerdict:
     """The verdict, each of whose reasons has a sentence for its values."""
     verdict = verdicts.judge(*given, **options)
     for code, values in verdict.reasons:
+        values = {**values, "separation": Measured(values.get("separation", 0.0), "σ", TOLERANCE)}
         assert TEXTS(f"reason_{code}", **values, unit="σ", displacement=1e-9).endswith(".")
     return verdict
 

@@ -26,6 +26,7 @@ from mdnum.references import energy_check
 from mdnum.references.adapted import evaluate
 from mdnum.references.ase_models import ENERGY, independent, reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy, neighborhoods
+from mdnum.report.words import number
 from mdnum.systems import build
 from mdnum.systems.simulation import Simulation
 from mdnum.verbs.check import dynamics_findings, energy_findings
@@ -204,6 +205,12 @@ def test_a_hot_crystal_follows_ase(judge):
 def test_langevin_is_checked_without_its_bath():
     bath = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 3}
     assert check_dynamics(make(crystal(), LENNARD_JONES, SHORT, dynamics=bath), steps=STEPS).ok
+
+
+def test_an_agreement_says_from_where_on_there_would_be_none():
+    checked = mdnum.check("energy", make(crystal(), LENNARD_JONES, SHORT))
+    worst = max(checked.report.frames, key=lambda frame: frame.force_max)
+    assert checked.report.ok and number(1e-10 * worst.force_scale, 1) in checked.verdict.text
 
 
 def test_float32_trajectories_are_measured_as_such():

@@ -24,6 +24,7 @@ from mdnum.numerics.verdicts import Delay, Growth
 from mdnum.provenance import hashes
 from mdnum.report.finding import Texts
 from mdnum.report.section import Plot, Table
+from mdnum.report.words import number
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import load
@@ -626,6 +627,14 @@ def test_every_verdict_has_its_sentence(crystal, monkeypatch, entries, tone, nam
     assert verdict.headline == said[name] and verdict.tone == tone
     pair = "{i}–{j}".format(**crystal.summary["decision"])
     assert "–" not in verdict.headline.replace(pair, "") and not verdict.headline.endswith("..")
+
+
+def test_where_no_decision_differs_a_split_has_its_size(crystal):
+    reasons = [{"code": "no_fork", "steps": 400, "separation": 2e-8}]
+    none = dict.fromkeys(("fork", "split", "decision"))
+    view = cause(crystal, effect="no fork", reasons=reasons, tolerance=0.03, **none)
+    text = fork_verdict.judge(view).text
+    assert all(number(size, digits) in text for size, digits in ((2e-8, 2), (0.03, 1)))
 
 
 def test_findings_are_those_that_apply(crystal):
