@@ -176,12 +176,9 @@ def hashes(system: _System) -> dict[str, str | None]:
 
 
 def commit(package: Path) -> str | None:
-    """The git commit that mdnum runs from, with "+" when its files were changed since.
+    """The git commit that a package runs from, with "+" when its files were changed since.
 
     None of the programs that a repository can name (monitors, hooks, filters, transports) is run.
-
-    Args:
-        package: the folder of the package.
 
     Returns:
         None for an installed wheel, without git, or when the folder belongs to another repository.

@@ -168,10 +168,7 @@ class CertifiedHorizon:
 
 
 def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
-    """Every decision of a run against its rounding bound, and the ambiguous ones in exact arithmetic.
-
-    Args:
-        simulation: a pair potential.
+    """Every decision of a run of pairs against its bound, and the ambiguous ones in exact arithmetic.
 
     Raises:
         InputError: a rebuild rule that may miss pairs.

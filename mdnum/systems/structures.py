@@ -265,11 +265,7 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Atoms closer than this are a mistake in a structure with this kind of potential, length.
-
-    Args:
-        sigmas: of a Lennard-Jones potential, length.
-    """
+    """Atoms closer than this are a mistake in a structure with this potential (and its sigmas), length."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
