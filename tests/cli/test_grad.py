@@ -143,9 +143,7 @@ def test_the_folder_holds_the_derivative_of_the_closed_form(tmp_path):
 
 
 @pytest.mark.slow
-def test_plain_alone_at_a_jump_is_done_and_named(tmp_path, capsys, monkeypatch):
-    # trust would be two programs more
-    monkeypatch.setattr(grad, "_PARTS", ("agreement", "growth", "flips"))
+def test_plain_alone_at_a_jump_is_done_and_named(tmp_path, capsys):
     options = ("--steps", "40", "--methods", "symmetric", "--no-report", "-o", str(tmp_path / "plain"))
     assert call("grad", WELL, "--of", "msd", "--wrt", "sigma", *options, "--json") == 1
     document = json.loads(capsys.readouterr().out)

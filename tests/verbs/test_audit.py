@@ -33,7 +33,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.words import listed
 from mdnum.store import RunFolder
-from mdnum.units import LJ, Measured, get
+from mdnum.units import LJ, Measured
 from mdnum.verbs import frame
 from mdnum.verbs.audit import KINDS, TEXTS, AuditView
 
@@ -470,9 +470,8 @@ def test_numbers_have_the_units_of_the_calculator_and_words_stay_what_they_are(
             tmp_path / "site", "odd-units", {"in_units": module}, {"mdnum.checks": {"odd": "in_units:Odd"}}
         )
     )
-    loaded = LoadedCalculator("odd", "odd", planted.Good, planted.crystal(), 0.01, get(system))
-    monkeypatch.setattr("mdnum.verbs.audit._loaded", lambda calculator: loaded)
-    outcome = mdnum.audit_calculator("odd", checks="odd", out=tmp_path / "a")
+    asked = {"metal": (planted.Good, planted.crystal()), "lj": ("argon/crystal-108",)}
+    outcome = mdnum.audit_calculator(*asked[system], checks="odd", out=tmp_path / "a")
     length = {"eV": "Å", "ε": "σ"}[unit]
     force, odd = outcome.verdict.findings
     assert f"0.250 {unit}/{length}" in force.text and odd.text == f"It is 7 {unit} in SteveV."
