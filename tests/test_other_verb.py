@@ -201,7 +201,7 @@ def spread(path=None, *, resume=None, stop=False, **keep):
             raise KeyboardInterrupt
     with closing(take(resume, frame.layout("spread"))) as folder:
         state = restored(folder, State)
-        folder.write_anew()
+        folder.restart()
         values = {"number": [0], "value": state.numbers[:1]}
         frame.store(folder, {"seconds": state.seconds}, {"values": values})
         return frame.finish(folder, report=False)

@@ -59,7 +59,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         return arrays | meta, store
     except FolderError:
         raise
-    # a flipped bit of an archive is told in as many ways as there are fields in it
+    # a flipped bit of an archive shows in as many ways as there are fields in it
     except Exception as error:
         seen = " ".join(str(error).split())[:200] or type(error).__name__
         raise FolderError(

@@ -43,8 +43,8 @@ _FILES = (
 )  # fmt: skip
 _SYSTEM = (SYSTEM_FILE, SIMULATION_FILE)
 _LOCK = ".lock"
-# of those, what nothing is read from: each report writes it anew
-_WRITTEN_ANEW = "report.html"
+# of those, the one from which nothing is read: each report replaces it
+_REPLACED = "report.html"
 # what may be in a folder whose writing came to nothing
 _NOTHING_YET = (
     SYSTEM_FILE, SIMULATION_FILE, "structure.extxyz", "provenance.json", "log.txt", manifest.NAME, _LOCK,
@@ -398,7 +398,7 @@ class RunFolder:
         for name in ("answers.json", "provenance.json"):
             self.check(name)
 
-    def write_anew(self) -> None:
+    def restart(self) -> None:
         """Makes a folder that was taken an unfinished one, without its tables, which are written at its end.
 
         Their part files go too, which a kill during `finalize` leaves behind.
@@ -528,12 +528,12 @@ class RunFolder:
             tables = [each for each in self._listed() if each.endswith((".parquet", ".traj"))]
             # part files by their number only
             sound = [each for each in tables if each not in others and "/" not in each]
-            told = f"; {', '.join(sound)} can still be read" if sound else ""
-            raise FolderError(f"{wrong}{told}", remedy=_RESTORE, where=str(self.path / name))
+            rest = f"; {', '.join(sound)} can still be read" if sound else ""
+            raise FolderError(f"{wrong}{rest}", remedy=_RESTORE, where=str(self.path / name))
 
     @contextmanager
     def explained(self) -> Iterator[None]:
-        """Whatever goes wrong in here because the folder is not what was written is told in one line.
+        """Whatever goes wrong in here because the folder is not what was written is reported in one line.
 
         Raises:
             FolderError: the folder is damaged, or unfinished, or has no manifest; or its digests are those of
@@ -647,11 +647,11 @@ class RunFolder:
         return self._checked[name][1]
 
     def _list_files(self, finished: bool | None = None) -> None:
-        """Lists the files of this folder that nobody else lists, those that grew since anew."""
+        """Lists the files of this folder that nobody else lists, and again those that grew."""
         listed = self._listed()
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
-        fixed = {*_FILES} - {_WRITTEN_ANEW}
+        fixed = {*_FILES} - {_REPLACED}
         new = [name for name in there if name not in listed and (name in fixed or self.layout.keeps(name))]
         now = manifest.listed_files(self.path, {*new, *({"log.txt", "trajectory.traj"} & set(there))})
         for name, allowed in listed.items():
@@ -722,7 +722,7 @@ class RunFolder:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Whatever goes wrong in here because a file holds what mdnum would not write there is told in one line.
+    """What goes wrong in here because a file holds what mdnum would not write there is reported in one line.
 
     Raises:
         FolderError: it does.

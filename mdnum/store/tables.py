@@ -223,7 +223,7 @@ class TableStream:
             self._write_merged(self._on_disk())
         parts = [path for _, path in self.parts()]
         merged = self.merged_path.name
-        # rows of parts that are in the merged file are not looked at any more
+        # rows of parts that are in the merged file are not read any more
         manifest.update(self._root, {merged: self.written[merged]}, [f"parts/{path.name}" for path in parts])
         with disk_errors(self.parts_folder):
             for path in parts:
@@ -371,7 +371,7 @@ def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Whether a column is this value in all rows, told from how it is given: a word, or a broadcast array."""
+    """Whether a column is this value in all rows, by how it is given: a word, or a broadcast array."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

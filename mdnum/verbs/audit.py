@@ -111,7 +111,7 @@ def audit(
         with closing(take(resume, frame.layout("audit"))) as folder:
             state = kept(folder)
             loaded = _same(calculator, state, folder.path)
-            folder.write_anew()
+            folder.restart()
             for file in (folder.path / "structures").glob("failed-*.extxyz"):
                 if re.fullmatch(r"failed-\d+\.extxyz", file.name) and file.name not in state.failed:
                     remove(file)

@@ -172,7 +172,7 @@ def _differentiated(
 
 
 def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
-    """Each derivative that was asked for, as a plain mapping.
+    """Each derivative that was requested, as a plain mapping.
 
     Args:
         asked: the [gradient] table.

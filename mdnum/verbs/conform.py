@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 TEXTS = Texts(__file__)
 #: Roundoff by the name of the precision.
 PRECISIONS = {"float64": DOUBLE, "float32": SINGLE}
-#: Random cases that can be asked for.
+#: Random cases that can be requested.
 MOST_CASES = 100_000
 #: Times the rounding of float64 below which an error is no sign of float32.
 _SLIGHT = 2.0**16
@@ -178,7 +178,7 @@ def conform(
             slug = f"conform-{tested.name.replace(':', '-')}"
             folder = stack.enter_context(frame.new_folder("conform", slug, out))
         else:
-            folder.write_anew()
+            folder.restart()
         state = state or Examination(word=tested.word, tested=name, options=options)
         found, kept = examiner.report, answers.Answers(folder, state)
         kept.save()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 
-#: Steps of each program, unless others are asked for: enough for every cause to show.
+#: Steps of each program, unless others are given: enough for every cause to show.
 PROGRAM_STEPS = 200
 #: A share of what double precision gains that counts as nothing, and bits of error that do.
 _NOTHING, _NO_BITS = 0.05, 1.0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mdnum.systems import BallSystem, System
     from mdnum.systems.simulation import Simulation
 
-#: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
+#: Steps of what makes hundreds of runs, or follows them by hand, unless more are given.
 FEW_STEPS = 500
 #: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
 #: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
@@ -55,7 +55,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """The last step: the one asked for, else the system's own, but no more than `most`.
+    """The last step: the one given, else the system's own, but no more than `most`.
 
     Raises:
         InputError: steps below 1.

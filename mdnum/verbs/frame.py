@@ -176,7 +176,7 @@ class UnknownKeyword(InputError, TypeError):
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
     """A public verb that rejects a keyword it does not have before it reads or writes anything.
 
-    What a verb passes on as `**keep` would otherwise be looked at only when its folder is made, after options
+    What a verb passes on as `**keep` would otherwise be examined only when its folder is made, after options
     that the misspelled one was to replace have been used.
 
     Args:
@@ -346,7 +346,7 @@ def finish(
 
     Args:
         result: what the verb computed, for who called it from Python.
-        view: of the folder, where it was looked at already.
+        view: of the folder, where it has been read already.
         write: False leaves the folder as it is.
 
     Raises:

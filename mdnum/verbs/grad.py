@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 ALL = "all"
 #: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
 _QUICK, AFFORDABLE = ("event-aware", "symmetric", "finite-differences"), 6_000_000
-#: Parts of a diagnosis that are always there, and those that are asked for.
+#: Parts of a diagnosis that are always there, and those on request.
 _PARTS, EDGES = ("agreement", "growth", "flips", "trust"), "edges"
 ALSO = ("spectrum", EDGES, "scaling")
 #: Parts that have a table, and its name; parts that the summary has, and what of each it leaves out.
@@ -359,7 +359,7 @@ def _ball_methods(asked: Sequence[str] | None) -> list[str]:
 def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
-    """The ball with the loss and the parameters that were asked for in its own tables."""
+    """The ball with the loss and the parameters that were requested in its own tables."""
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)

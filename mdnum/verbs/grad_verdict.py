@@ -120,7 +120,7 @@ def _of_methods(view: View) -> Iterator[Finding]:
 
 
 def _of_trust(view: View) -> Iterator[Finding]:
-    """Derivatives that are not trusted as far as they were asked for."""
+    """Derivatives that are not trusted as far as they were requested."""
     for names, one in grad_page.judgments(view.summary).items():
         whose = TEXTS("whose", names=listed(names)) if names else ""
         values: dict[str, Any] = {"names": list(names), "whose": whose, "section": "How far it is trusted"}
