@@ -201,13 +201,13 @@ def judge(view: View) -> Verdict:
             found.append(TEXTS.finding("DEMO_FAILED", section=section, which="; ".join(failed), **values))
     checks = [claim["ok"] for demo in demos for claim in demo["checks"]]
     counts = {"demos": len(demos), "right": len(demos) - len(found)}
-    told, headline = [TEXTS("held", held=sum(checks), checks=len(checks))], TEXTS("some", **counts)
+    evidence, headline = [TEXTS("held", held=sum(checks), checks=len(checks))], TEXTS("some", **counts)
     if len(demos) > 1:
         results = (f"{demo['name']}: {_result(demo)}" for demo in demos)
-        told, headline = [*results, *told], headline if found else TEXTS("all", **counts)
+        evidence, headline = [*results, *evidence], headline if found else TEXTS("all", **counts)
     elif not found:
         headline = _result(demos[0])
-    return conclude(found, told, headline=headline, best="good")
+    return conclude(found, evidence, headline=headline, best="good")
 
 
 def page(view: View, verdict: Verdict) -> Page:
@@ -225,8 +225,8 @@ def page(view: View, verdict: Verdict) -> Page:
         checks = Table(("", "check", "seen", "expected"), rows, shown=1000, bad=bad)
         figures = list(_plots(demo, curves))
         asked = [demo["question"], *([_result(demo)] if len(demos) > 1 else [])]
-        told = [*asked, *figures[:1], typeset(demo["answer"]), numbers, checks]
-        sections.append(Section(_heading(demo, demos), told, terminal=True))
+        parts = [*asked, *figures[:1], typeset(demo["answer"]), numbers, checks]
+        sections.append(Section(_heading(demo, demos), parts, terminal=True))
         more: list[Any] = [_table(one) for one in demo["tables"]]
         more += [*figures[1:], *([TEXTS("in_md", text=demo["in_md"])] if demo["in_md"] else [])]
         # of all of them the command prints no tables: they would hide the answers
