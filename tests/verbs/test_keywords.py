@@ -45,7 +45,7 @@ def test_a_misspelled_keyword_is_rejected_with_the_nearest_right_one(
         for one in inspect.signature(verb).parameters.values()
     )
     # an argument that cannot be used is not reached
-    with pytest.raises(InputError, match=r"'reports'.*Did you mean report\? It takes ") as caught:
+    with pytest.raises(InputError, match=r"'reports'.*mean report\? ") as caught:
         verb(*positional, reports=False)
     assert isinstance(caught.value, TypeError)
     with pytest.raises(InputError, match=rf"^{name}\(\) has no keyword 'zzz'"):
