@@ -64,7 +64,7 @@ def test_a_misspelled_keyword_is_rejected_with_the_nearest_right_one(
     ],
 )
 def test_of_each_verb_its_own_keywords_are_known(verb, word: str, right: str) -> None:
-    with pytest.raises(InputError, match=rf"\(\) has no keyword '{word}'\. .*'{right}'\?"):
+    with pytest.raises(InputError, match=rf"\(\) has no keyword '{word}'\. .* {right}\?"):
         verb(*["nothing"] * (2 if verb is mdnum.fork_folders else 1), **{word: 5.0})
 
 
