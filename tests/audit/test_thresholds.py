@@ -151,7 +151,7 @@ def test_ends(pair, orders: list[int], within: float):
     end = found.thresholds[-1]
     assert end.radius == pytest.approx(R_CUT, abs=within, rel=0.0)
     if pair is late:
-        assert (end.inside, end.outside, place(end)) == (BEFORE, R_CUT, repr(R_CUT))
+        assert (end.inside, end.outside, place(end).digits) == (BEFORE, R_CUT, repr(R_CUT))
 
 
 def two(pair, **options) -> CalculatorSubject:
@@ -391,7 +391,7 @@ def test_no_more_is_claimed_than_was_searched():
     assert told.variants == ["falls"] and further is not None and not found.thresholds
     # 4 ε (σ/r)⁶ is left at the farthest, for the power of the distance is 6
     left = 4 * laws.EPSILON * (laws.SIGMA / further.reached) ** 6
-    assert told.values["left"] == pytest.approx(1e3 * left, rel=1e-2) and left < 1e-7 * laws.KT
+    assert told.values["left"].value == pytest.approx(left, rel=1e-2) and left < 1e-7 * laws.KT
     # what is lost in rounding has no end there
     found = walked(Bare(lambda r: (float(np.exp(-r)) - 1e3, float(np.exp(-r)))))
     assert found.cutoff is None or found.cutoff < 30
