@@ -481,7 +481,7 @@ def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tm
     with pytest.raises(FolderError, match="another process"):
         # before anything of its answers is read
         conform(resume=folder.path)
-    again.write_anew()
+    again.restart()
     again.append("areas", rows)
     again.finalize()
     assert len(RunFolder.open(folder.path).read("areas")["area"]) == 1
