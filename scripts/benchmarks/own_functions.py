@@ -1,6 +1,7 @@
 """What does a pair function of one's own cost beside the built-in Lennard-Jones?
 
-Answer. In rational operations 1.0 to 1.2 times as much, with an exponential 1.4 to 1.6.
+Answer. In rational operations 1.0 to 1.2 times as much, with an exponential 1.4 to 1.6 (docs/speed.md).
+It takes five minutes.
 
 The liquid of benchmark.py with 4,000 atoms, float64, hard cutoff, on one core: every potential makes as many
 steps as the others in turn, from the same start. Ratios are medians over the turns, of processor time.
