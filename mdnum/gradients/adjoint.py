@@ -89,30 +89,42 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         [x.astype(dtype), onto_force.astype(dtype), *(w[None] for w in force.weights(tables))]
     )
     energy, virial = onto_energy.astype(dtype), onto_virial.astype(dtype)
-    model, cut = force.model, force.model.cutoff
-    at, back_to_model = jax.vjp(lambda model: model.at_cutoff(), model)
-    types_of = model.pair_types
-    own, shared = model.potential.split()
+    cut = force.model.cutoff
+
+    def pieces(model):
+        # the parameters of a pair type, those that all share, and what the end is made of
+        return (*model.typed.potential.split(), model.at_cutoff())
+
+    (own, shared, at), back_to_model = jax.vjp(pieces, force.model)
+    model, types_of = force.model.typed, force.model.pair_types
+    of_shared = MODEL in wanted and bool(jax.tree.leaves(shared))
 
     def distances(d, dw, inside):
         # the argument is masked, not only the result: a padded slot may be at distance zero
         r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
-    def onto_parameters(r2, along, inside, types, weights, *, of_all: bool):
-        """The cotangents of each slot's own parameters and end; `of_all`, of the shared ones in all slots."""
+    def onto_parameters(r2, along, inside, types, weights):
+        """Through the energy and slope of each slot: the slope, the cotangents of r², of the slot's own
+        parameters and end, and of the shared ones in all slots."""
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
 
-        def ended(slots, shared):
+        def ended(r2, slots, shared, weights=weights):
             potential, end = slots
             u, s = eqx.combine(potential, shared).evaluate(r2)
             return cut.cut(r2, u, s, end, *weights)
 
+        def in_a_row(r2, slots, shared):
+            # a sum over one axis of slots is a product of matrices, and one over two takes 1.2 times as long
+            flat = jax.tree.map(jnp.ravel, (r2, slots, weights))
+            return jax.tree.map(lambda part: part.reshape(r2.shape), ended(*flat[:2], shared, flat[2]))
+
         onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
-        if of_all:
-            return jax.vjp(lambda shared: ended(slots, shared), shared)[1](onto)[0]
-        return jax.vjp(lambda slots: ended(slots, shared), slots)[1](onto)[0]
+        if of_shared:
+            (_, slope), back = jax.vjp(in_a_row, r2, slots, shared)
+            return slope, *back(onto)
+        return None, None, jax.vjp(lambda slots: ended(r2, slots, shared), slots)[1](onto)[0], None
 
     def onto_weights(r2, along, inside, types, weights, others):
         """Of each slot, what it adds to its atom: the pair is in a slot of the other one, too."""
@@ -120,39 +132,49 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
-    def terms(d, dw, inside, types) -> list[Array]:
-        """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted."""
+    def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
+        """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted; and
+        what a block of slots adds on those that all pairs share."""
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
-        (_, slope), (_, bend) = jax.jvp(
-            lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
-        )
-        slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
-        # derivative by r² of what this slot adds to energy and virial
-        shared = energy * (0.5 * slope) - virial * (bend * r2 + slope)
-        pull, twist = slope + slope, 4 * (bend * along - shared)
-        made = [pull * dw[c] + twist * d[c] for c in range(3)]
+        slope = by_r2 = by_slot = by_shared = None
+        if MODEL in wanted:
+            slope, by_r2, by_slot, by_shared = onto_parameters(r2, along, inside, types, weights)
+        if slope is None:
+            (_, slope), (_, bend) = jax.jvp(
+                lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
+            )
+            slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
+            # derivative by r² of what this slot adds to energy and virial
+            rest = energy * (0.5 * slope) - virial * (bend * r2 + slope) - bend * along
+        else:
+            # the reverse pass had all of it but the r² in the virial
+            slope = jnp.where(inside, slope, 0)
+            rest = jnp.where(inside, by_r2, 0) - virial * slope
+        pull, twist = slope + slope, 4 * rest
+        made = [pull * dw[c] - twist * d[c] for c in range(3)]
         if FORCE in wanted:
             made += [pull * d[c] for c in range(3)]
         if SCALE in wanted:
-            made += [2 * r2 * (shared - bend * along)]
+            made += [2 * r2 * rest]
         if MODEL in wanted:
-            leaves = jax.tree.leaves(onto_parameters(r2, along, inside, types, weights, of_all=False))
             made += [
                 leaf if types is None else jnp.where(types == kind, leaf, 0)
-                for leaf in leaves
+                for leaf in jax.tree.leaves(by_slot)
                 for kind in range(types_of)
             ]
         if WEIGHT in wanted and weights:
             made += onto_weights(r2, along, inside, types, weights, dw[3 + several :])
-        return made
+        return made, by_shared
 
-    sums = list(_summed(terms, columns, cell, tables, bits, force.in_one_loop(tables)))
+    one_loop = force.in_one_loop(tables) and not of_shared
+    sums, onto_shared = _summed(terms, columns, cell, tables, bits, one_loop)
+    sums = list(sums)
     on_x = jnp.stack(sums[:3]).astype(x.dtype)
     made = jnp.stack(sums[3:6]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x)
     del sums[: 6 if FORCE in wanted else 3]
     scale = jnp.sum(sums.pop(0)) if SCALE in wanted else jnp.zeros((), dtype)
-    onto_model, onto_weight = jax.tree.map(jnp.zeros_like, (model, model.weights))
+    onto_model, onto_weight = jax.tree.map(jnp.zeros_like, (force.model, model.weights))
     if WEIGHT in wanted and onto_weight:
         places = jax.tree.structure(onto_weight)
         each = [unsorted(sums.pop(), tables.order) for _ in range(places.num_leaves)]
@@ -160,19 +182,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
     if MODEL in wanted:
         flat = jnp.stack([jnp.sum(total) for total in sums]).reshape(-1, types_of)
         onto_own, onto_at = jax.tree.unflatten(jax.tree.structure((own, at)), list(flat))
-        onto_shared = shared
-        if jax.tree.leaves(shared):
-
-            def block(total, d, inside, types):
-                r2, along = distances(d[:3], d[3:], inside)
-                added = onto_parameters(r2, along, inside, types, factors(model, d[6:]), of_all=True)
-                return jax.tree.map(jnp.add, total, added)
-
-            start = jax.tree.map(jnp.zeros_like, shared)
-            onto_shared = _over_groups(block, start, columns, cell, tables, bits)
-        (onto_model,) = back_to_model(onto_at)
-        direct = jax.tree.map(jnp.add, onto_model.potential, eqx.combine(onto_own, onto_shared))
-        onto_model = replace(onto_model, potential=direct)
+        (onto_model,) = back_to_model((onto_own, onto_shared if of_shared else shared, onto_at))
     return ForceCotangents(on_x, replace(onto_model, weights=onto_weight), scale, made)
 
 
@@ -184,35 +194,30 @@ def _differences(cell, own, other):
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sums over the slots of each atom of what they add, from the differences of two vectors."""
+    """Sums over the slots of each atom of what they add, from the differences of two vectors; and what all
+    slots add together, where there is such."""
 
     def pair(own, other, types, inside):
         # padding is nowhere
         d = [jnp.where(inside, c, 0) for c in _differences(cell, own, other)]
-        return terms(d[:3], d[3:], inside, types)
+        return terms(d[:3], d[3:], inside, types)[0]
 
     made = kernel.over_pairs(pair, columns, tables, flags=(bits,)) if in_one_loop else None
     if made is not None:
-        return made.sums
+        return made.sums, None
     index, types = tables.groups()
     d = [jax.ShapeDtypeStruct(index.shape[1:], columns.dtype)] * (2 * len(columns) - 6)
     inside = jax.ShapeDtypeStruct(index.shape[1:], np.bool_)
-    first = jax.eval_shape(terms, d[:3], d[3:], inside, None if types is None else types[0])
-    start = (jnp.zeros_like(columns[0]),) * len(first)
-    return _over_groups(
-        lambda sums, d, inside, types: _added(sums, terms(d[:3], d[3:], inside, types)),
-        start, columns, cell, tables, bits,
-    )  # fmt: skip
-
-
-def _over_groups(add, start, columns, cell, tables: Tables, bits):
-    """A sum over the groups of slots, of what `add` makes of the differences in one."""
+    first, whole = jax.eval_shape(terms, d[:3], d[3:], inside, None if types is None else types[0])
+    nothing = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), whole)
+    start = (jnp.zeros_like(columns[0]),) * len(first), nothing
     own = tuple(columns)
 
     def group(sums, slots):
         j, types, told = slots
         d = _differences(cell, own, [c.at[j].get(mode="promise_in_bounds") for c in own])
-        return add(sums, d, unpacked(told), types), None
+        added, block = terms(d[:3], d[3:], unpacked(told), types)
+        return (_added(sums[0], added), jax.tree.map(jnp.add, sums[1], block)), None
 
     return lax.scan(group, start, (*tables.groups(), halves_of(bits)))[0]
 

@@ -84,7 +84,8 @@ class PairForce(eqx.Module):
     @property
     def law(self) -> CutPotential | Guarded:
         """The potential as the policy computes it: in sixteen bits it is rounded after every operation."""
-        return Guarded(self.model, self.zero, rounded) if self._short else self.model
+        model = self.model.typed
+        return Guarded(model, self.zero, rounded) if self._short else model
 
     @property
     def _short(self) -> bool:

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ase.data import atomic_numbers
 from jaxtyping import Array, Float, Integer, Num
 from scipy.linalg import block_diag
 
@@ -51,13 +52,15 @@ class PairPotential(eqx.Module):
     name: ClassVar[str]
     #: Parameters that all pairs share, as the weights of a network: any pytree of arrays.
     shared: ClassVar[Any] = ()
+    #: Parameters with one entry per species, by name; a pair has those of both its species.
+    by_species: ClassVar[Any] = ()
 
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
 
     def reference(
-        self, r: Float[np.ndarray, "pairs"], **constants: float
+        self, r: Float[np.ndarray, "pairs"], **constants: Any
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
         """u(r) and u'(r) on the host: the judge of `evaluate`, its slope the derivative of its energy.
 
@@ -65,14 +68,19 @@ class PairPotential(eqx.Module):
             r: distances, length.
             constants: of the pair; shared parameters are its own.
         """
-        made = self.with_leaves({name: jnp.atleast_1d(value) for name, value in constants.items()})
+        made = self.typed.with_leaves(jax.tree.map(jnp.atleast_1d, constants))
         energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
-        own, shared = self.split()
+        own, shared = self.typed.split()
         return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
+
+    @property
+    def typed(self) -> PairPotential:
+        """It with its parameters by species as two by pair type, those of the first and of the second one."""
+        return self
 
     def split(self) -> tuple[Any, Any]:
         """It with its parameters by pair type alone, and with the shared ones alone; None for the others."""
@@ -87,9 +95,9 @@ class PairPotential(eqx.Module):
         """The same form with other parameters."""
         return replace(self, **leaves)
 
-    def constants(self, kind: int) -> dict[str, float]:
-        """Its parameters for one pair type, but for those that all share."""
-        return {name: float(leaf[kind]) for name, leaf in self.leaves.items()}
+    def constants(self, kind: int) -> dict[str, Any]:
+        """Its parameters for one pair type, those by species as two; not those that all share."""
+        return jax.tree.map(lambda leaf: float(leaf[kind]), dict(self.typed.leaves))
 
 
 class LennardJones(PairPotential):
@@ -164,27 +172,38 @@ class PairFunction(PairPotential):
         ...     e = jnp.exp(-alpha * (r - r0))
         ...     return depth * (e * e - 2 * e)
         >>> PairFunction(morse, depth=0.2, alpha=1.4, r0=2.9)
+        >>> def mixed(r, sigma, species):
+        ...     (a, b), (z1, z2) = sigma, species
+        ...     return z1 * z2 * jnp.exp(-2 * r / (a + b))
+        >>> PairFunction(mixed, sigma={"Na": 1.2, "Cl": 1.8})
 
     Args:
         function: of jax operations, elementwise in its first argument, whose name says whether that is the
-            distance, `r` (length), or its square, `r2`.
+            distance, `r` (length), or its square, `r2`. An argument `species` that is not given is the
+            atomic numbers of both atoms, as two floats.
         parameters: by name, a number for all pairs or one for each pair of species, {"Ni-P": 0.2, ...}: these
-            have an entry per pair type. Or arrays, lists, dictionaries or modules of arrays, as the weights
-            of a network: these are shared by all pairs. A list of numbers is an array.
+            have an entry per pair type. One for each species, {"Ni": 2.2, "P": 1.9}: the function receives
+            those of both atoms, as a tuple. Or arrays, lists, dictionaries or modules of arrays, as the
+            weights of a network: these are shared by all pairs. A list of numbers is an array.
 
     Raises:
         InputError: the first argument is neither, or the parameters are not those of the function.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
-    parameters: dict[str, Any]  # in a simulation, arrays with one entry per pair type
+    parameters: dict[str, Any]  # in a simulation, arrays with one entry per pair type, or two such
     shared: dict[str, Any]  # pyright: ignore[reportIncompatibleVariableOverride]
+    by_species: dict[str, Any]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, function: Callable[..., Any], **parameters: Any):
         self.function = function
-        self.parameters = {key: value for key, value in parameters.items() if _is_by_type(value)}
-        self.shared = {key: value for key, value in parameters.items() if key not in self.parameters}
         arguments = list(inspect.signature(function).parameters)
+        if "species" in arguments[1:]:
+            parameters = {"species": atomic_numbers, **parameters}
+        self.parameters = {key: value for key, value in parameters.items() if _is_by_type(value)}
+        self.by_species = {key: value for key, value in parameters.items() if _is_by_species(value)}
+        own = self.parameters | self.by_species
+        self.shared = {key: value for key, value in parameters.items() if key not in own}
         if arguments[:1] not in (["r"], ["r2"]):
             raise InputError(
                 f"its first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
@@ -204,28 +223,40 @@ class PairFunction(PairPotential):
     name = property(lambda self: _name_of(self.function))  # type: ignore[assignment]
 
     def evaluate(self, r2):
-        ones, parameters = jnp.ones_like(r2), self.parameters | self.shared
+        ones, parameters = jnp.ones_like(r2), self.typed.leaves | self.shared
         if next(iter(inspect.signature(self.function).parameters)) == "r2":
             return jax.jvp(lambda q: self.function(q, **parameters), (r2,), (ones,))
         r = jnp.sqrt(r2)
         energy, slope = jax.jvp(lambda r: self.function(r, **parameters), (r,), (ones,))
         return energy, slope * (0.5 / r)
 
+    @property
+    def typed(self):
+        both = {
+            key: tuple(leaf[side] for side in np.triu_indices(len(leaf)))
+            for key, leaf in self.by_species.items()
+        }
+        return self._with(parameters=self.parameters | both, by_species={}) if both else self
+
     def split(self):
-        own, shared = copy(self), copy(self)
-        object.__setattr__(own, "shared", jax.tree.map(lambda _: None, self.shared))
-        object.__setattr__(shared, "parameters", jax.tree.map(lambda _: None, self.parameters))
-        return own, shared
+        shared = {"shared": jax.tree.map(lambda _: None, self.shared)}
+        own = {key: jax.tree.map(lambda _: None, getattr(self, key)) for key in ("parameters", "by_species")}
+        return self._with(**shared), self._with(**own)
 
     @property
     def leaves(self):
         return self.parameters
 
     def with_leaves(self, leaves):
+        parts = {part: getattr(self, part) for part in ("parameters", "by_species", "shared")}
+        return self._with(
+            **{part: {key: leaves.get(key, old) for key, old in own.items()} for part, own in parts.items()}
+        )
+
+    def _with(self, **parts: Any) -> PairFunction:
         made = copy(self)
-        for part in ("parameters", "shared"):
-            changed = {key: leaves.get(key, value) for key, value in getattr(self, part).items()}
-            object.__setattr__(made, part, changed)
+        for key, value in parts.items():
+            object.__setattr__(made, key, value)
         return made
 
 
@@ -234,6 +265,15 @@ def _is_by_type(value: Any) -> bool:
     if isinstance(value, Mapping):
         return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
     return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
+
+
+def _is_by_species(value: Any) -> bool:
+    """Whether a parameter is a number for each species, by chemical symbols."""
+    return (
+        isinstance(value, Mapping)
+        and bool(value)
+        and all(key in atomic_numbers and np.ndim(one) == 0 for key, one in value.items())
+    )
 
 
 def _name_of(function: Callable[..., Any]) -> str:
@@ -258,6 +298,10 @@ class SumPotential(PairPotential):
     def evaluate(self, r2):
         made = [part.evaluate(r2) for part in self.parts]
         return tuple(energy for energy, _ in made), tuple(slope for _, slope in made)
+
+    @property
+    def typed(self):
+        return replace(self, parts=tuple(part.typed for part in self.parts))
 
     def split(self):
         each = zip(*(part.split() for part in self.parts), strict=True)
@@ -340,6 +384,11 @@ class CutPotential(eqx.Module):
     def pair_types(self) -> int:
         """How many kinds of pairs there are."""
         return self.r_cut.shape[0]
+
+    @property
+    def typed(self) -> CutPotential:
+        """It with its parameters by species as two by pair type."""
+        return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
         """The bare potential at r_cut, per pair type."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -30,6 +31,10 @@ from mdnum.units import Units
 
 if TYPE_CHECKING:
     from ase import Atoms
+
+
+#: Two energies of a pair that differ by more are not the same function in either order, relative.
+_SYMMETRIC = 1e-12
 
 
 @dataclass(frozen=True)
@@ -207,12 +212,46 @@ def cut(
     if cutoff.switches:
         r_onset = ONSET_FRACTION * r_cut if onset is None else table(onset, "cutoff.onset")
     leaves = {key: table(value, f"potential.{key}") for key, value in potential.leaves.items()}
+    leaves |= {
+        key: jax.device_put(by_species(value, symbols, f"{where}potential.{key}"))
+        for key, value in dict(potential.by_species).items()
+    }
     tree = jax.tree.map(
         lambda one: np.array(one) if _is_array(one) else one, potential.shared, is_leaf=_is_array
     )
     shared = (_finite(leaf, f"{where}potential.{path}") for path, leaf in leaves_by_path(tree).items())
     leaves |= jax.device_put(dict(jax.tree.unflatten(jax.tree.structure(tree), shared)))
-    return CutPotential(potential.with_leaves(leaves), cutoff, r_cut, r_onset, weights)
+    potential = potential.with_leaves(leaves)
+    _check_symmetric(potential, np.asarray(r_cut), symbols)
+    return CutPotential(potential, cutoff, r_cut, r_onset, weights)
+
+
+def _check_symmetric(potential: PairPotential, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
+    """That a function of both species is the same in either order, at distances up to the cutoff.
+
+    Raises:
+        InputError: it is not; with the pair, a distance and both energies.
+    """
+    here = potential.typed
+    if here is potential:
+        return
+    is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
+    other = here.with_leaves(
+        jax.tree.map(lambda leaf: leaf[::-1] if is_pair(leaf) else leaf, dict(here.leaves), is_leaf=is_pair)
+    )
+    r = r_cut * np.linspace(0.3, 1, 15)[:, None]
+    u, swapped = (np.asarray(one.evaluate(jnp.asarray(r * r))[0]) for one in (here, other))
+    scale = np.max(np.abs(u), initial=0, where=np.isfinite(u))
+    differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
+    if differs.any():
+        k, kind = np.unravel_index(np.argmax(differs), u.shape)
+        first, second = pair_names(symbols)[kind].split("-")
+        raise InputError(
+            f"u of {first}, {second} is {u[k, kind]:.6g} at r = {r[k, kind]:.6g}, and of {second}, {first} "
+            f"{swapped[k, kind]:.6g}; expected the same in either order",
+            where=potential.name,
+            remedy="Combine the values of both species symmetrically, as (a + b) / 2",
+        )
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
@@ -240,10 +279,7 @@ def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
     what = f"terms.{term}.weight"
     symbols = atoms.get_chemical_symbols()
     if isinstance(weight, Mapping):
-        if missing := sorted(set(symbols) - set(weight)):
-            remedy = "Give a number for every species"
-            raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
-        weight = [weight[symbol] for symbol in symbols]
+        weight = by_species(weight, symbols, what)
     numbers = np.array(weight, np.float64)
     if numbers.shape != (len(atoms),) or not np.isfinite(numbers).all():
         seen = f"an array of shape {numbers.shape}"
@@ -277,13 +313,29 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
     """
     names = pair_names(symbols)
     if isinstance(value, Mapping):
-        given = {pair_key(*key.split("-")): number for key, number in value.items()}
+        given = {}
+        for key, number in value.items():
+            if given.setdefault(pair_key(*key.split("-")), number) != number:
+                message = f"{key} is given in both orders, with different numbers"
+                raise InputError(message, where=what, remedy="Give one number for a pair")
         missing = [one for one in names if pair_key(*one.split("-")) not in given]
         if missing:
             remedy = "Give one for every pair of species, or one number for all"
             raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
         value = [given[pair_key(*one.split("-"))] for one in names]
     return np.broadcast_to(_finite(value, what), (len(names),)).copy()
+
+
+def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> Float[np.ndarray, "species"]:
+    """One number per species.
+
+    Raises:
+        InputError: a species has none, or it is no finite number.
+    """
+    if missing := [symbol for symbol in symbols if symbol not in value]:
+        remedy = "Give a number for every species"
+        raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
+    return _finite([value[symbol] for symbol in symbols], what)
 
 
 def _finite(value: Any, what: str) -> Float[np.ndarray, "..."]:

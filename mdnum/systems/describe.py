@@ -139,6 +139,10 @@ def _interactions(simulation: Simulation) -> dict[str, Any]:
 def _pair_tables(simulation: Simulation, term: CutPotential) -> dict[str, Any]:
     potential, cutoff = term.potential, term.cutoff
     constants = {name: by_pair(simulation, leaf) for name, leaf in potential.leaves.items()}
+    constants |= {
+        name: dict(zip(simulation.symbols, np.asarray(leaf).tolist(), strict=True))
+        for name, leaf in dict(potential.by_species).items()
+    }
     constants |= _leaves(potential.shared) | _code(getattr(potential, "function", None))
     onset = {"onset": by_pair(simulation, term.r_onset)} if cutoff.switches else {}
     radius, compare = by_pair(simulation, term.r_cut), simulation.decider.compare

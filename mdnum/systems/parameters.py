@@ -47,7 +47,7 @@ _UNITS = {
     "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}", "skin": "{length}",
     "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",
     "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
-    "velocity": "{length}/{time}",
+    "velocity": "{length}/{time}", "species": "",
 }  # fmt: skip
 
 
@@ -60,7 +60,7 @@ class Parameter:
             pairs share.
         unit: in the units of the simulation; "" for a pure number, and "[alpha]" for an alpha of which it is
             not known. Of initial velocities that of length per internal time.
-        by: "pair type" or "atom"; "" where it is one for all.
+        by: "pair type", "species" or "atom"; "" where it is one for all.
     """
 
     value: Float[np.ndarray, "..."]
@@ -128,10 +128,12 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """What a parameter has an entry for: "pair type" or "atom"; "" where it is one for all."""
+    """What a parameter has an entry for: "pair type", "species" or "atom"; "" where it is one for all."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
-    return "pair type" if _is_typed(simulation, name) and simulation.pair_types > 1 else ""
+    if not _is_typed(simulation, name) or simulation.pair_types == 1:
+        return ""
+    return "species" if name in _by_species(simulation) else "pair type"
 
 
 def is_weight(name: str) -> bool:
@@ -141,6 +143,12 @@ def is_weight(name: str) -> bool:
 
 def _is_typed(simulation: Simulation, name: str) -> bool:
     return simulation.pairwise and name in pair_leaves(simulation.model, shared=False)
+
+
+def _by_species(simulation: Simulation) -> set[str]:
+    """The paths of parameters with an entry for each species."""
+    every = pair_leaves(simulation.model, shared=False)
+    return set(every) - set(pair_leaves(simulation.model, shared=False, species=False))
 
 
 def unit(simulation: Simulation, name: str) -> str:
@@ -180,8 +188,9 @@ def leaf_of(model: Any, name: str) -> Any:
     return pair_leaves(model)[name]
 
 
-def pair_leaves(model: CutPotential | Channels, shared: bool = True) -> dict[str, Any]:
-    """The arrays of pair potentials and their ends by path; those without pair types where wanted.
+def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
+    """The arrays of pair potentials and their ends by path; those without pair types, and those by species,
+    where wanted.
 
     `cutoff.radius` is that of all terms where they agree. Of some that do each has the one that they share.
     """
@@ -191,7 +200,8 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True) -> dict[str
         ends = {"cutoff.radius": part.r_cut} if every else {}
         for name, potential, end, onset, weight in part.rows:
             term = f"terms.{name}." if name else ""
-            own = {**potential.leaves, **(leaves_by_path(potential.shared) if shared else {})}
+            own = {**potential.leaves, **(dict(potential.by_species) if species else {})}
+            own |= leaves_by_path(potential.shared) if shared else {}
             found |= {f"{term}potential.{key}": leaf for key, leaf in own.items()}
             found |= {f"{term}weight": weight} if shared and weight is not None else {}
             ends |= {f"{term}cutoff.radius": part.r_cut}
@@ -320,14 +330,18 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """The paths of single pairs of species, where there are several."""
+    """The paths of single pairs of species, and of single ones, where there are several."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
+    single = _by_species(simulation)
     typed = [name for name in pair_leaves(simulation.model, shared=False) if "potential." in name]
+    pairs = schema.pair_names(simulation.symbols)
     return {
-        name.replace("potential.", f"potential.pairs.{pair}.", 1): Entry(name, (k,))
-        for k, pair in enumerate(schema.pair_names(simulation.symbols))
+        name.replace("potential.", f"potential.{'species' if name in single else 'pairs'}.{of}.", 1): Entry(
+            name, (k,)
+        )
         for name in typed
+        for k, of in enumerate(simulation.symbols if name in single else pairs)
     }
 
 

@@ -91,6 +91,16 @@ def test_single_weights_have_the_derivatives_of_differences(mixture, by_hand):
         assert float(value) == pytest.approx(float(whole[name]), rel=1e-6), name
 
 
+def test_all_weights_at_once_have_the_derivatives_of_differences_in_random_directions(mixture, by_hand):
+    rng, h = np.random.default_rng(5), 1e-5
+    for _ in range(2):
+        along = {name: rng.normal(size=value.shape) for name, value in by_hand.items()}
+        at = {name: mdnum.gradients.parameters.value(mixture.simulation, name) for name in along}
+        ends = [mixture.value({name: at[name] + sign * h * along[name] for name in at}) for sign in (1, -1)]
+        ours = sum(np.sum(by_hand[name] * along[name]) for name in at)
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(ours, rel=1e-6)
+
+
 @pytest.mark.nightly
 def test_pairs_of_one_type_in_single_precision(mixture):
     """Where all pairs are of one type the weights are still shared, and a bias of one number is no scalar."""
