@@ -104,9 +104,9 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
-    def onto_parameters(r2, along, inside, types, weights):
-        """Through the energy and slope of each slot: the slope, the cotangents of r², of the slot's own
-        parameters and end, and of the shared ones in all slots."""
+    def through(r2, along, inside, types, weights):
+        """Energy and slope as a function of r², of each slot's own parameters and end and of what all share;
+        those of the slots; and the cotangents of energy and slope."""
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
 
@@ -115,16 +115,21 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
             u, s = eqx.combine(potential, shared).evaluate(r2)
             return cut.cut(r2, u, s, end, *weights)
 
+        onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
+        return ended, slots, onto
+
+    def with_shared(r2, along, inside, types, weights):
+        """The slope of each slot, the cotangents of its r² and of its own parameters and end, and those of
+        the shared parameters in all slots: by one reverse pass, which is cheaper than two for a network."""
+        ended, slots, onto = through(r2, along, inside, types, weights)
+
         def in_a_row(r2, slots, shared):
             # a sum over one axis of slots is a product of matrices, and one over two takes 1.2 times as long
             flat = jax.tree.map(jnp.ravel, (r2, slots, weights))
             return jax.tree.map(lambda part: part.reshape(r2.shape), ended(*flat[:2], shared, flat[2]))
 
-        onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
-        if of_shared:
-            (_, slope), back = jax.vjp(in_a_row, r2, slots, shared)
-            return slope, *back(onto)
-        return None, None, jax.vjp(lambda slots: ended(r2, slots, shared), slots)[1](onto)[0], None
+        (_, slope), back = jax.vjp(in_a_row, r2, slots, shared)
+        return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
         """Of each slot, what it adds to its atom: the pair is in a slot of the other one, too."""
@@ -137,20 +142,22 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         what a block of slots adds on those that all pairs share."""
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
-        slope = by_r2 = by_slot = by_shared = None
-        if MODEL in wanted:
-            slope, by_r2, by_slot, by_shared = onto_parameters(r2, along, inside, types, weights)
-        if slope is None:
+        by_slot = by_shared = None
+        if of_shared:
+            slope, by_r2, by_slot, by_shared = with_shared(r2, along, inside, types, weights)
+            slope = jnp.where(inside, slope, 0)
+            # the reverse pass had all of it but the r² in the virial
+            rest = jnp.where(inside, by_r2, 0) - virial * slope
+        else:
             (_, slope), (_, bend) = jax.jvp(
                 lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
             )
             slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
             # derivative by r² of what this slot adds to energy and virial
             rest = energy * (0.5 * slope) - virial * (bend * r2 + slope) - bend * along
-        else:
-            # the reverse pass had all of it but the r² in the virial
-            slope = jnp.where(inside, slope, 0)
-            rest = jnp.where(inside, by_r2, 0) - virial * slope
+            if MODEL in wanted:
+                ended, slots, onto = through(r2, along, inside, types, weights)
+                by_slot = jax.vjp(lambda slots: ended(r2, slots, shared), slots)[1](onto)[0]
         pull, twist = slope + slope, 4 * rest
         made = [pull * dw[c] - twist * d[c] for c in range(3)]
         if FORCE in wanted:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +19,7 @@ from mdnum.md.fixed_point import FixedPointDecider, FixedPointUnits
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
-from mdnum.md.potentials import Channels, CutPotential, PairPotential, each_term, pair_type
+from mdnum.md.potentials import Channels, CutPotential, PairFunction, PairPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import FIXED_POINT
@@ -35,6 +34,9 @@ if TYPE_CHECKING:
 
 #: Two energies of a pair that differ by more are not the same function in either order, relative.
 _SYMMETRIC = 1e-12
+#: How far inside of the cutoff an energy is compared with that at it, and how steep it may be there, both per
+#: cutoff.
+_INSIDE, _STEEP = 1e-7, 1e4
 
 
 @dataclass(frozen=True)
@@ -222,30 +224,38 @@ def cut(
     shared = (_finite(leaf, f"{where}potential.{path}") for path, leaf in leaves_by_path(tree).items())
     leaves |= jax.device_put(dict(jax.tree.unflatten(jax.tree.structure(tree), shared)))
     potential = potential.with_leaves(leaves)
-    _check_symmetric(potential, np.asarray(r_cut), symbols)
+    if isinstance(potential, PairFunction):
+        _check_function(potential, np.asarray(r_cut), symbols)
     return CutPotential(potential, cutoff, r_cut, r_onset, weights)
 
 
-def _check_symmetric(potential: PairPotential, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """That a function of both species is the same in either order, at distances up to the cutoff.
+def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
+    """That a person's function goes on beyond its cutoff, and is the same for both orders of a pair.
 
     Raises:
         InputError: it is not; with the pair, a distance and both energies.
     """
     here = potential.typed
-    if here is potential:
-        return
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
     other = here.with_leaves(
         jax.tree.map(lambda leaf: leaf[::-1] if is_pair(leaf) else leaf, dict(here.leaves), is_leaf=is_pair)
     )
-    r = r_cut * np.linspace(0.3, 1, 15)[:, None]
-    u, swapped = (np.asarray(one.evaluate(jnp.asarray(r * r))[0]) for one in (here, other))
+    r = r_cut * np.append(np.linspace(0.3, 1, 15), 1 - _INSIDE)[:, None]
+    u, swapped = np.asarray(jax.jit(lambda r2: [one.evaluate(r2)[0] for one in (here, other)])(r * r))
     scale = np.max(np.abs(u), initial=0, where=np.isfinite(u))
+    pairs_of = pair_names(symbols)
+    if not (ends := np.abs(u[-1] - u[-2]) <= _STEEP * _INSIDE * np.max(np.abs(u[-4:]), axis=0)).all():
+        kind = int(np.argmin(ends))
+        raise InputError(
+            f"u of {pairs_of[kind]} is {u[-2, kind]:.6g} at its cutoff {r_cut[kind]:g} and "
+            f"{u[-1, kind]:.6g} just inside; expected a function that goes on there",
+            where=potential.name,
+            remedy="Leave the end to the cutoff: the function need not know of it",
+        )
     differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
     if differs.any():
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
-        first, second = pair_names(symbols)[kind].split("-")
+        first, second = pairs_of[kind].split("-")
         raise InputError(
             f"u of {first}, {second} is {u[k, kind]:.6g} at r = {r[k, kind]:.6g}, and of {second}, {first} "
             f"{swapped[k, kind]:.6g}; expected the same in either order",

@@ -313,6 +313,13 @@ def _nearest(
     return near[rows, column], origin[np.minimum(who[rows, column], len(origin) - 1)], pairs
 
 
+def nearest_distance(atoms: Atoms, within: float) -> float:
+    """The distance of the closest pair of atoms, or `within` where none is as close."""
+    return (
+        min(float(np.min(_nearest(atoms, within)[0], initial=within)), within) if len(atoms) > 1 else within
+    )
+
+
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:

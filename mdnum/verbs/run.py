@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from mdnum.plain import plain
 from mdnum.provenance import cores
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
-from mdnum.report.words import pair_name
+from mdnum.report.words import number, pair_name
 from mdnum.safe_path import environment, python
 from mdnum.store import RunFolder
 from mdnum.verbs.check import temperature_findings
@@ -103,7 +103,7 @@ def run(
         seen = f"is the folder of `mdnum {folder.layout.command}`, and no run"
         raise InputError(seen, where=str(resume), remedy=remedy)
     frames: SimpleQueue[np.ndarray | None] = SimpleQueue()
-    compared: list[Future[tuple[EnergyReport | None, float | None]]] = []
+    compared: list[Future[_Beside]] = []
     with ThreadPoolExecutor(1) as thread:
 
         def shown(simulation: Simulation, positions: np.ndarray) -> None:
@@ -131,7 +131,7 @@ def run(
             say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
         # after the comparison
         drawn = thread.submit(draw_first, view) if report else None
-        energies = compared[0].result() if check else (None, None)
+        energies = compared[0].result()
         with folder.explained():
             # which are followed pair by pair beside both
             _ = view.flips.alternates
@@ -160,17 +160,23 @@ def _compile_beside() -> None:
             )
 
 
+class _Beside(NamedTuple):
+    """What is worked out beside the loop."""
+
+    compared: EnergyReport | None = None  # the first and the last frame with ASE
+    period: float | None = None  # the fastest in them
+    function: dict[str, Any] | None = None  # what a person's pair function was found to be
+
+
 def _beside_the_loop(
     simulation: Simulation, frames: SimpleQueue[np.ndarray | None], check: bool, report: bool
-) -> tuple[EnergyReport | None, float | None]:
-    """The comparison of the first and the last frame with ASE, and the fastest period in them.
-
-    The loop is not in Python, most of this is.
-    """
+) -> _Beside:
+    """The comparison with ASE and what else takes Python's time, which the loop does not."""
     if report:
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
-        return None, None
+        return _Beside()
+    from mdnum.audit.functions import examined
     from mdnum.references.energy_check import SAMPLED, check_energy
     from mdnum.rollout.adequacy import fastest_period
 
@@ -194,15 +200,18 @@ def _beside_the_loop(
             yield name, atoms
 
     compared = check_energy(simulation, named())
-    return compared, min((one for one in periods if one is not None), default=None)
+    period = min((one for one in periods if one is not None), default=None)
+    return _Beside(compared, period, examined(simulation))
 
 
-def _keep(run: RunView, compared: EnergyReport | None, period: float | None) -> None:
-    """Puts the comparison with ASE and the fastest period into the summary."""
+def _keep(run: RunView, compared: EnergyReport | None, period: float | None, function: Any) -> None:
+    """Puts what was worked out beside the loop into the summary."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
     run.summary["fastest_period"] = period
+    if function is not None:
+        run.summary["cutoff"] = {**run.cutoff, "smoothness": function["smoothness"], "function": function}
     run.summary["ase"] = plain(compared.worst)
     run.summary["findings"] += map(plain, energy_findings(compared))
     run.folder.write_summary(run.summary)
@@ -235,7 +244,7 @@ def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
-        *_decisions(run), *_drift(run), *_cutoff(run), *_start(run), *_loop(run),
+        *_decisions(run), *_drift(run), *_cutoff(run), *_function(run), *_start(run), *_loop(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
     severities = {finding.severity for finding in found}
@@ -409,6 +418,22 @@ def _cutoff(run: RunView) -> Iterator[Finding]:
 def _loop(run: RunView) -> Iterator[Finding]:
     if operation := run.summary.get("not_compiled"):
         yield TEXTS.finding("NOT_COMPILED", operation=operation)
+
+
+def _function(run: RunView) -> Iterator[Finding]:
+    """Where a person's pair function is no number, and where it breaks, by the derivative that jumps."""
+    places = (run.cutoff.get("function") or {}).get("places", ())
+    energy, length = run.units.energy, run.units.length
+    for code, orders in (("FUNCTION_NOT_FINITE", (-1,)), ("FUNCTION_BREAKS", (0, 1, 2, 3))):
+        found = sorted((row for row in places if row["order"] in orders), key=lambda row: row["order"])
+        if found:
+            worst, *rest = found
+            order = worst["order"]
+            yield TEXTS.finding(
+                code, *["others"] * bool(rest), *["smooth"] * (order > 1), **worst, length=length,
+                unit=energy + ("", f"/{length}", f"/{length}²", f"/{length}³")[order], places=len(found),
+                others=", ".join(f"{row['pair']} {number(row['distance'], 6)} {length}" for row in rest),
+            )  # fmt: skip
 
 
 def _evidence(run: RunView) -> Iterator[str]:

@@ -222,11 +222,14 @@ def _what(run: RunView) -> list[tuple[str, str]]:
     given["terms"] = "; ".join(terms) or None
     # how many steps were made is said above; the file says how many were planned
     made = {key: value for key, value in (system.get("dynamics") or {}).items() if key != "steps"}
+    function = run.cutoff.get("function") or {}
     return TEXTS.rows("what", **{
         **vars(units), **given, "about": system.get("about") or None, "steps": run.steps,
         "atoms": run.summary.get("atoms") or None, "span": float(time[-1] - time[0]),
         "mean": float(np.mean(run.series["temperature"])),
         **{name: run.cutoff.get(name) for name in ("energy_jump", "force_jump")},
+        **{key: function.get(key) for key in ("from", "to")}, "breaks": len(function.get("places", ())),
+        "first": TEXTS(f"jumps_{run.cutoff['smoothness']}") if function else None,
         "dynamics": in_words(made, vars(units) | {"timestep": units.time}) if made else None,
     })  # fmt: skip
 

@@ -1,0 +1,172 @@
+"""Is a person's pair function smooth where atoms are, and how does it end? Found from its values alone.
+
+A run records what happens at its cutoff. Where a function has a break of its own, as pieces that do not meet,
+no flip is recorded, and no derivative through the run knows of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations_with_replacement, pairwise
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mdnum.audit.curve import SMOOTH, Curve, Jump, bisect, find_jumps
+from mdnum.md.potentials import LennardJones, Morse, PairPotential, SoftSphere
+from mdnum.systems.simulation import Simulation
+from mdnum.systems.structures import nearest_distance
+
+#: Intervals of a scan; two breaks closer together than one may be taken for one.
+_INTERVALS = 240
+#: How much closer than in the start atoms are taken to come, and how far beyond the cutoff a scan goes on, so
+#: that it finds a break at the cutoff itself.
+_CLOSER, _BEYOND = 0.9, 0.02
+#: A derivative at the cutoff below this share of its median in the outer half is rounding; energy, others.
+_NOTHING = (1e-12, 1e-9)
+#: Peaks of the force that are examined, and how often each is enlarged, nine times; a pole has at each level
+#: so many times the median around it, and in the end so many times that of the whole range.
+_PEAKS, _ZOOMS, _SHARP, _LARGE = 8, 8, 3.0, 1e3
+_ORDERS = ("energy", "force", "curvature", "third derivative")
+
+
+def examined(simulation: Simulation) -> dict[str, Any] | None:
+    """The breaks of a person's pair functions between the closest pair of the start and the cutoff.
+
+    Returns:
+        None where all potentials are mdnum's, else plain values: `from` and `to`, length; `smoothness`, the
+        number of derivatives of the cut energy that do not jump at the cutoff (-1: the energy jumps; 3: or
+        more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
+        energy that jumps, `what` that is (the energy is 0, the force 1) and its `jump`, beyond minus before.
+        Where the function is "singular" or "not finite" the order is -1.
+
+    Error:
+        a step of the force by 1e-6 of its scale is found, one of a curvature by 1e-4, where no other break is
+        within a 240th of the range.
+    """
+    if not simulation.pairwise:
+        return None
+    terms = {
+        name: term for name, term in simulation.model.terms.items()
+        if not isinstance(term.potential, LennardJones | Morse | SoftSphere)
+    }  # fmt: skip
+    if not terms:
+        return None
+    low = _CLOSER * nearest_distance(simulation.structure, simulation.r_cut)
+    places, order = [], SMOOTH
+    for name, term in terms.items():
+        own, shared = term.potential.typed.split()
+        walk, ends = _walked(shared), _ends(term.cutoff, shared)
+        for kind, pair in enumerate(combinations_with_replacement(simulation.symbols, 2)):
+            single = jax.tree.map(lambda leaf, kind=kind: leaf[kind], own)
+            r_cut, r_onset = float(term.r_cut[kind]), float(term.r_onset[kind])
+            order = min(order, _order(ends(single, r_cut, r_onset, np.linspace(0.5, 1, 101) * r_cut)))
+            at = {"term": name, "pair": "-".join(pair)}
+            places += [at | row for row in _breaks(partial(walk, single), low, r_cut)]
+    return {"from": low, "to": simulation.r_cut, "smoothness": order, "places": places}
+
+
+def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
+    """Energy and force of two, from the parameters of their type and a distance."""
+
+    @jax.jit
+    def evaluate(own, r):
+        def energy(r):
+            return eqx.combine(own, shared).evaluate(r * r)[0]
+
+        u, slope = jax.jvp(energy, (r,), (jnp.ones_like(r),))
+        return u, -slope
+
+    return lambda own, r: tuple(float(value) for value in evaluate(own, np.float64(r)))  # type: ignore[return-value]
+
+
+def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., np.ndarray]:
+    """The cut energy and its first derivatives at distances, the last of which is pulled inside a little."""
+    from mdnum.md.potentials import CutPotential
+
+    @jax.jit
+    def evaluate(own, r_cut, r_onset, r):
+        whole = CutPotential(eqx.combine(own, shared), cutoff, r_cut[None], r_onset[None])
+        at = jax.tree.map(lambda leaf: jnp.reshape(leaf, ()), whole.at_cutoff())
+
+        def energy(r):
+            return cutoff.cut(r * r, *whole.potential.evaluate(r * r), at)[0]
+
+        made = [energy]
+        for _ in range(SMOOTH):
+            made.append(lambda r, f=made[-1]: jax.jvp(f, (r,), (jnp.ones_like(r),))[1])
+        return jnp.stack([f(r) for f in made])
+
+    def ends(own, r_cut, r_onset, r):
+        return np.asarray(evaluate(own, np.float64(r_cut), np.float64(r_onset), r * (1 - 2.0**-44)))
+
+    return ends
+
+
+def _order(derivatives: np.ndarray) -> int:
+    """How many derivatives do not jump at the last place."""
+    for order, row in enumerate(derivatives):
+        usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
+        if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
+            return order - 1
+    return SMOOTH
+
+
+def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
+    """What is wrong with a curve between two distances, a row for each place."""
+    step = (r_cut - low) / _INTERVALS
+    curve, high = Curve(at), r_cut * (1 + _BEYOND)
+    grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
+    values = curve.many(grid)
+    good: np.ndarray = np.isfinite(values).all(axis=0)
+    nothing, rows = {"order": -1, "what": "singular", "jump": None}, []
+    for k in np.flatnonzero(good[1:] != good[:-1]):
+        ends = bisect(lambda r: bool(np.isfinite(curve(r)).all()), grid[k], grid[k + 1])
+        rows.append({"distance": float(ends[int(good[k])]), **nothing, "what": "not finite"})
+    poles = [{"distance": one, **nothing} for one in _poles(curve, grid, np.abs(values[1]))]
+    rows += [one for one in poles if all(abs(one["distance"] - row["distance"]) > step for row in rows)]
+    # between two of them, or one and an end
+    ends = [low - 4 * step, *sorted(row["distance"] for row in rows), high + 4 * step]
+    for left, right in pairwise(ends):
+        start, end = left + 4 * step, right - 4 * step
+        if end - start > 20 * step and np.isfinite(curve(0.5 * (start + end))).all():
+            found, _ = find_jumps(curve, start, end, step)
+            rows += [_row(jump) for jump in found]
+    # beyond its cutoff a function may do as it likes
+    return sorted(
+        (row for row in rows if row["distance"] <= r_cut * (1 + 1e-12)), key=lambda row: row["distance"]
+    )
+
+
+def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
+    """Where the force grows the more the nearer one looks."""
+    inner = force[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
+    found, usual = [], np.median(force[np.isfinite(force)])
+    for k in peaks[np.argsort(-force[peaks])][:_PEAKS]:
+        left, right = grid[k - 1], grid[k + 1]
+        for _ in range(_ZOOMS):
+            places = np.linspace(left, right, 19)
+            seen = np.nan_to_num(np.abs(curve.many(places)[1]), nan=np.inf)
+            best = int(np.argmax(seen[1:-1])) + 1
+            if not seen[best] > _SHARP * np.median(seen):
+                break
+            left, right = places[best - 1], places[best + 1]
+        else:
+            if seen[best] > _LARGE * usual:
+                found.append(float(places[best]))
+    return found
+
+
+def _row(jump: Jump) -> dict[str, Any]:
+    sizes = jump.energy, jump.force, jump.curvature, jump.third
+    return {
+        "distance": jump.at,
+        "order": jump.order,
+        "what": _ORDERS[jump.order],
+        "jump": sizes[jump.order],
+    }
