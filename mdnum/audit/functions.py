@@ -31,6 +31,8 @@ _NOTHING = (1e-12, 1e-9)
 #: Peaks of the force that are examined, and how often each is enlarged, nine times; a pole has at each level
 #: so many times the median around it, and in the end so many times that of the whole range.
 _PEAKS, _ZOOMS, _SHARP, _LARGE = 8, 8, 3.0, 1e3
+#: A force differs from the slope of its energy by this share at half of all distances.
+_WRONG = 1e-4
 _ORDERS = ("energy", "force", "curvature", "third derivative")
 
 
@@ -42,7 +44,8 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         number of derivatives of the cut energy that do not jump at the cutoff (-1: the energy jumps; 3: or
         more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
         energy that jumps, `what` that is (the energy is 0, the force 1) and its `jump`, beyond minus before.
-        Where the function is "singular" or "not finite" the order is -1.
+        Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
+        minus the derivative of the energy, as with a wrong `custom_jvp`.
 
     Error:
         a step of the force by 1e-6 of its scale is found, one of a curvature by 1e-4, where no other break is
@@ -122,7 +125,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
     values = curve.many(grid)
-    good: np.ndarray = np.isfinite(values).all(axis=0)
+    good = np.logical_and(*np.isfinite(values))
     nothing, rows = {"order": -1, "what": "singular", "jump": None}, []
     for k in np.flatnonzero(good[1:] != good[:-1]):
         ends = bisect(lambda r: bool(np.isfinite(curve(r)).all()), grid[k], grid[k + 1])
@@ -136,6 +139,17 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
         if end - start > 20 * step and np.isfinite(curve(0.5 * (start + end))).all():
             found, _ = find_jumps(curve, start, end, step)
             rows += [_row(jump) for jump in found]
+    u, f = values[:, grid <= r_cut]
+    with np.errstate(invalid="ignore"):
+        # that of the force over each interval, by the cubic through four points
+        change, work = (
+            np.diff(u)[1:-1],
+            (13 * (f[1:-2] + f[2:-1]) - f[:-3] - f[3:]) * (grid[1] - grid[0]) / 24,
+        )
+        share = np.abs(change + work) / (np.abs(change) + np.abs(work) + 1e-300)
+    if np.nanmedian(share) > _WRONG:
+        worst = float(grid[1 + int(np.nanargmax(share))])
+        rows.append({"distance": worst, "order": -2, "what": "force", "jump": None})
     # beyond its cutoff a function may do as it likes
     return sorted(
         (row for row in rows if row["distance"] <= r_cut * (1 + 1e-12)), key=lambda row: row["distance"]

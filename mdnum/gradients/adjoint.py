@@ -125,8 +125,9 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
         def in_a_row(r2, slots, shared):
             # a sum over one axis of slots is a product of matrices, and one over two takes 1.2 times as long
-            flat = jax.tree.map(jnp.ravel, (r2, slots, weights))
-            return jax.tree.map(lambda part: part.reshape(r2.shape), ended(*flat[:2], shared, flat[2]))
+            row, slots, others = jax.tree.map(jnp.ravel, (r2, slots, weights))
+            made = ended(row, slots, shared, others)
+            return jax.tree.map(lambda part: part.reshape(r2.shape), made)
 
         (_, slope), back = jax.vjp(in_a_row, r2, slots, shared)
         return slope, *back(onto)

@@ -224,11 +224,20 @@ class PairFunction(PairPotential):
 
     def evaluate(self, r2):
         ones, parameters = jnp.ones_like(r2), self.typed.leaves | self.shared
-        if next(iter(inspect.signature(self.function).parameters)) == "r2":
+        if self._of_square:
             return jax.jvp(lambda q: self.function(q, **parameters), (r2,), (ones,))
         r = jnp.sqrt(r2)
         energy, slope = jax.jvp(lambda r: self.function(r, **parameters), (r,), (ones,))
         return energy, slope * (0.5 / r)
+
+    def energy(self, r2: Float[Array, "..."]) -> Float[Array, "..."]:
+        """As the first of `evaluate`."""
+        parameters = self.typed.leaves | self.shared
+        return self.function(r2 if self._of_square else jnp.sqrt(r2), **parameters)
+
+    @property
+    def _of_square(self) -> bool:
+        return next(iter(inspect.signature(self.function).parameters)) == "r2"
 
     @property
     def typed(self):

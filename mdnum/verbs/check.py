@@ -71,7 +71,7 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
     with code.allow_code(allow_code):
         simulation = build(system)
     checks: Mapping[str, tuple[Callable[[Any], Any], Callable[[Any], Iterator[Finding]]]] = {
-        "energy": (check_energy, energy_findings),
+        "energy": (partial(check_energy, lammps=True), energy_findings),
         "pairs": (check_pairs, pair_findings),
         "dynamics": (check_dynamics, dynamics_findings),
     }
@@ -149,15 +149,20 @@ def would_show(report: Any, units: Units) -> Iterator[str]:
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:
     """What to know of energies, forces and stresses beside a reference."""
     from mdnum.references.ase_models import ENERGY, ITSELF
+    from mdnum.references.energy_check import LAMMPS
 
     wrong = [frame for frame in report.frames if not frame.ok]
     if wrong:
         worst = max(wrong, key=lambda frame: frame.force_rel)
-        variants = ["third"] * (worst.energy_third is not None) + ["ambiguous"] * bool(worst.ambiguous)
+        third = "lammps" if report.third == LAMMPS else "third"
+        variants = [third] * (worst.energy_third is not None) + ["ambiguous"] * bool(worst.ambiguous)
         yield TEXTS.finding("ASE_DISAGREES", *variants, reference=report.reference, **vars(worst))
     if not report.is_ase:
         own = {ITSELF: ["own"], ENERGY: ["energy"]}.get(report.reference, [])
-        yield TEXTS.finding("NOT_ASE", *own)
+        worst = max(report.frames, key=lambda frame: frame.energy_third or 0.0)
+        own += ["lammps"] * (report.third == LAMMPS) + ["untranslated"] * bool(report.untranslated)
+        energy, force = worst.energy_third, worst.force_third
+        yield TEXTS.finding("NOT_ASE", *own, energy=energy, force=force, operation=report.untranslated)
     if report.precision != "float64":
         yield TEXTS.finding(
             "NARROW_PRECISION",

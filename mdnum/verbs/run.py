@@ -424,14 +424,16 @@ def _function(run: RunView) -> Iterator[Finding]:
     """Where a person's pair function is no number, and where it breaks, by the derivative that jumps."""
     places = (run.cutoff.get("function") or {}).get("places", ())
     energy, length = run.units.energy, run.units.length
-    for code, orders in (("FUNCTION_NOT_FINITE", (-1,)), ("FUNCTION_BREAKS", (0, 1, 2, 3))):
+    codes = {"FUNCTION_SLOPE": (-2,), "FUNCTION_NOT_FINITE": (-1,), "FUNCTION_BREAKS": (0, 1, 2, 3)}
+    for code, orders in codes.items():
         found = sorted((row for row in places if row["order"] in orders), key=lambda row: row["order"])
         if found:
             worst, *rest = found
             order = worst["order"]
             yield TEXTS.finding(
                 code, *["others"] * bool(rest), *["smooth"] * (order > 1), **worst, length=length,
-                unit=energy + ("", f"/{length}", f"/{length}²", f"/{length}³")[order], places=len(found),
+                unit=energy + ("", f"/{length}", f"/{length}²", f"/{length}³")[max(order, 0)],
+                places=len(found),
                 others=", ".join(f"{row['pair']} {number(row['distance'], 6)} {length}" for row in rest),
             )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -107,6 +108,11 @@ def test_an_end_of_its_own_where_the_cutoff_is_is_refused():
             return jnp.where(r < RADIUS, wall(r), 0)
 
         found(ended)
+
+
+def test_a_force_that_is_not_the_slope_of_the_energy_is_found():
+    seen = found(lambda r: wall(r) + 0.1 * wall(jax.lax.stop_gradient(r)), "shifted")
+    assert seen is not None and [row["order"] for row in seen["places"]] == [-2]
 
 
 def test_potentials_of_mdnum_are_not_examined():
