@@ -9,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
+from ase.build import bulk
 from gradient_problems import everything
+from oracles import cut_energy
 
 import mdnum
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.md.cell import wrap_positions
+from mdnum.md.cutoffs import CUTOFFS
+from mdnum.store import RunFolder
 
 SIGMA, EPSILON = {"Ar": 1.0, "Kr": 1.2, "Ne": 0.8}, {"Ar": 1.0, "Kr": 1.5, "Ne": 0.5}
 
@@ -141,3 +145,83 @@ def test_one_species_needs_no_order():
     own = mdnum.PairFunction(one_sided, sigma={"Ar": 1.5})
     assert simulation(own, symbols="Ar27").evaluate().energy > 0
     assert mdnum.parameters(simulation(own, symbols="Ar27"))["potential.sigma"].value.shape == ()
+
+
+# --- every end, and all that is made of a run, beside the potential that is here -------------------------
+
+
+def lennard_jones(r2, sigma, epsilon):
+    s6 = (sigma * sigma / r2) ** 3
+    return 4 * epsilon * (s6 * s6 - s6)
+
+
+def fluid(potential, kind):
+    crystal = bulk("Ar", "fcc", a=1.58, cubic=True).repeat(3)
+    cut = mdnum.Cut(kind, 2.0)
+    return mdnum.simulation(
+        crystal, potential, cut, units="lj", timestep=0.004, temperature=1.2, skin=0.3, seed=3
+    )
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(one, marks=[pytest.mark.nightly] * (one not in ("force-shifted", "cosine")))
+        for one in CUTOFFS
+    ],
+)
+def test_forces_are_those_of_the_end_written_down_again(kind):
+    made = fluid(mdnum.PairFunction(lennard_jones, sigma=1.0, epsilon=1.0), kind)
+    x = made.positions + np.random.default_rng(4).normal(size=made.positions.shape) * 0.05
+    i, j = np.triu_indices(len(x), 1)
+    d = x[i] - x[j]
+    d -= np.diag(made.structure.cell) * np.round(d / np.diag(made.structure.cell))
+    r = np.linalg.norm(d, axis=1)
+    i, j, d, r = i[r < 2], j[r < 2], d[r < 2], r[r < 2]
+
+    def energy(r):
+        cut = cut_energy(
+            kind, r, 2.0, 1.8, lambda r: 4 * (r**-12 - r**-6), lambda r: 4 * (6 * r**-7 - 12 * r**-13)
+        )
+        inner = kind in ("switched", "quintic", "cosine")
+        return np.where(np.real(r) > 1.8, cut, 4 * (r**-12 - r**-6)) if inner else cut
+
+    pull = (np.imag(energy(r + 1e-30j)) / 1e-30 / r)[:, None] * d
+    force = np.zeros_like(x)
+    np.add.at(force, i, -pull)
+    np.add.at(force, j, pull)
+    mine = made.evaluate(x, np.asarray(made.structure.cell))
+    assert mine.energy == pytest.approx(np.real(energy(r)).sum(), rel=1e-12)
+    np.testing.assert_allclose(mine.forces, force, atol=1e-12 * np.abs(force).max())
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", CUTOFFS)
+def test_runs_forks_maps_and_gradients_are_those_of_the_potential_that_is_here(kind, tmp_path):
+    made = [
+        fluid(mdnum.PairFunction(lennard_jones, sigma=1.0, epsilon=1.0), kind),
+        fluid(mdnum.LennardJones(sigma=1.0, epsilon=1.0), kind),
+    ]
+    runs, forks, maps, gradients = [], [], [], []
+    for k, one in enumerate(made):
+        keep = {"report": False}
+        runs.append(mdnum.run(one, steps=40, out=tmp_path / f"run-{k}", **keep))
+        forks.append(mdnum.fork(one, "precision", steps=20, out=tmp_path / f"fork-{k}", **keep))
+        found = mdnum.fork_map(
+            one, "potential.epsilon", 1.0, 1.02, steps=20, most=2, cells=8, out=tmp_path / f"map-{k}", **keep
+        )
+        maps.append(found.result)
+        problem = Problem(one, everything(one.atoms), 30)
+        gradients.append(mdnum.method("event-aware")(problem, ("potential", "cutoff.radius")).gradient)
+    ledgers = [RunFolder.open(one.folder).read("flips", ["step", "i", "j", "entered"]) for one in runs]
+    assert len(ledgers[0]["step"]) > 50
+    assert all(np.array_equal(ledgers[0][key], ledgers[1][key]) for key in ledgers[0])
+    mine, theirs = (one.summary for one in runs)
+    assert mine["energy_budget_closes"] and mine["ase"]["ok"] and mine["cutoff"]["function"]["places"] == []
+    for key in ("energy_jump", "force_jump", "smoothness"):
+        assert mine["cutoff"][key] == pytest.approx(theirs["cutoff"][key], rel=1e-12, abs=1e-15)
+    assert all(forks[0].summary[key] == forks[1].summary[key] for key in ("effect", "fork"))
+    places = [[one.below.at for one in found.boundaries] for found in maps]
+    assert len(places[0]) > 0 and places[0] == pytest.approx(places[1], rel=1e-9)
+    for name, value in gradients[1].items():
+        assert gradients[0][name] == pytest.approx(value, rel=1e-7), name
