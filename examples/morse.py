@@ -24,6 +24,6 @@ print(run.summary["flips_entered"], "pairs entered the cutoff; ASE's list agrees
 fork = mdnum.fork(simulation, "precision", steps=100)
 print(fork.verdict.headline)
 
-grad = mdnum.grad(simulation, "potential", ["depth", "r0", "r_cut"], steps=50, methods="event-aware")
+grad = mdnum.grad(simulation, "potential", ["alpha", "depth", "r0", "r_cut"], steps=50, methods="event-aware")
 for method in grad.summary["methods"]:
     print(method["method"], method["gradient"])

@@ -43,6 +43,12 @@ problem = mdnum.Problem(simulation, mdnum.gradients.losses.MeanPotential(), step
 value, slopes = mdnum.value_and_grad(problem, ["potential"], "symmetric")({})
 along = {name: rng.normal(size=slope.shape) for name, slope in slopes.items()}
 ends = [
-    problem.value({n: mdnum.parameters(simulation)[n].value + h * along[n] for n in along}) for h in (-1e-5, 1e-5)
+    problem.value({n: mdnum.parameters(simulation)[n].value + h * along[n] for n in along})
+    for h in (-1e-5, 1e-5)
 ]
-print("by weights:", sum(np.sum(slopes[n] * along[n]) for n in along), "differences:", (ends[1] - ends[0]) / 2e-5)
+print(
+    "by weights:",
+    sum(np.sum(slopes[n] * along[n]) for n in along),
+    "differences:",
+    (ends[1] - ends[0]) / 2e-5,
+)

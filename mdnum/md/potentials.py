@@ -22,6 +22,7 @@ from scipy.linalg import block_diag
 import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import AtCutoff, Cutoff
+from mdnum.numerics.host import by_numpy
 from mdnum.registry import Registry
 
 if TYPE_CHECKING:
@@ -62,14 +63,15 @@ class PairPotential(eqx.Module):
     def reference(
         self, r: Float[np.ndarray, "pairs"], **constants: Any
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """u(r) and u'(r) on the host: the judge of `evaluate`, its slope the derivative of its energy.
+        """u(r) and u'(r) by numpy: the judge of `evaluate`, its slope the derivative of its energy.
 
         Args:
             r: distances, length.
             constants: of the pair; shared parameters are its own.
         """
-        made = self.typed.with_leaves(jax.tree.map(jnp.atleast_1d, constants))
-        energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
+        made = self.typed.with_leaves(jax.tree.map(np.atleast_1d, constants))
+        along = np.ones(len(r))
+        energy, slope = by_numpy(lambda r: jax.jvp(lambda r: made.evaluate(r * r)[0], (r,), (along,)), r)
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:

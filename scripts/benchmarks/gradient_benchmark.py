@@ -11,6 +11,7 @@ last step, by sigma and epsilon. Contenders take turns from the same start, afte
     symmetric     value and gradient: the derivative of the steps
     event-aware   the same and what every flip adds
     reversible    the run on the lattice, taken back step by step; beside the lattice's own forward run
+    network       the same three with 9,996 weights of a network as the pair potential, by all of them
     jax.grad      through jax-md's own loop (velocity Verlet, list update at each step, in one scan), for as
                   many steps as fit the memory given; its list's length is the best it can be, and its
                   potential is switched, because jax-md has no hard cutoff
@@ -48,9 +49,14 @@ NAMES = ("sigma", "epsilon")
 FORWARD, SYMMETRIC, AWARE, LATTICE, REVERSIBLE, JAX_GRAD = (
     "forward", "symmetric", "event-aware", "lattice forward", "reversible", "jax.grad",
 )  # fmt: skip
+NETWORK, BY_WEIGHTS, BY_WEIGHTS_AWARE = "network forward", "network symmetric", "network event-aware"
 #: What each is measured against, and the most that it may cost beside it.
-_BESIDE = {SYMMETRIC: FORWARD, AWARE: FORWARD, REVERSIBLE: LATTICE}
-MOST_RATIO, LEAST_GAIN, MOST_GROWTH, MOST_MB = 3.0, 4.0, 1.1, 2048.0
+_BESIDE = {
+    SYMMETRIC: FORWARD, AWARE: FORWARD, REVERSIBLE: LATTICE, BY_WEIGHTS: NETWORK, BY_WEIGHTS_AWARE: NETWORK,
+}  # fmt: skip
+MOST_RATIO, LEAST_GAIN, MOST_GROWTH, MOST_MB, MOST_BY_WEIGHTS = 3.0, 4.0, 1.1, 2048.0, 5.0
+#: Width of both layers of the network, which has 9,996 weights, and steps of its rollout.
+WIDTH, FEW = 98, 20
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,7 @@ def on_the_lattice(system: System) -> System:
     return replace(system, spec=system.spec.model_copy(update={"precision": precision}))
 
 
-def forward(system: System) -> Callable[[int], None]:
+def forward(system: Any) -> Callable[[int], None]:
     """The run alone."""
     from mdnum.rollout import Engine
     from mdnum.systems import build
@@ -94,7 +100,30 @@ def forward(system: System) -> Callable[[int], None]:
     return run
 
 
-def gradient(system: System, method: str, *, finite: bool = True) -> Callable[[int], None]:
+def network(atoms: int) -> Any:
+    """The same liquid with two layers of a network as its pair potential, as a simulation."""
+    import jax.numpy as jnp
+
+    import mdnum
+
+    def energy(r, layers, out):
+        h = r[..., None]
+        for weight, bias in layers:
+            h = jnp.tanh(h @ weight + bias)
+        return h @ out
+
+    rng = np.random.default_rng(0)
+    layers = [(rng.normal(size=(one, WIDTH)) / one**0.5, rng.normal(size=WIDTH) * 0.1) for one in (1, WIDTH)]
+    potential = mdnum.PairFunction(energy, layers=layers, out=rng.normal(size=WIDTH) / WIDTH**0.5)
+    like = mdnum.build(liquid(atoms))
+    return mdnum.simulation(
+        like.structure, potential, mdnum.Cut("hard", 2.5), units="lj", timestep=0.002, skin=0.3
+    )
+
+
+def gradient(
+    system: Any, method: str, names: tuple[str, ...] = NAMES, *, finite: bool = True
+) -> Callable[[int], None]:
     """Value and gradient by one of mdnum's methods.
 
     Args:
@@ -108,7 +137,7 @@ def gradient(system: System, method: str, *, finite: bool = True) -> Callable[[i
     simulation, found = build(system), METHODS.parse(method)
 
     def run(steps: int) -> None:
-        answer = found(Problem(simulation, VelocityAutocorrelation(), steps), NAMES)
+        answer = found(Problem(simulation, VelocityAutocorrelation(), steps), names)
         if finite and not all(np.isfinite(value).all() for value in answer.gradient.values()):
             raise RuntimeError(f"{method}: a gradient that is not finite measures nothing")
 
@@ -188,6 +217,11 @@ def race(atoms: int, steps: int, turns: int, most_mb: float, without: tuple[str,
         grid = on_the_lattice(system)
         loops[LATTICE] = (forward(grid), steps)
         loops[REVERSIBLE] = (gradient(grid, REVERSIBLE), steps)
+    if NETWORK not in without:
+        made = network(atoms)
+        loops[NETWORK] = (forward(made), FEW)
+        for name, method in ((BY_WEIGHTS, SYMMETRIC), (BY_WEIGHTS_AWARE, AWARE)):
+            loops[name] = (gradient(made, method, ("potential",)), FEW)
     if JAX_GRAD not in without:
         say(f"{atoms} atoms: how many steps of jax.grad fit {most_mb:g} MB")
         run, fit = jax_grad(system, most_mb)
@@ -238,7 +272,8 @@ def verdicts(result: dict[str, Any]) -> list[tuple[str, float, str, bool]]:
         if row.name in _BESIDE:
             assert row.cpu_ratio is not None
             claim = f"{row.name} over {_BESIDE[row.name]}, N = {row.atoms:,}, CPU time"
-            rows.append((claim, row.cpu_ratio, f"<= {MOST_RATIO:g}", row.cpu_ratio <= MOST_RATIO))
+            most = MOST_BY_WEIGHTS if _BESIDE[row.name] == NETWORK else MOST_RATIO
+            rows.append((claim, row.cpu_ratio, f"<= {most:g}", row.cpu_ratio <= most))
         elif row.name == JAX_GRAD:
             assert row.cpu_ratio is not None
             claim = f"jax.grad over symmetric, N = {row.atoms:,}, {row.steps} steps, CPU time"
@@ -305,7 +340,11 @@ def _options() -> argparse.Namespace:
         "--memory", type=float, default=3000.0, metavar="MB", help="for jax.grad (default 3000)"
     )
     made.add_argument(
-        "--without", nargs="+", default=[], choices=(REVERSIBLE, JAX_GRAD), help="contenders to leave out"
+        "--without",
+        nargs="+",
+        default=[],
+        choices=(REVERSIBLE, JAX_GRAD, NETWORK),
+        help="contenders to leave out",
     )
     made.add_argument("--no-peaks", action="store_true", help="no memory of whole processes")
     made.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
