@@ -22,10 +22,10 @@ def loss(layers):
     return jnp.mean((network(r, layers) - 4 * (r**-12 - r**-6)) ** 2)
 
 
-rng, sizes = np.random.default_rng(0), (1, 16, 16)
+rng = np.random.default_rng(0)
 layers = [
     {"weight": jnp.asarray(rng.normal(size=(a, b)) / a**0.5), "bias": jnp.zeros(b)}
-    for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+    for a, b in ((1, 16), (16, 16))
 ]
 step = jax.jit(lambda at: jax.tree.map(lambda w, slope: w - 0.01 * slope, at, jax.grad(loss)(at)))
 for _ in range(4000):
@@ -42,13 +42,6 @@ print(run.summary["flips_entered"], "pairs entered the cutoff; ASE agrees:", run
 problem = mdnum.Problem(simulation, mdnum.gradients.losses.MeanPotential(), steps=50)
 value, slopes = mdnum.value_and_grad(problem, ["potential"], "symmetric")({})
 along = {name: rng.normal(size=slope.shape) for name, slope in slopes.items()}
-ends = [
-    problem.value({n: mdnum.parameters(simulation)[n].value + h * along[n] for n in along})
-    for h in (-1e-5, 1e-5)
-]
-print(
-    "by weights:",
-    sum(np.sum(slopes[n] * along[n]) for n in along),
-    "differences:",
-    (ends[1] - ends[0]) / 2e-5,
-)
+at = {name: mdnum.parameters(simulation)[name].value for name in slopes}
+less, more = (problem.value({n: at[n] + h * along[n] for n in at}) for h in (-1e-5, 1e-5))
+print("by weights:", sum(np.sum(slopes[n] * along[n]) for n in at), "differences:", (more - less) / 2e-5)

@@ -54,7 +54,7 @@ _LARGEST = 100_000
 
 
 class Untranslated(Exception):
-    """A formula has an operation without a word of lepton; which."""
+    """Something for which lepton has no word; what."""
 
 
 def installed() -> bool:
@@ -98,25 +98,27 @@ def expression(function: Any) -> str:
     (result,) = interpreted(jax.make_jaxpr(function)(np.float64(1.0)), ["r"], rule, enter)
     if sizes.get(result, 1) > _LARGEST:
         raise Untranslated(f"{len(lines)} operations on one another")
-    needed, left = {result}, [result]
-    while left:
-        for one in lines.get(left.pop(), ("", []))[1]:
-            left += [one] * (one not in needed)
-            needed.add(one)
     # a definition stands behind those that use it
-    parts = [f"{name} = {lines[name][0]}" for name in reversed(lines) if name in needed]
+    needed, parts = {result}, []
+    for own in reversed(lines):
+        if own in needed:
+            words, used = lines[own]
+            needed |= set(used)
+            parts.append(f"{own} = {words}")
     return "; ".join([result, *parts])
 
 
 def expressions(simulation: Simulation) -> list[str]:
-    """The cut energy of each pair type, of a pair function of a person's.
+    """The cut energy of each pair type of a person's pair function.
 
     Raises:
         Untranslated: there is none such.
     """
     model = simulation.model
     if not isinstance(model, CutPotential) or not isinstance(model.potential, PairFunction) or model.weights:
-        raise Untranslated("no single pair function")
+        raise Untranslated("terms that add, or weights")
+    if any(simulation.pbc) and not all(simulation.pbc):
+        raise Untranslated("a box that is periodic along some axes")
     own, at = model.typed, model.at_cutoff()
     made = []
     for kind in range(model.pair_types):
@@ -162,7 +164,6 @@ class Lepton(ClassicalCalculator):
                 for (a, b), formula, end in zip(types, self.formulas, self.r_cut, strict=True)
             ),
             "mass * 1.0", "compute e all pe/atom", "compute p all pressure NULL virial",
-            "variable e equal pe", *(f"variable p{k} equal c_p[{k}]" for k in range(1, 7)),
             "thermo_style custom step pe c_p[1]", "thermo_modify norm no",
             "dump d all custom 1 out.dump id c_e fx fy fz",
             "dump_modify d sort id format float %.17g", "run 0",
