@@ -69,7 +69,7 @@ class PairPotential(eqx.Module):
             r: distances, length.
             constants: of the pair; shared parameters are its own.
         """
-        made = self.typed.with_leaves(jax.tree.map(np.atleast_1d, constants))
+        made = self.typed.with_leaves(jax.tree.map(lambda one: jnp.asarray([one]), constants))
         along = np.ones(len(r))
         energy, slope = by_numpy(lambda r: jax.jvp(lambda r: made.evaluate(r * r)[0], (r,), (along,)), r)
         return np.asarray(energy), np.asarray(slope)

@@ -19,8 +19,8 @@ _NAMES = {
     "add_any": "add", "sub": "subtract", "mul": "multiply", "div": "true_divide", "neg": "negative",
     "max": "maximum", "min": "minimum", "pow": "power", "atan2": "arctan2", "asin": "arcsin",
     "acos": "arccos", "atan": "arctan", "abs": "absolute", "gt": "greater", "ge": "greater_equal",
-    "lt": "less", "le": "less_equal", "eq": "equal", "ne": "not_equal", "and": "logical_and", "or": "logical_or",
-    "not": "logical_not", "logistic": "expit", "erf_inv": "erfinv", "lgamma": "gammaln",
+    "lt": "less", "le": "less_equal", "eq": "equal", "ne": "not_equal", "and": "logical_and",
+    "or": "logical_or", "not": "logical_not", "logistic": "expit", "erf_inv": "erfinv", "lgamma": "gammaln",
 }  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def test_planted_breaks_are_found_with_their_order_size_and_distance():
 
 
 def test_a_pole_and_what_is_no_number_are_found():
-    with pytest.raises(InputError, match=r"unfit: u of Ar-Ar is nan at its cutoff 2\.5"):
+    with pytest.raises(InputError, match=r"unfit: .*Ar-Ar.*nan.*2\.5"):
         found(unfit)
     seen = found(lambda r: jnp.where(r > 2.2, 0, unfit(r)))
     assert seen is not None
@@ -102,7 +102,7 @@ def test_each_pair_of_species_is_examined_for_itself():
 
 def test_an_end_of_its_own_where_the_cutoff_is_is_refused():
     """What a pair brings there would count as nothing."""
-    with pytest.raises(InputError, match=r"ended: u of Ar-Ar is 0 at its cutoff 2\.5 and -0\.0"):
+    with pytest.raises(InputError, match=r"ended: .*Ar-Ar.* 0 .*2\.5.*-0\.0"):
 
         def ended(r):
             return jnp.where(r < RADIUS, wall(r), 0)
