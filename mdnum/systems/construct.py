@@ -434,8 +434,10 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         kinds = jax.device_put(pair_type(places[first], places[second], len(old)))
 
         def of_kinds(one: CutPotential) -> CutPotential:
+            leaves = {key: leaf[kinds] for key, leaf in one.potential.leaves.items()}
+            leaves |= {key: leaf[places] for key, leaf in dict(one.potential.by_species).items()}
             ends = one.r_cut[kinds], one.r_onset[kinds]
-            return CutPotential(one.potential.of(kinds), one.cutoff, *ends, one.weights)
+            return CutPotential(one.potential.with_leaves(leaves), one.cutoff, *ends, one.weights)
 
         model = each_term(model, of_kinds)
         if model.weights and not np.array_equal(atoms.numbers, simulation.structure.numbers):

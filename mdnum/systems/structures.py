@@ -315,9 +315,11 @@ def _nearest(
 
 def nearest_distance(atoms: Atoms, within: float) -> float:
     """The distance of the closest pair of atoms, or `within` where none is as close."""
-    return (
-        min(float(np.min(_nearest(atoms, within)[0], initial=within)), within) if len(atoms) > 1 else within
-    )
+    from scipy.spatial import KDTree
+
+    places, _ = with_images(atoms, within)
+    near, _ = KDTree(places).query(places[: len(atoms)], k=[2])
+    return float(np.min(near, initial=within))
 
 
 def with_images(

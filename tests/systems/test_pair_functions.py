@@ -18,6 +18,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.md.cell import wrap_positions
 from mdnum.md.cutoffs import CUTOFFS
+from mdnum.references import MdnumCalculator
 from mdnum.store import RunFolder
 
 SIGMA, EPSILON = {"Ar": 1.0, "Kr": 1.2, "Ne": 0.8}, {"Ar": 1.0, "Kr": 1.5, "Ne": 0.5}
@@ -116,6 +117,13 @@ def test_an_argument_species_is_the_atomic_numbers_of_both():
             total += (u[0] - u[1]) * (r < 2.0)
     assert made.evaluate().energy == pytest.approx(total, rel=1e-12)
     assert mdnum.parameters(made)["potential.species"].value.tolist() == [18, 36, 10]
+
+
+def test_a_calculator_of_some_of_the_species_has_their_values(by_species):
+    part = Atoms("KrNe", positions=[[0, 0, 0], [1.2, 0, 0]])
+    part.calc = MdnumCalculator(by_species)
+    s6 = (1.0 / 1.2) ** 6
+    assert part.get_potential_energy() == pytest.approx(4 * np.sqrt(1.5 * 0.5) * (s6 * s6 - s6), rel=1e-12)
 
 
 def one_sided(r, sigma):
