@@ -41,7 +41,8 @@ def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.nd
 def _rule(equation: Any, inputs: Sequence[np.ndarray]) -> list[Any]:
     import scipy.special
 
-    name, params = equation.primitive.name, equation.params
+    name: str = equation.primitive.name
+    params = equation.params
     inner = params.get("call_jaxpr")
     if name.startswith("custom_") and inner is not None:
         return interpreted(inner, inputs, _rule, np.asarray)

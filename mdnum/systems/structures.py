@@ -318,8 +318,8 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
     from scipy.spatial import KDTree
 
     places, _ = with_images(atoms, within)
-    near, _ = KDTree(places).query(places[: len(atoms)], k=[2])
-    return float(np.min(near, initial=within))
+    near, _ = KDTree(places).query(places[: len(atoms)], k=2)
+    return float(np.min(np.asarray(near)[:, 1], initial=within))
 
 
 def with_images(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +107,8 @@ def test_lammps_sees_a_wrong_derivative_that_the_function_itself_does_not():
     frames = {"start": made.structure}
     alone, both = (check_energy(made, frames, lammps=lammps) for lammps in (False, True))
     assert alone.ok and not both.ok and both.third == "LAMMPS"
-    assert both.frames[0].energy_third < 1e-12 and both.frames[0].force_third > 1e-4
+    frame: Any = both.frames[0]
+    assert frame.energy_third < 1e-12 and frame.force_third > 1e-4
     assert [one.code for one in energy_findings(both)] == ["ASE_DISAGREES", "NOT_ASE"]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -212,7 +213,7 @@ def test_runs_forks_maps_and_gradients_are_those_of_the_potential_that_is_here(k
     ]
     runs, forks, maps, gradients = [], [], [], []
     for k, one in enumerate(made):
-        keep = {"report": False}
+        keep: Any = {"report": False}
         runs.append(mdnum.run(one, steps=40, out=tmp_path / f"run-{k}", **keep))
         forks.append(mdnum.fork(one, "precision", steps=20, out=tmp_path / f"fork-{k}", **keep))
         found = mdnum.fork_map(
