@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from mdnum.gradients import Problem as Problem
     from mdnum.gradients import method as method
     from mdnum.gradients import value_and_grad as value_and_grad
+    from mdnum.md.energies import energy_function as energy_function
     from mdnum.md.integrators import Integrator as Integrator
     from mdnum.md.integrators import KickDrift as KickDrift
     from mdnum.md.integrators import Langevin as Langevin

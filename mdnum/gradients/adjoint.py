@@ -242,20 +242,22 @@ def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
 
 def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted) -> ForceCotangents:
     values = quantities(force)
-    neighbor = force.neighbors(lax.stop_gradient(x), tables, bits)
-    matrix = jnp.asarray(force.cell.matrix)
-    w, virial = onto_force.T.astype(jnp.float64), onto_virial.astype(jnp.float64)
+    neighbor, dtype = force.neighbors(lax.stop_gradient(x), tables, bits), force.dtype
+    matrix = jnp.asarray(force.cell.matrix).astype(dtype)
+    w, virial = onto_force.T.astype(dtype), onto_virial.astype(dtype)
 
     def energy(x, values, scale):
         other: Any = with_quantities(force, values)
-        return other.potential.energy(x * scale, neighbor, matrix * scale)
+        return force.energy_of(tables, neighbor, other.potential)(x, matrix, scale * jnp.eye(3, dtype=dtype))
 
-    at = (x.T.astype(jnp.float64), values, jnp.ones((), jnp.float64))
+    at = (x.T.astype(dtype), values, jnp.ones((), dtype))
     still = jax.tree.map(jnp.zeros_like, values)
     if MODEL in wanted:
         slope = jax.grad(energy, argnums=(0, 1, 2))
         (by_x, by_model, by_scale), (bend_x, bend_model, bend_scale) = jax.jvp(slope, at, (w, still, virial))
-        model = jax.tree.map(lambda bend, one: onto_energy * one - bend, bend_model, by_model)
+        model = jax.tree.map(
+            lambda bend, one: (onto_energy * one - bend).astype(one.dtype), bend_model, by_model
+        )
     else:
         slope = jax.grad(lambda x, scale: energy(x, values, scale), argnums=(0, 1))
         (by_x, by_scale), (bend_x, bend_scale) = jax.jvp(slope, (at[0], at[2]), (w, virial))

@@ -121,6 +121,7 @@ def upstream() -> ModuleType:
     """The package jax_md, imported when first asked for; takes seconds."""
     with standard_promotion():
         import jax_md
+        import jax_md.custom_partition
         import jax_md.energy
         import jax_md.minimize
         import jax_md.partition
@@ -147,6 +148,8 @@ def as_neighbor_list(
     idx_dense: Int[Array, "atoms slots"] | np.ndarray,
     reference_position: Float[Array, "atoms 3"] | np.ndarray,
     format: Format = "dense",
+    self_edges: bool = False,
+    code: Any = 0,
 ) -> NeighborList:
     """jax-md's NeighborList around a list that somebody else built, so that any jax-md energy runs on it.
 
@@ -157,6 +160,8 @@ def as_neighbor_list(
             name the atom itself become padding: jax-md's EAM would count them as density at r = 0.
         reference_position: positions at which the list was built, length.
         format: dense (atoms, slots); sparse (2, atoms slots), both ways; ordered-sparse, each pair once.
+        self_edges: list each atom as its own neighbor, as jax-md does where its `mask_self` is false.
+        code: of the list's error, as if it had overflowed.
     """
     partition = upstream().partition
     formats = {
@@ -169,6 +174,8 @@ def as_neighbor_list(
     atoms = idx_dense.shape[0]
     own = jnp.arange(atoms, dtype=jnp.int32)[:, None]
     idx = jnp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(jnp.int32)
+    if self_edges:
+        idx = jnp.concatenate([idx, own], axis=1)
     if format != "dense":
         receiver = idx.reshape(-1)
         sender = jnp.broadcast_to(own, idx.shape).reshape(-1)
@@ -179,7 +186,7 @@ def as_neighbor_list(
     return partition.NeighborList(
         idx=idx,
         reference_position=jnp.asarray(reference_position),
-        error=partition.PartitionError(jnp.zeros((), jnp.uint8)),
+        error=partition.PartitionError(jnp.asarray(code, jnp.uint8)),
         cell_list_capacity=None,
         max_occupancy=idx.shape[-1],
         format=formats[format],
@@ -187,6 +194,22 @@ def as_neighbor_list(
         cell_list_fn=_refuse_update,  # type: ignore[arg-type]
         update_fn=_refuse_update,  # type: ignore[arg-type]
     )
+
+
+def multi_image(neighbor: NeighborList, shifts: Float[Array, "... 3"], box: Float[Array, "3 3"]) -> Any:
+    """The list with an integer shift for each entry, as jax_md.custom_partition makes them.
+
+    Args:
+        shifts: lattice vectors to add to the second atom. box: lattice vectors as columns, length.
+    """
+    from jax_md.custom_partition import NeighborListMultiImage
+
+    idx = neighbor.idx if neighbor.format is upstream().partition.Dense else tuple(neighbor.idx)
+    return NeighborListMultiImage(
+        idx=idx, shifts=shifts, reference_position=neighbor.reference_position, reference_box=box, box=box,
+        search_shifts=jnp.zeros((1, 3)), format=neighbor.format, max_occupancy=neighbor.max_occupancy,
+        update_fn=_refuse_update, did_buffer_overflow=neighbor.did_buffer_overflow,
+    )  # fmt: skip
 
 
 class PairSearch:

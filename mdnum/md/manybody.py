@@ -45,6 +45,12 @@ class ManyBody(eqx.Module):
         smoothness: at r_cut.
         sources: papers of the form and its constants.
         r_cut: longest interaction radius, length; a field, or computed from the constants.
+        trusts_list: whether the energy takes a listed pair wherever it is near r_cut, so that a decision that
+            is imposed has its effect.
+        labeled: whether atoms are told apart by their place in the structure (species or charges that the
+            function holds), so that it is called in the order of the structure.
+        self_edges: whether each atom is listed as its own neighbor.
+        compare: what inside means.
     """
 
     pbc: tuple[bool, bool, bool] = eqx.field(static=True, kw_only=True, default=(True, True, True))
@@ -52,6 +58,10 @@ class ManyBody(eqx.Module):
     format: Format = eqx.field(static=True, kw_only=True, default="dense")
     smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=_UNKNOWN)
     sources: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
+    trusts_list: bool = eqx.field(static=True, kw_only=True, default=False)
+    labeled: bool = eqx.field(static=True, kw_only=True, default=False)
+    self_edges: bool = eqx.field(static=True, kw_only=True, default=False)
+    compare: str = eqx.field(static=True, kw_only=True, default="r <")
 
     def energy(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
@@ -64,6 +74,16 @@ class ManyBody(eqx.Module):
             cell: lattice vectors as rows, length.
         """
         raise NotImplementedError(f"{type(self).__name__} defines no energy")
+
+    def deformed(
+        self,
+        positions: Float[Array, "atoms 3"],
+        neighbor: NeighborList,
+        cell: Float[Array, "3 3"],
+        deformation: Float[Array, "3 3"],
+    ) -> Float[Array, ""]:
+        """The energy of positions and lattice vectors that are multiplied, as rows, by a deformation near 1."""
+        return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
@@ -84,8 +104,8 @@ class ManyBody(eqx.Module):
 
         def strained(points: Array, strain: Array) -> Array:
             # the symmetric part alone: the energy does not see rotations, its rounding does
-            map_ = identity + 0.5 * (strain + strain.T)
-            return self.energy(points @ map_, neighbor, cell.astype(points.dtype) @ map_)
+            deformation = identity + 0.5 * (strain + strain.T)
+            return self.deformed(points, neighbor, cell.astype(points.dtype), deformation)
 
         zero = jnp.zeros((3, 3), positions.dtype)
         energy, (slope, virial) = jax.value_and_grad(strained, argnums=(0, 1))(positions, zero)
@@ -120,76 +140,3 @@ def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
         static = field.name in values and field.name not in names
         object.__setattr__(out, field.name, values[field.name] if static else getattr(whole, field.name))
     return out
-
-
-# --- any energy function over a neighbor list, jax-md's too -------------------------------------------
-
-
-class EnergyFunction(ManyBody):
-    """An energy with parameters in any pytree, over a neighbor list of jax-md.
-
-    Attributes:
-        parameters: a pytree of arrays; each is a parameter `potential.parameters...` by its path.
-        function: (parameters, positions (atoms, 3), neighbor, cell (3, 3)) to energy, length and energy units
-            of the system. It must test r < r_cut itself.
-    """
-
-    parameters: Any
-    function: Callable[..., Array] = eqx.field(static=True)
-    r_cut: float = eqx.field(static=True)
-    name: str = eqx.field(static=True, kw_only=True, default="energy function")
-
-    def energy(self, positions, neighbor, cell):
-        return self.function(self.parameters, positions, neighbor, cell)
-
-    def check_cell(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> None:
-        """Raise if the function does not follow the cell it is given.
-
-        jax_md.space's own displacements swallow the keyword and keep the box they were made with: energies
-        look right and stresses are silently wrong. Shifting one atom by a lattice vector of a slightly
-        larger cell must not change the energy in that cell.
-
-        Raises:
-            InputError: it does not.
-        """
-        larger = cell * 1.03125
-        axis = next((axis for axis in range(3) if self.pbc[axis]), None)
-        if axis is None:
-            return
-        points = np.asarray(positions)
-        moved = points.copy()
-        moved[0] += np.asarray(larger)[axis]
-        energy = eqx.filter_jit(self.energy)
-        here, there = (float(energy(jnp.asarray(one), neighbor, larger)) for one in (points, moved))
-        if not abs(here - there) <= 1e-6 * max(abs(here), 1.0):
-            raise InputError(
-                f"{self.name}: the energy function ignores the cell it is given (a move by a lattice vector "
-                f"changes the energy from {here:g} to {there:g})",
-                remedy="build it on mdnum.md.jaxmd.displacement instead of a space of jax_md.space",
-            )
-
-
-def from_jax_md(
-    energy_fn: Callable[..., Array], r_cut: float, format: Format = "dense", **declared: Any
-) -> EnergyFunction:
-    """Wrap a jax-md energy function `energy_fn(positions, neighbor, cell=...)`.
-
-    Build it on `mdnum.md.jaxmd.displacement(cell, pbc)` (a space of jax_md.space ignores the cell it is
-    given: energies look right, stresses are silently wrong; `check_cell` tells) and hand its constants in as
-    `mdnum.md.jaxmd.scalar(...)`: anything else becomes float32 in silence. The function must test r < r_cut
-    itself, or its energy depends on when the list was built.
-
-    Args:
-        energy_fn: the second of the pair that jax-md's `*_neighbor_list` functions return.
-        r_cut: longest interaction radius, length.
-        format: neighbor list format that it takes.
-        declared: other attributes of ManyBody; of a smoothness not given nothing is promised.
-    """
-    if not (np.isfinite(r_cut) and r_cut > 0):
-        raise InputError(f"an interaction radius above 0 is needed; got {r_cut}")
-    declared = {"name": "jax-md"} | declared
-    named = jax.named_call(energy_fn, name=declared["name"])
-    function = lambda _, positions, neighbor, cell: named(positions, neighbor, cell=cell)  # noqa: E731
-    return EnergyFunction((), function, float(r_cut), format=format, **declared)

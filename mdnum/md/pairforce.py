@@ -394,8 +394,9 @@ def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
 class ManyBodyForce(eqx.Module):
     """Forces of an energy function over a jax-md neighbor list, by automatic differentiation."""
 
-    potential: eqx.Module  # energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`
-    # cell, zero, thresholds, decider, policy: as in PairForce. The energy itself is always float64
+    potential: Any  # energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`
+    # cell, zero, thresholds, decider, policy: as in PairForce. The energy is evaluated in the force's dtype, but
+    # for numbers that its function holds
     cell: Cell
     zero: Int[Array, ""]
     thresholds: Float[Array, "types"]
@@ -404,29 +405,42 @@ class ManyBodyForce(eqx.Module):
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
-        """The box as jax arrays."""
-        zero = zero_bits(policy.dtype("decision"))
+        """The box as jax arrays, and the parameters in the force's dtype."""
+        zero, dtype = zero_bits(policy.dtype("decision")), policy.dtype("force")
+        if dtype != np.float64:
+            potential = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, potential)
         return cls(potential, cell.astype(np.float64), zero, decider.values(), decider.convention, policy)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions."""
         return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions).decide(tables)
 
-    def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
+    def __call__(
+        self,
+        positions: Float[Array, "3 atoms"],
+        tables: Tables,
+        *,
+        decisions: bool,
+        given: UInt8[Array, "words atoms"] | None = None,
+        where: UInt8[Array, "words atoms"] | None = None,
+    ) -> Forces:
         """Forces at wrapped positions; as PairForce, the whole energy counted on the first atom."""
         made = self.decide(positions, tables)
-        total, slope, strain = self._differentiate(positions, tables, made)
+        bits = made.bits if given is None else given
+        if given is not None and where is not None:
+            bits = made.bits ^ ((made.bits ^ given) & where)
+        total, slope, strain = self._differentiate(positions, tables, bits)
         return Forces(
-            -slope.T,
+            -slope.T.astype(self.policy.dtype("accumulate")),
             jnp.zeros(positions.shape[1], jnp.float64).at[0].set(total),
-            -jnp.trace(strain),
+            -jnp.trace(strain).astype(jnp.float64),
             made if decisions else None,
         )
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
         """Minus the derivative of the energy by strain."""
-        _, _, strain = self._differentiate(positions, tables, self.decide(positions, tables))
-        return -0.5 * (strain + strain.T)
+        _, _, strain = self._differentiate(positions, tables, self.decide(positions, tables).bits)
+        return -0.5 * (strain + strain.T).astype(jnp.float64)
 
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
@@ -438,20 +452,40 @@ class ManyBodyForce(eqx.Module):
         shifts = jnp.arange(slots, dtype=jnp.uint8)[None, :, None]
         inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
         acted_on = jnp.where(inside, tables.index, atoms).reshape(words * slots, atoms).T
-        x = positions.T.astype(jnp.float64)
-        return jaxmd.as_neighbor_list(acted_on, x, self.potential.format)  # type: ignore[attr-defined]
+        x, own = positions.T.astype(self.dtype), self.potential
+        if own.labeled:
+            names = jnp.append(tables.order, atoms).astype(jnp.int32)
+            x, acted_on = self.placed(x, tables), jnp.zeros_like(names[acted_on]).at[tables.order].set(names[acted_on])
+        return jaxmd.as_neighbor_list(acted_on, x, own.format, own.self_edges)
 
-    def _differentiate(self, positions, tables: Tables, made: Decisions):
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the positions that the energy function receives."""
+        return self.policy.dtype("force")
+
+    def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
+        """Sorted positions in the order in which the energy function knows its atoms."""
+        # the table is in sorted order and so is everything that an energy sees which takes all atoms for alike
+        return jnp.zeros_like(x).at[tables.order].set(x) if self.potential.labeled else x
+
+    def energy_of(
+        self, tables: Tables, neighbor: Any, potential: Any = None
+    ) -> Callable[[Any, Any, Any], Float[Array, ""]]:
+        """The energy by sorted positions (atoms, 3), lattice vectors as rows, and a deformation of both."""
+        own = self.potential if potential is None else potential
+        return lambda x, matrix, by: own.deformed(self.placed(x, tables), neighbor, matrix, by)
+
+    def _differentiate(self, positions, tables: Tables, bits):
         """Energy, and its derivatives by positions and by strain."""
-        neighbor = self.neighbors(lax.stop_gradient(positions), tables, made.bits)
+        neighbor = self.neighbors(lax.stop_gradient(positions), tables, bits)
+        energy_of, matrix = self.energy_of(tables, neighbor), self.cell.matrix.astype(self.dtype)
+        unit = jnp.eye(3, dtype=self.dtype)
 
-        # the table is in sorted order and so is everything the energy function sees
         def energy(x, strain):
-            deform = jnp.eye(3, dtype=jnp.float64) + strain
-            return self.potential.energy(x @ deform, neighbor, self.cell.matrix @ deform)  # type: ignore[attr-defined]
+            return energy_of(x, matrix, unit + strain).astype(jnp.float64)
 
-        x = positions.T.astype(jnp.float64)
-        total, (slope, strain) = jax.value_and_grad(energy, argnums=(0, 1))(x, jnp.zeros((3, 3), jnp.float64))
+        x = positions.T.astype(self.dtype)
+        total, (slope, strain) = jax.value_and_grad(energy, argnums=(0, 1))(x, jnp.zeros_like(unit))
         return total, slope, strain
 
 

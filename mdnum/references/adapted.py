@@ -15,7 +15,7 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from numpy import ndarray
 
 from mdnum.md.jaxmd import as_neighbor_list
-from mdnum.md.manybody import EnergyFunction
+from mdnum.md.energies import EnergyFunction
 from mdnum.references.independent import ClassicalCalculator, PairForm, edges_of
 
 
@@ -156,11 +156,11 @@ class EnergyOnNeighborList(ClassicalCalculator):
         counts = np.bincount(i, minlength=n)
         index = np.full((n, max(1, int(counts.max(initial=0)))), n, np.int32)
         index[i, np.arange(len(i)) - (np.cumsum(counts) - counts)[i]] = j
-        neighbor = as_neighbor_list(index, x, self.potential.format)
+        own, cell = self.potential, jnp.asarray(atoms.cell.array)
+        neighbor = as_neighbor_list(index, x, own.format, own.self_edges)
 
         def energy(x, strain):
-            deform = jnp.eye(3) + strain
-            return self.potential.energy(x @ deform, neighbor, jnp.asarray(atoms.cell.array) @ deform)
+            return own.deformed(x, neighbor, cell, jnp.eye(3) + strain)
 
         with jax.disable_jit():
             total, (slope, strain) = jax.value_and_grad(energy, argnums=(0, 1))(x, jnp.zeros((3, 3)))

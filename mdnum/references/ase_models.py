@@ -32,7 +32,7 @@ from ase.calculators.tersoff import Tersoff, TersoffParameters
 
 from mdnum.md import tetrahedral
 from mdnum.md.embedded_atom import EmbeddedAtom
-from mdnum.md.manybody import EnergyFunction
+from mdnum.md.energies import EnergyFunction
 from mdnum.md.potentials import LennardJones, Morse, PairFunction
 from mdnum.references.adapted import (
     EnergyOnNeighborList,

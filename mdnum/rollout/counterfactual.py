@@ -50,7 +50,7 @@ class Counterfactual:
         frame: ReferenceFrame | None = None,
         guard: float | None = None,
     ):
-        if not simulation.pairwise or not leader.pairwise:
+        if not simulation.imposable or not leader.imposable:
             raise InputError(
                 "decisions cannot be imposed on a many-body potential",
                 remedy="Compare the two runs without a counterfactual",

@@ -75,7 +75,7 @@ class MdProgram:
     @property
     def imposable(self) -> str | None:
         """Only pair potentials act on decisions that they are given."""
-        if self.simulation.pairwise:
+        if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
 

@@ -17,6 +17,7 @@ from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
 from mdnum.md.fixed_point import FixedPointDecider, FixedPointUnits
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.energies import EnergyFunction
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
 from mdnum.md.potentials import Channels, CutPotential, PairFunction, PairPotential, each_term, pair_type
@@ -174,11 +175,16 @@ def simulation(
         numbers = {"timestep": timestep, "friction": friction, "temperature": temperature, "seed": seed}
         integrator = kind.of_file({**numbers, **(dynamics or {})}, system)
     drawn = not atoms.has("momenta") if drawn is None else drawn
-    return assembled(
-        Origin(name, about), atoms, system, model, "r <" if cutoff is None else cutoff.compare,
+    made = assembled(
+        Origin(name, about), atoms, system, model, model.compare if cutoff is None else cutoff.compare,
         RebuildRule(skin, *rebuild), builder, precision, REDUCTIONS.parse(reduction), integrator,
         Draw(float(temperature), seed, remove_drift, drawn), steps, save_every,
     )  # fmt: skip
+    if isinstance(model, EnergyFunction) and model.notes is None:
+        from mdnum.systems.admission import admitted
+
+        return admitted(made)
+    return made
 
 
 def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import numpy as np
 
+from mdnum.md.energies import EnergyFunction
 from mdnum.md.manybody import leaves_by_path
 from mdnum.md.potentials import CutPotential
 from mdnum.numerics.reductions import BY_NAME
@@ -129,9 +130,17 @@ def _interactions(simulation: Simulation) -> dict[str, Any]:
     """The tables of the potential and its cutoff, or one of several terms."""
     model = simulation.model
     if not simulation.pairwise:
-        return {
-            "potential": {"kind": model.name, **_leaves(model), **_code(getattr(model, "function", None))}
-        }
+        known = {"kind": model.name, **_leaves(model)}
+        if isinstance(model, EnergyFunction):
+            how = model.call.how
+            known |= {
+                "convention": how.label, "list": model.format, "units": ", ".join(model.unit) or "the simulation's",
+                "coordinates": "fractional" if how.fractional else "real", "box": how.box or "its own",
+                "imposable": model.trusts_list, "order": "of the structure" if model.labeled else "any",
+                **({"notes": {code: json.loads(values) for code, values in model.notes}} if model.notes else {}),
+                **_code(model.call.function),
+            }  # fmt: skip
+        return {"potential": known}
     tables = {name: _pair_tables(simulation, term) for name, term in model.terms.items()}
     return tables.get("", {"terms": tables})
 

@@ -105,9 +105,9 @@ class Simulation:
 
     def __post_init__(self):
         short = self.policy.state == FIXED_POINT or self.policy.force not in WIDE
-        if not self.pairwise and self.policy != PrecisionPolicy():
-            message = "many-body potentials are evaluated in float64 only"
-            raise InputError(message, where="precision", remedy="Remove the [precision] table")
+        if not self.pairwise and short:
+            message = "many-body potentials are evaluated in float64 and float32 only"
+            raise InputError(message, where="precision", remedy="Leave out state and force, or give these")
         if short and self.pairwise and "" not in self.model.terms:
             seen = f"not with {self.policy.state} state and {self.policy.force} forces"
             remedy = "Leave out state and force, or write the sum as one potential"
@@ -143,6 +143,11 @@ class Simulation:
     def pairwise(self) -> bool:
         """Whether the fast pair path serves it (else the general path does)."""
         return isinstance(self.model, CutPotential | Channels)
+
+    @property
+    def imposable(self) -> bool:
+        """Whether decisions can be imposed: an energy that decides by itself does not act on them."""
+        return self.pairwise or self.model.trusts_list
 
     @property
     def pbc(self) -> tuple[bool, bool, bool]:
@@ -324,12 +329,12 @@ class Simulation:
         """The same system with other pair terms or a many-body potential, and decisions at their radii.
 
         Raises:
-            InputError: the longest radius and the skin do not fit the box, or a many-body potential is not in
-                float64 throughout.
+            InputError: the longest radius and the skin do not fit the box, or a many-body potential is neither
+                in float64 nor in float32.
         """
         radii = tuple(np.atleast_1d(np.asarray(model.r_cut, np.float64)).tolist())
         check_radius(self.cell, max(radii), self.rule.skin)
-        compare = self.decider.compare if isinstance(model, CutPotential | Channels) else "r <"
+        compare = self.decider.compare if isinstance(model, CutPotential | Channels) else model.compare
         return replace(self, model=model, decider=replace(self.decider, r_cut=radii, compare=compare))
 
     @property
@@ -375,6 +380,9 @@ class Simulation:
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
         check_radius(cell, self.r_cut, 0.0)
+        if not self.pairwise and getattr(self.model, "fixed_box", False):
+            message = f"{self.model.name} keeps the box that it was made with"
+            raise InputError(message, where=self.name, remedy="Let it take box= (jax_md.space.periodic_general)")
         cell = cell if self.fixed_point is None else self.fixed_point.cell(cell)
         return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
 

@@ -260,8 +260,13 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
     raise InputError(
         f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
         f"perpendicular width of the box (along {axis}) is {half:.6g} {length}, where a pair gets two images",
-        remedy=f"This box allows {allowed}; or repeat the structure",
+        remedy=f"This box allows {allowed}; or repeat the structure {repeats(cell, r_cut + skin)}",
     )
+
+
+def repeats(cell: Cell, r_list: float) -> str:
+    """How often a box must be repeated along a, b and c for one image to be enough."""
+    return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:

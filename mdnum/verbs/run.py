@@ -244,7 +244,8 @@ def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
-        *_decisions(run), *_drift(run), *_cutoff(run), *_function(run), *_start(run), *_loop(run),
+        *_decisions(run), *_drift(run), *_cutoff(run), *_function(run), *_potential(run), *_start(run),
+        *_loop(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
     severities = {finding.severity for finding in found}
@@ -436,6 +437,13 @@ def _function(run: RunView) -> Iterator[Finding]:
                 places=len(found),
                 others=", ".join(f"{row['pair']} {number(row['distance'], 6)} {length}" for row in rest),
             )  # fmt: skip
+
+
+def _potential(run: RunView) -> Iterator[Finding]:
+    """What the trial calls of an energy function found."""
+    units = {"energy_unit": run.units.energy, "length_unit": run.units.length}
+    for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
+        yield TEXTS.finding(code, **values, **units)
 
 
 def _evidence(run: RunView) -> Iterator[str]:

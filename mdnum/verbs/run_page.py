@@ -213,6 +213,7 @@ def _what(run: RunView) -> list[tuple[str, str]]:
 
     def said(table: Mapping[str, Any] | None) -> str | None:
         if table and (code := table.get("code")):
+            table = {key: value for key, value in table.items() if key != "notes"}
             table = {**table, "code": f"sha256 {code['sha256'][:12]}, its text in simulation.json"}
         return in_words(table, lengths) if table else None
 

@@ -98,7 +98,8 @@ class PrecisionChoice(Choice):
         missing = [role for role in roles if role not in ROLES[world]]
         applies(not missing, f"it has no role {'.'.join(missing)}; there are {', '.join(ROLES[world])}")
         if world == "md":
-            applies(system.pairwise, "many-body potentials are evaluated in float64 only")
+            wide = system.pairwise or self.dtype in WIDE
+            applies(wide, "many-body potentials are evaluated in float64 and float32 only")
         before = {getattr(own, role) for role in roles}
         verb = "is" if len(roles) == 1 else "are"
         applies(before != {self.dtype}, f"{', '.join(roles)} {verb} {self.dtype} already")

@@ -1,0 +1,296 @@
+"""Energies over a neighbor list as people write them: which conventions there are, and one way to call all.
+
+Those of jax-md's world differ in where the list and the parameters stand, how the box is given, whether
+positions are fractional, whether list entries name an image, and what is returned. A signature says the
+first part, a trial call (`mdnum.systems.admission`) the rest.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from mdnum.errors import InputError
+from mdnum.md import jaxmd
+from mdnum.md.manybody import ManyBody
+
+_LISTS = ("neighbor", "neighbors", "nbrs", "nlist", "neighbor_list", "nbr_list")
+_GRAPHS = ("graph", "graphs", "graphs_tuple", "batch")
+#: Keywords by which a function can learn the box and its strain.
+KEYWORDS = ("cell", "box", "perturbation")
+#: Units of length in Å and of energy in eV that a function may be written in.
+LENGTHS: Mapping[str, float] = {"Å": 1.0, "angstrom": 1.0, "nm": 10.0, "bohr": 0.529177210903}
+ENERGIES: Mapping[str, float] = {
+    "eV": 1.0, "meV": 1e-3, "kcal/mol": 1 / 23.060547830619026, "kJ/mol": 1 / 96.48533212331002,
+    "hartree": 27.211386245988,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How a function is called; the fields behind `keywords` are what a trial finds out."""
+
+    native: bool = False  # (parameters, positions, neighbor, cell)
+    parameters: bool = False  # they come first
+    keyword: str = ""  # by which the list is given; empty where it follows the positions
+    keywords: tuple[str, ...] = ()  # those of KEYWORDS that it takes
+    images: bool = False  # the list has an integer shift for each entry
+    box: str = ""  # how it follows the box: "cell" (rows), "columns" or "rows" of box=; empty where it keeps its own
+    strain: bool = False  # whether perturbation= strains what it sees
+    fractional: bool = False  # positions are fractional coordinates
+    # whether derivatives by fractional coordinates are those by real ones, as jax-md's spaces define them
+    real_slope: bool = False
+    returns: str = "number"  # "number", the key of a dictionary, or "atoms" for an array of one for each
+
+    @property
+    def label(self) -> str:
+        """Its name, for people."""
+        base = (
+            "mdnum's own" if self.native
+            else "multi-image list" if self.images
+            else "parameters first" if self.parameters
+            else "keyword only" if self.keyword
+            else "classical"
+        )  # fmt: skip
+        return base if self.returns in ("number", "atoms") else f"{base}, dictionary with {self.returns}"
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function in its own convention, called like mdnum's own: (parameters, positions, neighbor, cell)."""
+
+    function: Callable[..., Any]
+    how: Convention
+    length: float = 1.0  # its unit of length, in the simulation's
+    unit: float = 1.0  # its unit of energy, in the simulation's
+    name: str = "energy function"
+
+    def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Array:
+        """Its energy in its own units, of positions as it wants them.
+
+        Args:
+            given: the keywords of the convention, and for its own one "cell".
+        """
+        how = self.how
+        args = (parameters, x) if how.parameters or how.native else (x,)
+        if how.native:
+            args += (neighbor, given["cell"])
+        elif not how.keyword:
+            args += (neighbor,)
+        keywords = {} if how.native else {name: given[name] for name in how.keywords}
+        if how.keyword:
+            keywords[how.keyword] = neighbor
+        # jax-md and what is written like it mixes widths
+        with jaxmd.standard_promotion():
+            out = jax.named_call(self.function, name=self.name.replace(" ", "_"))(*args, **keywords)
+        if how.returns == "atoms":
+            return jnp.sum(out)
+        return jnp.reshape(out if how.returns == "number" else out[how.returns], ())
+
+    def __call__(self, parameters: Any, x: Array, neighbor: Any, cell: Array, strain: Any = None) -> Array:
+        """The energy.
+
+        Args:
+            cell: lattice vectors as rows. strain: a further deformation of everything, near 1.
+        """
+        how = self.how
+        if not how.strain:
+            if strain is not None:
+                x, cell = x @ strain, cell @ strain
+        else:
+            # the function's derivative by its box may not be one at fixed positions; by the perturbation it is
+            held = lax.stop_gradient(cell)
+            missing = jnp.all(held == 0, axis=1)[:, None]
+            whole = jnp.where(missing, jnp.eye(3, dtype=held.dtype), held)
+            along = jnp.eye(3, dtype=held.dtype) + jnp.linalg.solve(whole, cell - held)
+            x, cell = x @ jnp.linalg.inv(along), held
+            strain = along if strain is None else along @ strain
+        x, cell = x / self.length, cell / self.length
+        given = {"cell": cell, "box": cell if how.box == "rows" else cell.T}
+        if how.images:
+            neighbor = with_images(neighbor, x, cell, given["box"])
+        if how.strain:
+            given["perturbation"] = strain.T
+        if how.fractional:
+            x = (_real_slope if how.real_slope else jnp.matmul)(x, jnp.linalg.inv(cell))
+        return self.bare(parameters, x, neighbor, given) * self.unit
+
+
+@jax.custom_jvp
+def _real_slope(x: Array, inverse: Array) -> Array:
+    """Fractional coordinates whose tangents are those of real ones, as jax-md's transforms expect them."""
+    return x @ inverse
+
+
+@_real_slope.defjvp
+def _real_slope_jvp(primals, tangents):
+    return _real_slope(*primals), tangents[0]
+
+
+def with_images(
+    neighbor: Any, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
+) -> Any:
+    """A list whose entries have the integer shifts of their nearest images, as `custom_partition` makes it."""
+    n, dense = x.shape[0], neighbor.format.name == "Dense"
+    here, other = (jnp.arange(n)[:, None], neighbor.idx) if dense else neighbor.idx
+    d = x[jnp.where(other < n, other, 0)] - x[jnp.where(here < n, here, 0)]
+    shifts = -jnp.round(lax.stop_gradient(d @ jnp.linalg.inv(cell)))
+    return jaxmd.multi_image(neighbor, shifts, box)
+
+
+class EnergyFunction(ManyBody):
+    """An energy with parameters in any pytree, over a neighbor list of jax-md.
+
+    Attributes:
+        parameters: a pytree of arrays; each is a parameter `potential.parameters...` by its path.
+        function: (parameters, positions (atoms, 3), neighbor, cell (3, 3)) to energy, length and energy units
+            of the system; or a `Call` of one in another convention, as `energy_function` makes it.
+        species: chemical symbols that it knows; empty where it does not say.
+        start: what makes its parameters, (key, positions, neighbor) to a pytree; None where they are given.
+        lists: its own (allocate, update), with which the trial call compares; None where there is none.
+        unit: of length and of energy that it was declared in; empty for the simulation's.
+        notes: what the trial call found, (code, values as JSON); None before there was one.
+    """
+
+    parameters: Any
+    function: Callable[..., Array] = eqx.field(static=True)
+    r_cut: float = eqx.field(static=True)
+    name: str = eqx.field(static=True, kw_only=True, default="energy function")
+    species: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
+    start: Callable[..., Any] | None = eqx.field(static=True, kw_only=True, default=None)
+    lists: Any = eqx.field(static=True, kw_only=True, default=None)
+    unit: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
+    notes: tuple[tuple[str, str], ...] | None = eqx.field(static=True, kw_only=True, default=None)
+
+    @property
+    def call(self) -> Call:
+        """The function with its convention."""
+        if isinstance(self.function, Call):
+            return self.function
+        return Call(self.function, Convention(native=True, box="cell"), name=self.name)
+
+    @property
+    def fixed_box(self) -> bool:
+        """Whether it keeps the box that it was made with."""
+        return any(self.pbc) and not self.call.how.box
+
+    def energy(self, positions, neighbor, cell):
+        return self.call(self.parameters, positions, neighbor, cell)
+
+    def deformed(self, positions, neighbor, cell, deformation):
+        return self.call(self.parameters, positions, neighbor, cell, deformation)
+
+
+def energy_function(
+    given: Any,
+    r_cut: float,
+    *,
+    parameters: Any = None,
+    format: str | None = None,
+    units: tuple[str, str] | str = (),
+    species: tuple[str, ...] = (),
+    name: str = "",
+    compare: str = "r <",
+) -> EnergyFunction:
+    """A potential of an energy over a neighbor list, in any of the conventions of jax-md's world.
+
+    Known are `energy_fn(R, neighbor, **kw)`; `energy_fn(params, R, neighbor, **kw)`; `energy_fn(R, *, box=,
+    neighbor=, perturbation=)`; each alone or with its neighbor functions, as jax-md's `*_neighbor_list`
+    return them; with multi-image lists; returning a number, one for each atom, or a dictionary with "total"
+    or "energy"; and mdnum's own, `f(parameters, positions, neighbor, cell)`. What the signature does not say
+    (box in rows or columns, real or fractional positions) is found by trial calls when a simulation is made.
+
+    Example:
+        >>> shape = jax_md.energy.lennard_jones_neighbor_list(displacement, box, r_cutoff=mdnum.md.jaxmd.scalar(2.5))
+        >>> mdnum.simulation(atoms, mdnum.energy_function(shape, 2.5), units="lj", timestep=0.002)
+
+    Args:
+        given: the energy function, or a tuple of it and its neighbor functions (and, between them, a function
+            that makes parameters).
+        r_cut: longest interaction radius, in the function's unit of length.
+        parameters: a pytree of arrays, for a function that takes them; default what comes with `given`.
+        format: "dense", "sparse" or "ordered-sparse"; default that of its own list, or what it takes.
+        units: of length and energy that the function is written in, such as ("Å", "kcal/mol"); default those
+            of the simulation.
+        species: chemical symbols that it knows, if not all.
+        name: for people.
+        compare: what inside means to the decisions, "r <", "r <=", "r2 <" or "r2 <=".
+
+    Raises:
+        InputError: a convention that is not known, or that takes a graph; units that are not known.
+    """
+    if not (np.isfinite(r_cut) and r_cut > 0):
+        raise InputError(f"an interaction radius above 0 is needed; got {r_cut}")
+    parts = list(given) if isinstance(given, tuple | list) else [given]
+    lists = next((part for part in parts if hasattr(part, "allocate")), None)
+    # (neighbor_fn, init_fn, energy_fn), or (energy_fn, neighbor_fn, displacement_fn)
+    first = lists is None or parts[0] is not lists
+    others = [part for part in parts if part is not lists]
+    if not others or not callable(function := others[0 if first else -1]):
+        seen = ", ".join(type(part).__name__ for part in parts)
+        raise InputError(f"no energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)")
+    start = others[0] if not first and len(others) > 1 else None
+    name = name or getattr(function, "__qualname__", "").split(".")[0].replace("<lambda>", "") or "energy function"
+    how = recognized(function, parameters is not None or start is not None, name)
+    how = replace(how, images=lists is not None and "MultiImage" in type(lists).__name__)
+    if how.parameters and parameters is None and start is None:
+        raise InputError(f"{name}: its first argument is its parameters", remedy="Give parameters=")
+    length, energy = _scales(units, name)
+    tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
+    made = Call(function, how, length, energy, name)
+    return EnergyFunction(
+        tree, made, float(r_cut) * length, format=format or "", name=name, species=tuple(species), start=start,
+        lists=lists, unit=(units,) if isinstance(units, str) and units else tuple(units), compare=compare,
+    )  # fmt: skip
+
+
+def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Convention:
+    """What a function's signature says of its convention.
+
+    Args:
+        parameters: whether there are some, or something that makes them.
+    """
+    try:
+        given = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return Convention(parameters=parameters, keywords=KEYWORDS)
+    kinds = inspect.Parameter
+    placed = [one for one in given if one.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]
+    names = [one.name.lower() for one in placed]
+    if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
+        raise InputError(
+            f"{name} takes a graph and no neighbor list: no list can be given to it as it is",
+            remedy="Wrap it: def energy(parameters, R, neighbor, cell), which makes the graph of neighbor.idx "
+            "and mdnum.md.jaxmd.displacement(cell)",
+        )
+    open_ended = any(one.kind == kinds.VAR_KEYWORD for one in given)
+    allowed = {one.name for one in given}
+    keywords = tuple(word for word in KEYWORDS if open_ended or word in allowed)
+    place = next((k for k, one in enumerate(names) if one in _LISTS), None)
+    if len(names) == 4 and names[3] in ("cell", "lattice"):
+        return Convention(native=True, box="cell")
+    word = next((one.name for one in given if one.kind == kinds.KEYWORD_ONLY and one.name in _LISTS), "")
+    first = parameters if place is None else place == 2
+    return Convention(parameters=first or (bool(word) and len(names) > 1), keyword=word, keywords=keywords)
+
+
+def _scales(units: Any, name: str) -> tuple[float, float]:
+    if not units or units == "metal" or units == "lj":
+        return 1.0, 1.0
+    try:
+        length, energy = units
+        return LENGTHS[length], ENERGIES[energy]
+    except (ValueError, KeyError):
+        raise InputError(
+            f"{name}: unknown units {units!r}",
+            remedy=f"Give one of {', '.join(LENGTHS)} and one of {', '.join(ENERGIES)}",
+        ) from None

@@ -1,0 +1,553 @@
+"""What an energy function is, found by calling it before a simulation is made of it, and what is wrong with it.
+
+A signature does not say whether positions are fractional, whether lattice vectors are rows or columns, or
+whether the box that is given counts at all. A wrong guess gives energies that look right. So the function is
+called at the first configuration, over lists that are the same in other words and in boxes that are nearly
+the same, by one compiled program.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError, in_a_line
+from mdnum.md import jaxmd
+from mdnum.md.cell import Cell, complete, displacement, wrap_positions
+from mdnum.md.energies import Call, EnergyFunction, with_images
+from mdnum.md.manybody import Smoothness
+from mdnum.plain import beside
+from mdnum.systems.simulation import Simulation
+
+_TEXTS = beside(__file__)
+FORMATS = ("dense", "sparse", "ordered-sparse")
+#: Relative difference of energies that are the same, by whether all arithmetic is in double precision.
+_SAME = {True: 1e-9, False: 1e-5}
+#: Of the box that tells rows from columns: how far it is sheared, not the same way along any two axes.
+_SHEAR = 1e-3 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.7, 0.4, 0.0]])
+#: Digits that a person writes: numbers in single precision with more are weights, or were computed.
+_DIGITS = 6
+
+
+class AdmissionError(InputError):
+    """An energy function cannot be simulated as it is; `code` says why, `values` with which numbers."""
+
+    def __init__(self, code: str, name: str, **values: Any):
+        entry = _TEXTS[code]
+        super().__init__(entry["text"].format(**values), remedy=entry["remedy"].format(**values), where=name)
+        self.code, self.values = code, values
+
+
+def admitted(simulation: Simulation) -> Simulation:
+    """The simulation with an energy function that is known: its convention, its smoothness, what was noted.
+
+    Raises:
+        AdmissionError: what it does cannot be right, in one of the ways of admission.toml.
+    """
+    with jaxmd.standard_promotion():
+        trial = Trial(simulation)
+        trial.resolve()
+        trial.check()
+        model = trial.at_the_cutoff()
+    notes = tuple((code, json.dumps(_short(values))) for code, values in trial.notes.items())
+    return simulation.with_model(replace(model, notes=notes))
+
+
+def _short(values: Mapping[str, Any]) -> dict[str, Any]:
+    """With six digits: another processor computes others."""
+    return {key: float(f"{one:.6g}") if isinstance(one, float) else one for key, one in values.items()}
+
+
+class Trial:
+    """An energy function at one configuration, in the order of the structure.
+
+    Attributes:
+        model: the function as far as it is known.
+        notes: what should be known about it, values by code.
+    """
+
+    def __init__(self, simulation: Simulation):
+        self.model: EnergyFunction = simulation.model
+        self.name, self.notes = self.model.name, {}
+        self.symbols = simulation.symbols
+        self._check_species(simulation.symbols)
+        self.pbc = np.array(simulation.pbc)
+        self.cell = complete(np.asarray(simulation.cell.matrix), self.pbc)
+        self.x, _ = wrap_positions(simulation.cell, simulation.positions)
+        self.seed = simulation.draw.seed
+        room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
+        table = simulation.verlet_list(min(max(simulation.rule.skin, 0.1 * simulation.r_cut), room)).build(
+            self.x, simulation.cell
+        )
+        # the list in the order of the structure; the skin, and slots that hold nothing
+        names = np.append(table.order, len(self.x)).astype(np.int32)
+        self.idx = np.full((len(self.x), table.slots), len(self.x), np.int32)
+        self.idx[table.order] = names[table.index].T
+        self.inside = self.within(self.idx, self.x, self.model.r_cut)
+        self._lists()
+        self._compile()
+
+    def _check_species(self, symbols: tuple[str, ...]) -> None:
+        unknown = sorted(set(symbols) - set(self.model.species))
+        if self.model.species and unknown:
+            known = ", ".join(self.model.species)
+            raise AdmissionError("UNKNOWN_SPECIES", self.name, unknown=", ".join(unknown), known=known)
+
+    @property
+    def call(self) -> Call:
+        """The function with the convention that is known so far."""
+        return self.model.call
+
+    def _with(self, **found: Any) -> None:
+        self.model = replace(self.model, function=replace(self.call, how=replace(self.call.how, **found)))
+
+    # --- calling it -----------------------------------------------------------------------------------
+
+    def _lists(self) -> None:
+        """The format of its own list, whether that lists atoms themselves, and its parameters."""
+        model, lists, own = self.model, self.model.lists, None
+        if lists is not None:
+            for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
+                try:
+                    own = lists.allocate(jnp.asarray(x))
+                    break
+                except Exception as error:
+                    self.notes["LIST_FAILED"] = {"error": in_a_line(error)}
+        if own is not None:
+            self.notes.pop("LIST_FAILED", None)
+            known = {"Dense": "dense", "Sparse": "sparse", "OrderedSparse": "ordered-sparse"}
+            idx, n = own.idx, len(self.x)
+            if own.format.name == "Dense":
+                itself = np.any(np.asarray(idx) == np.arange(n)[:, None])
+            else:
+                itself = np.any((np.asarray(idx[0]) == np.asarray(idx[1])) & (np.asarray(idx[0]) < n))
+            images = self.call.how.images
+            model = replace(model, format=known[own.format.name], self_edges=bool(itself) and not images)
+        self.model = model
+        if model.start is not None and not jax.tree.leaves(model.parameters):
+            key, x = jax.random.PRNGKey(self.seed), jnp.asarray(self.x / self.call.length)
+            listed = own if own is not None else jaxmd.as_neighbor_list(self.idx, x, model.format or "dense")
+            self.model = replace(model, parameters=model.start(key, x, listed))
+
+    def bare(self, parameters, x, idx, real, cell, box, strain, code):
+        """The function's own energy, of positions and a box in its own terms."""
+        call, model = self.call, self.model
+        neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
+        if call.how.images:
+            neighbor = with_images(neighbor, real, cell, box)
+        return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
+
+    def _arguments(self, idx=None, x=None, cell=None, *, real=None, box=None, strain=None, code=0):
+        cell = (self.cell if cell is None else cell) / self.call.length
+        x = (self.x if x is None else x) / self.call.length
+        given = (
+            x, self.inside if idx is None else idx, x if real is None else real / self.call.length, cell,
+            cell.T if box is None else box / self.call.length, np.eye(3) if strain is None else strain,
+        )  # fmt: skip
+        return (self.model.parameters, *map(jnp.asarray, given), jnp.asarray(code, jnp.uint8))
+
+    def _compile(self) -> None:
+        """Find a format, keywords and a result that fit, and compile energy and derivatives."""
+        formats = (self.model.format,) if self.model.format else FORMATS
+        words, failed = self.call.how.keywords, ""
+        # a space of jax-md may raise at a keyword that the function passes on
+        sets = [tuple(w for w in words if w != left) for left in ("", "box", "cell", "perturbation")]
+        for form in formats:
+            for keywords in dict.fromkeys([*sets, ()]):
+                self.model = replace(self.model, format=form)
+                self._with(keywords=keywords)
+                try:
+                    self._with(returns=self._returned())
+                    every = jax.jit(jax.value_and_grad(self.bare, argnums=(1, 4, 5, 6)))
+                    self.program = self._quick(every.trace(*self._arguments()))
+                    return
+                except AdmissionError:
+                    raise
+                except Exception as error:
+                    failed = failed or in_a_line(error)
+        raise AdmissionError("NOT_CALLABLE", self.name, error=failed, tried=", ".join(formats))
+
+    def _quick(self, traced: Any) -> Any:
+        """A program compiled for a few calls."""
+        self.trace = traced.jaxpr
+        return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
+
+    def _returned(self) -> str:
+        """What it returns, as `Convention.returns`."""
+        found: list[Any] = []
+
+        function = self.call.function
+
+        def kept(*args, **keywords):
+            out = function(*args, **keywords)
+            found.append(jax.tree.map(lambda leaf: jnp.shape(leaf), out))
+            return jnp.zeros(())
+
+        held = self.model
+        self.model = replace(held, function=replace(self.call, function=kept))
+        try:
+            jax.eval_shape(self.bare, *self._arguments())
+        finally:
+            self.model = held
+        shape = found[-1]
+        if isinstance(shape, Mapping):
+            key = next((key for key in ("total", "energy") if key in shape), None)
+            if key is None or shape[key] not in ((), (1,)):
+                raise AdmissionError("NO_ENERGY", self.name, seen=f"a dictionary with {', '.join(shape)}")
+            return key
+        if shape in ((), (1,)):
+            return "number"
+        if shape == (len(self.x),):
+            return "atoms"
+        raise AdmissionError("NO_ENERGY", self.name, seen=f"{shape!r}")
+
+    def energy(self, *args: Any, **keywords: Any) -> float:
+        """Its own energy; arguments as for `_arguments`."""
+        return float(self.program(*self._arguments(*args, **keywords))[0])
+
+    def there(self, x=None, idx=None, cell=None, **keywords) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
+        """Energy and forces in the simulation's units, at real positions, by the convention that is known."""
+        how, call = self.call.how, self.call
+        x, cell = (self.x if x is None else x), (self.cell if cell is None else cell)
+        given = x @ np.linalg.inv(cell) * call.length if how.fractional else x
+        # a function that follows cell= must do so alone
+        box = self.cell.T if how.box == "cell" else cell if how.box == "rows" else cell.T
+        out = self.program(*self._arguments(idx, given, cell, real=x, box=box, **keywords))
+        slope = np.asarray(out[1][0])
+        if how.fractional and not how.real_slope:
+            slope = slope @ np.linalg.inv(cell / call.length).T
+        return float(out[0]) * call.unit, -slope * call.unit / call.length
+
+    def same(self, a: float, b: float) -> bool:
+        """Whether two energies are the same within rounding."""
+        return abs(a - b) <= _SAME[self.double] * self.scale
+
+    def within(self, idx, x, radius: float) -> Int[np.ndarray, "atoms slots"]:
+        """Of listed pairs those closer than a radius."""
+        n = len(x)
+        return np.where((idx < n) & (self.distances(idx, x) < radius), idx, n).astype(np.int32)
+
+    def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
+        """Of the listed pairs, some number for padding."""
+        box = Cell.create(self.cell, tuple(self.pbc.tolist()))
+        d = displacement(box, x[:, None], x[np.minimum(idx, len(x) - 1)])
+        return np.sqrt(sum(c * c for c in d))
+
+    # --- what it is -----------------------------------------------------------------------------------
+
+    def resolve(self) -> None:
+        """Which box it follows, and whether its positions are real or fractional.
+
+        Raises:
+            AdmissionError: numbers that are not finite; another box than the simulation's, or one that it
+                ignores; no way to strain what it sees.
+        """
+        self.double, how = not _single_arithmetic(self.trace), self.call.how
+        if not self.pbc.any():
+            self._known("cell" if how.native else "")
+            return
+        boxes = ["cell"] if how.native else [box for word, *of in _BOXES if word in how.keywords for box in of]
+        found = [(fractional, box) for fractional in (False, True)[: 2 - how.native] for box in (*boxes, "")]
+        kept = None
+        for fractional, box in found:
+            self._with(fractional=fractional, box=box)
+            if self._takes_images():
+                kept = kept or (fractional, "")
+                if box and self._follows():
+                    kept = fractional, box
+                    break
+        self._with(fractional=kept is not None and kept[0])
+        self._known(kept[1] if kept else "")
+        if kept is None:
+            here, there = (self.there(x)[0] for x in self._moves(self.cell)[-2:])
+            raise AdmissionError("ANOTHER_BOX", self.name, here=there, there=here)
+        if not self.call.how.strain and self.call.how.box != "cell":
+            raise AdmissionError("CELL_IGNORED" if how.native else "NO_STRAIN", self.name)
+
+    def _known(self, box: str) -> None:
+        """Keep how the box is followed, and the keywords that this takes; energies must be finite then."""
+        how = self.call.how
+        self._with(box=box)
+        energy, forces = self.there()
+        by_strain = np.asarray(self.program(*self._converted(self.inside))[1][3])
+        strain = box != "cell" and "perturbation" in how.keywords and bool(np.any(by_strain))
+        used = ("cell",) if box == "cell" else ("box",) * bool(box) + ("perturbation",) * strain
+        self._with(strain=strain, keywords=tuple(word for word in how.keywords if word in used))
+        self.scale = max(abs(energy), float(np.abs(forces).max(initial=0.0)) * self.model.r_cut, 1e-12)
+        self.scale /= self.call.unit
+        if np.isfinite(energy) and np.isfinite(forces).all():
+            return
+        n = len(self.x)
+        # the same with neighbors, some of them twice, where there is padding
+        first = np.where(self.inside[:, :1] < n, self.inside[:, :1], (np.arange(n) == 0)[:, None])
+        padded = all(np.isfinite(one).all() for one in self.there(idx=np.where(self.inside < n, self.inside, first)))
+        operation = first_not_finite(jax.grad(self.bare, 1), *self._converted(self.inside))
+        raise AdmissionError("NAN_BY_PADDING" if padded else "NOT_FINITE", self.name, operation=operation)
+
+    def _moves(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
+        """Positions with one atom, that has neighbors, moved by each of some vectors; last those unmoved."""
+        moved = np.arange(len(self.x)) == self._central
+        axes = np.flatnonzero(self.pbc)
+        return [*(self.x + np.outer(moved, vectors[axis]) for axis in axes), self.x]
+
+    def _takes_images(self) -> bool:
+        """Whether an atom may move by a lattice vector, and by none of another convention."""
+        if not self._unmoved(self.cell):
+            return False
+        # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
+        return self.call.how.fractional or not self._unmoved(np.eye(3) * self.call.length)
+
+    @property
+    def _central(self) -> int:
+        """The atom that has most neighbors."""
+        return int(np.argmax((self.inside < len(self.x)).sum(axis=1)))
+
+    def _unmoved(self, vectors, cell=None) -> bool:
+        """Whether moving an atom by any of some vectors leaves the energy of its pairs as it is."""
+        n, rows = len(self.x), np.arange(len(self.x))[:, None]
+        reach = 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(self.cell), axis=0)))
+        own = (self.inside == self._central) | (rows == self._central)
+        idx = self.within(np.where(own, self.inside, n), self.x, reach)
+        none = self.there(idx=np.full_like(idx, n))[0]
+        *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
+        size = max(abs(here[0] - none), np.abs(here[1]).max() * self.model.r_cut, 1e-13 * abs(here[0]))
+        return all(abs(one[0] - here[0]) <= 10 * _SAME[self.double] * size for one in moved)
+
+    def _follows(self) -> bool:
+        """Whether a box that is slightly sheared counts, and counts as what it is."""
+        cell, n = self.cell + self.cell @ _SHEAR, len(self.x)
+        near = self.within(self.idx, self.x, 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(cell), axis=0))))
+        # pairs that no face of the box is between are where they were
+        straight = self.x[:, None] - self.x[np.minimum(near, n - 1)]
+        apart = np.linalg.norm(straight, axis=-1)
+        whole = np.where(np.isclose(apart, self.distances(near, self.x), rtol=1e-9), near, n).astype(np.int32)
+        here, there = self.there(idx=whole), self.there(idx=whole, cell=cell)
+        size = max(abs(here[0]), np.abs(here[1]).max() * self.model.r_cut)
+        return abs(here[0] - there[0]) <= _SAME[self.double] * size and self._unmoved(cell, cell)
+
+    # --- what may be wrong with it --------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Raise where its numbers cannot be right; note what should be known."""
+        n, rng = len(self.x), np.random.default_rng(0)
+        energy, _ = self.there()
+        self._derivatives(rng)
+        shuffled = rng.permuted(self.inside, axis=1).astype(np.int32)
+        if not self.same(energy, other := self.there(idx=shuffled)[0]):
+            raise AdmissionError("DEPENDS_ON_ORDER", self.name, here=energy, there=other)
+        wide = np.pad(self.inside, ((0, 0), (0, 8)), constant_values=n)
+        # its own padding between the neighbors was among what was shuffled
+        arguments = self._converted(wide)
+        alone = self._quick(jax.jit(self.bare).trace(*arguments))
+        if not self.same(energy, other := float(alone(*arguments)) * self.call.unit):
+            raise AdmissionError("DEPENDS_ON_CAPACITY", self.name, here=energy, there=other)
+        order = rng.permutation(n)
+        place = np.append(np.argsort(order), n).astype(np.int32)
+        other = self.there(self.x[order], place[self.inside[order]])[0]
+        self.model = replace(self.model, labeled=not self.same(energy, other))
+        if not self.same(energy, skin := self.there(idx=self.idx)[0]):
+            self.model = replace(self.model, trusts_list=True)
+            self.notes["TRUSTS_LIST"] = {"inside": energy, "skin": skin}
+        none = self.there(idx=np.full_like(self.inside, n))
+        if not all(np.isfinite(one).all() for one in none):
+            operation = first_not_finite(jax.grad(self.bare, 1), *self._converted(np.full_like(self.inside, n)))
+            self.notes["NO_EDGES_NAN"] = {"operation": operation}
+        if not np.isfinite(self.there(code=1)[0]):
+            self.notes["NAN_ON_OVERFLOW"] = {}
+        if not self.call.how.box and self.pbc.any():
+            self.notes["FIXED_BOX"] = {}
+        if not self.double:
+            self.notes["SINGLE_INSIDE"] = {}
+        if rounded := single_numbers(self.trace):
+            self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
+
+    def _converted(self, idx) -> tuple[Any, ...]:
+        how = self.call.how
+        x = self.x @ np.linalg.inv(self.cell) * self.call.length if how.fractional else self.x
+        return self._arguments(idx, x, real=self.x, box=self.cell if how.box == "rows" else self.cell.T)
+
+    def _derivatives(self, rng: np.random.Generator) -> None:
+        """Forces, and stress where the box counts, against differences of energies."""
+        step, allowed = (1e-5, 1e-4) if self.double else (3e-3, 5e-2)
+        step *= self.model.r_cut
+        # no pair that crosses the cutoff within the difference
+        crossing = np.abs(self.distances(self.inside, self.x) - self.model.r_cut) < 20 * step
+        idx = np.where(crossing, len(self.x), self.inside).astype(np.int32)
+        noise = (1e-14 if self.double else 1e-6) * self.scale * self.call.unit / step
+        along = rng.standard_normal(self.x.shape)
+        along /= np.linalg.norm(along, axis=1).max()
+
+        def slope(at: Callable[[float], float]) -> float:
+            return (at(step) - at(-step)) / (2 * step)
+
+        found = slope(lambda h: self.there(self.x + h * along, idx)[0])
+        for real_slope in (False, True)[: 1 + self.call.how.fractional]:
+            self._with(real_slope=real_slope)
+            forces = self.there(idx=idx)[1]
+            terms = -np.sum(forces * along, axis=1)
+            if abs(found - terms.sum()) <= allowed * np.sqrt(np.sum(terms**2)) + 10 * noise:
+                break
+        else:
+            raise AdmissionError("FORCES_WRONG", self.name, found=found, force=float(terms.sum()))
+        how = self.call.how
+        if how.fractional and not how.strain:
+            raise AdmissionError("NO_STRAIN", self.name)
+        if not how.box or not self.pbc.all():
+            return
+        strain = rng.standard_normal((3, 3))
+        strain = 0.05 * (strain + strain.T)
+        _, (by_x, by_cell, _, by_strain) = self.program(*self._converted(idx))
+        if how.strain:
+            stress = np.sum(np.asarray(by_strain) * strain)
+        else:
+            stress = np.sum(np.asarray(by_x) * (self.x / self.call.length @ strain))
+            stress += np.sum(np.asarray(by_cell) * (self.cell / self.call.length @ strain))
+        step /= self.model.r_cut
+
+        def at(h: float) -> float:
+            by = np.eye(3) + h * strain
+            return self.there(self.x @ by, idx, self.cell @ by)[0]
+
+        found, size = slope(at), self.scale * self.call.unit
+        if abs(found - stress * self.call.unit) > allowed * size + 10 * noise * self.model.r_cut:
+            raise AdmissionError("STRESS_WRONG", self.name, found=found, stress=float(stress * self.call.unit))
+
+    def at_the_cutoff(self) -> EnergyFunction:
+        """The function with what a crossing of its cutoff does, of the pairs that are nearest to it."""
+        n, r_cut = len(self.x), self.model.r_cut
+        r = np.where(self.idx < n, self.distances(self.idx, self.x), np.inf)
+        rows, slots = np.unravel_index(np.argsort(np.abs(r - r_cut), axis=None)[:6], r.shape)
+        jumps, pushes, acts = [0.0], [0.0], []
+        for i, slot in zip(rows.tolist(), slots.tolist(), strict=True):
+            j = int(self.idx[i, slot])
+            if not i < j < n or abs(r[i, slot] - r_cut) > 0.2 * r_cut:
+                continue
+            box = Cell.create(self.cell, tuple(self.pbc.tolist()))
+            toward = np.stack(displacement(box, self.x[i], self.x[j])) / r[i, slot]
+            change = []
+            for factor in (1 - 1e-7, 1 + 1e-3):
+                x = self.x.copy()
+                x[j] += toward * (r_cut * factor - r[i, slot])
+                listed = self.within(self.idx, x, r_cut)
+                pair = np.zeros_like(listed, bool)
+                pair[i], pair[j] = self.idx[i] == j, self.idx[j] == i
+                ends = [self.there(x, np.where(pair, held, listed).astype(np.int32)) for held in (self.idx, n)]
+                change.append((ends[0][0] - ends[1][0], np.abs(ends[0][1] - ends[1][1]).max()))
+            (jump, push), (beyond, _) = change
+            jumps.append(jump)
+            pushes.append(float(push))
+            if not self.same(1e3 * jump, 0.0):
+                acts.append(abs(beyond - jump) <= 0.1 * abs(jump))
+        if len(jumps) == 1:
+            return self.model
+        jump, push = max(jumps, key=abs), max(pushes)
+        order = -1.0 if acts else 0.0 if push > 1e-5 * self.scale * self.call.unit / r_cut else 1.0
+        if order == -1:
+            self.notes["ENERGY_JUMPS"] = {"jump": jump, "push": push}
+            # the jump of every crossing where all are alike; of others it is not known before
+            alike = len(self.symbols) == 1 and all(abs(one - jump) <= 1e-6 * abs(jump) for one in jumps[1:])
+            jump, push = (jump, push) if alike else (float("nan"), float("nan"))
+        else:
+            jump, push = 0.0, push if order == 0 else 0.0
+        trusts = all(acts) if acts else self.model.trusts_list
+        if acts and not trusts:
+            self.notes.pop("TRUSTS_LIST", None)
+            self.notes["DECIDES_ITSELF"] = {}
+        return replace(self.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
+
+
+#: What a keyword may hold, in the order in which it is tried.
+_BOXES = (("cell", "cell"), ("box", "columns", "rows"))
+
+
+# --- reading a program --------------------------------------------------------------------------------
+
+
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    """Of a program and all that it calls."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            if _is_program(inner):
+                yield from _equations(getattr(inner, "jaxpr", inner))
+
+
+def _is_program(value: Any) -> bool:
+    return hasattr(value, "eqns") or hasattr(value, "jaxpr")
+
+
+def _single_arithmetic(jaxpr: Any) -> bool:
+    """Whether arrays of numbers are computed in less than double precision on the way to the energy."""
+    for equation in _equations(jaxpr):
+        for out in equation.outvars:
+            dtype = getattr(out.aval, "dtype", None)
+            narrow = dtype is not None and jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 8
+            ins = [getattr(one.aval, "dtype", None) for one in equation.invars]
+            if narrow and equation.primitive.name == "convert_element_type" and ins == [np.dtype(np.float64)]:
+                return True
+    return False
+
+
+def single_numbers(closed: Any) -> list[str]:
+    """Numbers of a program that were rounded to single precision, as they were most likely written."""
+    held = list(closed.consts)
+    for equation in _equations(closed.jaxpr):
+        held += [one.val for one in equation.invars if hasattr(one, "val")]
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            held += getattr(inner, "consts", ())
+    numbers: dict[str, None] = {}
+    for one in held:
+        if getattr(one, "dtype", None) == np.float32 and np.size(one) <= 64:
+            for number in np.ravel(np.asarray(one)):
+                # halves and whole numbers lose nothing, and what has all digits was computed
+                short = len(str(number).strip("-0.").replace(".", "")) <= _DIGITS
+                if np.isfinite(number) and short and float(str(number)) != float(number):
+                    numbers[str(number)] = None
+    return list(numbers)
+
+
+def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
+    """The first operation of a function that makes of finite numbers one that is not, and its place."""
+    closed = jax.make_jaxpr(function)(*args)
+    found: list[str] = []
+
+    def finite(values) -> bool:
+        return all(np.isfinite(one).all() for one in map(np.asarray, values) if one.dtype.kind == "f")
+
+    def run(jaxpr: Any, consts: Any, values: Any) -> list[Any]:
+        known: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *values], strict=True))
+        for equation in jaxpr.eqns:
+            ins = [one.val if hasattr(one, "val") else known[one] for one in equation.invars]
+            inner = next((equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params), None)
+            whole = hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(ins)
+            if inner is not None and whole and equation.primitive.name not in ("scan", "while"):
+                outs = run(inner.jaxpr, inner.consts, ins)
+            else:
+                params = equation.primitive.get_bind_params(equation.params)
+                # earlier versions return functions among the arguments, too
+                more, params = params if isinstance(params, tuple) else ((), params)
+                outs = equation.primitive.bind(*more, *ins, **params)
+                outs = outs if equation.primitive.multiple_results else [outs]
+            if not found and finite(ins) and not finite(outs):
+                found.append(f"{equation.primitive.name} ({_line(equation)})")
+            known |= dict(zip(equation.outvars, outs, strict=True))
+        return [one.val if hasattr(one, "val") else known[one] for one in jaxpr.outvars]
+
+    run(closed.jaxpr, closed.consts, jax.tree.leaves(args))
+    return found[0] if found else "an operation on numbers that were not finite before"
+
+
+def _line(equation: Any) -> str:
+    """File, line and function in which an operation was written."""
+    frames = getattr(equation.source_info.traceback, "frames", ())
+    place = next((one for one in frames if "/jax/" not in one.file_name and "equinox" not in one.file_name), None)
+    if place is None:
+        return "place unknown"
+    return f"{place.file_name.rpartition('/')[2]}:{place.line_num} {place.function_name}"

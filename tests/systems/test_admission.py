@@ -1,0 +1,408 @@
+"""Energy functions in the conventions that people have, against numpy, and with one defect each."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.geometry import get_distances
+
+import mdnum
+from mdnum.md import jaxmd
+from mdnum.md.jaxmd import displacement as own_displacement
+from mdnum.systems.admission import AdmissionError, first_not_finite
+
+RADIUS, DEPTH = 4.4, 0.3
+SHEAR = np.array([[1, 0, 0], [0.11, 1, 0], [-0.07, 0.09, 1]])
+
+
+def argon(tilted: bool = True) -> Atoms:
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * 2
+    atoms.rattle(0.15, seed=5)
+    if tilted:
+        atoms.set_cell(atoms.cell.array @ SHEAR, scale_atoms=True)
+    return atoms
+
+
+def by_hand(atoms: Atoms, depth=DEPTH, power: int = 2) -> tuple[float, np.ndarray, np.ndarray]:
+    """Energy, forces and stress of depth (1 - r²/R²)^power, of all pairs."""
+    d, r = get_distances(atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+    depth = np.broadcast_to(depth, r.shape)
+    near = (r < RADIUS) & (r > 0)
+    t = np.where(near, 1 - (r / RADIUS) ** 2, 0.0)
+    # of half the pairs' sum, by the square of the distance
+    slope = np.where(near, -0.5 * depth * power * t ** (power - 1) / RADIUS**2, 0.0)
+    forces = 4 * np.sum(slope[:, :, None] * d, axis=1)
+    stress = 2 * np.einsum("ij,ija,ijb->ab", slope, d, d) / atoms.get_volume()
+    return 0.5 * np.sum(np.where(near, depth * t**power, 0)), forces, stress
+
+
+def energies(d, real, depth: Any = DEPTH, power: int = 2):
+    """The same of listed vectors; one for each entry."""
+    t = 1 - jnp.sum(jnp.where(real[..., None], d, 1.0) ** 2, axis=-1) / RADIUS**2
+    return 0.5 * depth * jnp.where(real & (t > 0), t, 0.0) ** power
+
+
+def entries(neighbor, n: int):
+    """Both ends of every entry, and whether it is one."""
+    i, j = (jnp.arange(n)[:, None], neighbor.idx) if neighbor.format.name == "Dense" else neighbor.idx
+    i, j = jnp.broadcast_arrays(i, j)
+    real = (i < n) & (j < n)
+    return jnp.where(real, i, 0), jnp.where(real, j, 0), real
+
+
+def over(space, R, neighbor, depth: Any = DEPTH, each=energies, **kw):
+    """Energies of entries, by a displacement function of jax-md."""
+    i, j, real = entries(neighbor, len(R))
+    flat = jax.vmap(partial(space, **kw))(R[i.ravel()], R[j.ravel()])
+    return each(flat.reshape(*i.shape, 3), real, depth)
+
+
+def general(atoms: Atoms, fractional: bool):
+    md = jaxmd.upstream()
+    box = jnp.asarray(atoms.cell.array.T)
+    return md.space.periodic_general(box, fractional_coordinates=fractional)[0]
+
+
+def classical(atoms: Atoms, fractional: bool = False):
+    space = general(atoms, fractional)
+    return lambda R, neighbor, **kw: jnp.sum(over(space, R, neighbor, **kw))
+
+
+def parameters_first(atoms: Atoms):
+    space = general(atoms, False)
+
+    def energy(params, R, neighbor, **kw):
+        return jnp.sum(over(space, R, neighbor, params["depths"][0], **kw))
+
+    lists = SimpleNamespace(allocate=lambda R: jaxmd.as_neighbor_list(np.full((len(R), 1), len(R)), R, "sparse"))
+    return lists, lambda key, R, neighbor: {"depths": [jnp.asarray(DEPTH)]}, energy
+
+
+def keyword_only(atoms: Atoms, rows: bool = False):
+    base = atoms.cell.array
+
+    def energy(R, *, box=None, neighbor=None):
+        cell = jnp.asarray(base) if box is None else box if rows else box.T
+        return jnp.sum(over(own_displacement(cell), R, neighbor))
+
+    return energy
+
+
+def dictionary(atoms: Atoms):
+    space = general(atoms, False)
+
+    def energy(R, nlist, **kw):
+        return {"bond": jnp.zeros(()), "total": jnp.sum(over(space, R, nlist, **kw))}
+
+    return energy, SimpleNamespace(allocate=lambda R: jaxmd.as_neighbor_list(np.zeros((len(R), 1)), R)), space
+
+
+def multi_image(atoms: Atoms):
+    from jax_md import custom_partition
+
+    lists = custom_partition.neighbor_list_multi_image(None, jnp.asarray(atoms.cell.array.T), RADIUS, 0.0)
+
+    def energy(R, neighbor, box=None, perturbation=None, **_):
+        held = neighbor if box is None else neighbor.__class__(**{**vars(neighbor), "box": box})
+        d = custom_partition._compute_displacements(R, held)
+        d = d if perturbation is None else d @ perturbation.T
+        return jnp.sum(energies(d, custom_partition.neighbor_list_multi_image_mask(held)))
+
+    return lists, energy
+
+
+def per_atom(atoms: Atoms):
+    space = general(atoms, True)
+    return lambda R, neighbor, **kw: jnp.sum(over(space, R, neighbor, **kw), axis=1)
+
+
+def simulation(made, atoms: Atoms, **more: Any):
+    function = mdnum.energy_function(made, RADIUS, **more)
+    return mdnum.simulation(atoms, function, timestep=0.002, skin=0.2)
+
+
+def compared(one, atoms: Atoms, depth: Any = DEPTH, power: int = 2) -> None:
+    energy, forces, stress = by_hand(atoms, depth, power)
+    found = one.evaluate()
+    assert found.energy == pytest.approx(energy, rel=1e-13)
+    np.testing.assert_allclose(found.forces, forces, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.stress, stress, rtol=0, atol=1e-15)
+
+
+CONVENTIONS = {
+    "classical": (classical, "classical", "columns", False),
+    "fractional": (partial(classical, fractional=True), "classical", "columns", True),
+    "first": (parameters_first, "parameters first", "columns", False),
+    "keyword": (keyword_only, "keyword only", "columns", False),
+    "rows": (partial(keyword_only, rows=True), "keyword only", "rows", False),
+    "dictionary": (dictionary, "classical, dictionary with total", "columns", False),
+    "images": (multi_image, "multi-image list", "columns", True),
+    "atoms": (per_atom, "classical", "columns", True),
+}
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_each_convention_is_recognized_and_has_the_numbers_of_numpy(name: str):
+    make, label, box, fractional = CONVENTIONS[name]
+    atoms = argon()
+    one = simulation(make(atoms), atoms)
+    how = one.model.call.how
+    assert (how.label, how.box, how.fractional) == (label, box, fractional)
+    compared(one, atoms)
+
+
+def test_a_function_that_takes_a_graph_is_refused_by_name():
+    def network(graph):
+        return graph.energy
+
+    with pytest.raises(mdnum.InputError, match="network takes a graph"):
+        mdnum.energy_function(network, RADIUS)
+    Graph = namedtuple("Graph", "nodes")
+
+    def annotated(g: Graph):
+        return g.nodes
+
+    with pytest.raises(mdnum.InputError, match="annotated takes a graph"):
+        mdnum.energy_function(annotated, RADIUS)
+
+
+def native(parameters, R, neighbor, cell, *, each=energies):
+    return jnp.sum(over(own_displacement(cell), R, neighbor, parameters, each))
+
+
+def first_counts_more(d, real, depth):
+    return energies(d, real, depth) * jnp.where(jnp.arange(real.shape[1]) == 0, 1.1, 1.0)
+
+
+def per_slot(d, real, depth):
+    return energies(d, real, depth) / real.shape[1]
+
+
+def masked_late(d, real, depth):
+    t = 1 - jnp.linalg.norm(d, axis=-1) / RADIUS
+    return 0.5 * depth * jnp.where(real & (t > 0), t, 0.0) ** 2
+
+
+def of_a_negative_number(d, real, depth):
+    return energies(d, real, depth) + jnp.log(depth - 5)
+
+
+def per_edge(d, real, depth):
+    return energies(d, real, depth) / jnp.sum(real)
+
+
+def in_single(d, real, depth):
+    return energies(d.astype(jnp.float32), real, depth)
+
+
+def on_trust(d, real, depth):
+    """Jumps at the cutoff, wherever an entry is."""
+    t = 1.2 - jnp.sum(jnp.where(real[..., None], d, 1.0) ** 2, axis=-1) / RADIUS**2
+    return 0.5 * depth * jnp.where(real, t, 0.0)
+
+
+def by_itself(d, real, depth):
+    r2 = jnp.sum(jnp.where(real[..., None], d, 1.0) ** 2, axis=-1)
+    return jnp.where(r2 < RADIUS**2, on_trust(d, real, depth), 0.0)
+
+
+def with_constant(d, real, depth):
+    # as jax_md.util.maybe_downcast makes them
+    return energies(d, real, depth) * jnp.asarray(0.3, jnp.float32) * jnp.asarray(0.5, jnp.float32)
+
+
+def held_still(d, real, depth):
+    return energies(jax.lax.stop_gradient(d), real, depth) + energies(d, real, depth)
+
+
+def own(each, depth: Any = DEPTH):
+    function = mdnum.md.energies.EnergyFunction(
+        jnp.asarray(depth), partial(native, each=each), RADIUS, format="dense", name=each.__name__
+    )
+    return lambda atoms: mdnum.simulation(atoms, function, timestep=0.002, skin=0.2)
+
+
+def brought(make, **more: Any):
+    return lambda atoms: simulation(make(atoms), atoms, **more)
+
+
+def another_box(atoms: Atoms):
+    larger = atoms.copy()
+    larger.set_cell(atoms.cell.array * 1.1)
+    return classical(larger)
+
+
+def a_matrix(atoms: Atoms):
+    space = jaxmd.upstream().space.periodic(jnp.asarray(atoms.cell.array))[0]
+    # with a matrix a vector becomes three
+    each = jax.vmap(lambda a, b: jnp.sum(space(a, b) ** 2))
+
+    def energy(R, neighbor, **kw):
+        i, j, real = entries(neighbor, len(R))
+        t = 1 - jnp.where(real, each(R[i.ravel()], R[j.ravel()]).reshape(i.shape), 9.0) / (3 * RADIUS**2)
+        return jnp.sum(jnp.where(real & (t > 0), t, 0.0) ** 2)
+
+    return energy
+
+
+def deaf(atoms: Atoms):
+    space = general(atoms, False)
+    return lambda R, neighbor: jnp.sum(over(space, R, neighbor))
+
+
+def ignores_the_cell(atoms: Atoms):
+    space = general(atoms, False)
+    function = lambda parameters, R, neighbor, cell: jnp.sum(over(space, R, neighbor))  # noqa: E731
+    made = mdnum.md.energies.EnergyFunction((), function, RADIUS, format="dense")
+    return mdnum.simulation(atoms, made, timestep=0.002, skin=0.2)
+
+
+def strained_twice(atoms: Atoms):
+    space = general(atoms, False)
+
+    def energy(R, neighbor, box=None, perturbation=None):
+        return jnp.sum(over(space, R, neighbor, box=box, perturbation=perturbation @ perturbation))
+
+    return energy
+
+
+def vectors(atoms: Atoms):
+    space = general(atoms, False)
+    return lambda R, neighbor, **kw: jnp.ones(3) * jnp.sum(over(space, R, neighbor, **kw))
+
+
+def raises(R, neighbor, **kw):
+    raise KeyError("weights")
+
+
+DEFECTS = {
+    "DEPENDS_ON_ORDER": own(first_counts_more),
+    "DEPENDS_ON_CAPACITY": own(per_slot),
+    "NAN_BY_PADDING": own(masked_late),
+    "NOT_FINITE": own(of_a_negative_number),
+    "FORCES_WRONG": own(held_still),
+    "ANOTHER_BOX": brought(another_box, format="dense"),
+    "ANOTHER_BOX, a matrix": brought(a_matrix, format="dense"),
+    "CELL_IGNORED": ignores_the_cell,
+    "NO_STRAIN": brought(deaf, format="dense"),
+    "STRESS_WRONG": brought(strained_twice, format="dense"),
+    "NO_ENERGY": brought(vectors, format="dense"),
+    "NOT_CALLABLE": brought(lambda atoms: raises),
+    "UNKNOWN_SPECIES": brought(classical, species=("Si", "O")),
+}
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_closes_the_door(name: str):
+    with pytest.raises(AdmissionError) as caught:
+        DEFECTS[name](argon())
+    assert caught.value.code == name.partition(",")[0] and caught.value.remedy
+    if "NAN" in name or "FINITE" in name:
+        operation = {"NAN_BY_PADDING": "div", "NOT_FINITE": "log"}[name]
+        assert caught.value.values["operation"].startswith(operation)
+        assert "test_admission.py" in caught.value.values["operation"]
+
+
+def overflowing(atoms: Atoms):
+    energy = classical(atoms)
+    return lambda R, neighbor, **kw: jnp.where(neighbor.did_buffer_overflow, jnp.nan, energy(R, neighbor, **kw))
+
+
+NOTES = {
+    "NO_EDGES_NAN": (own(per_edge), {}),
+    "SINGLE_INSIDE": (own(in_single), {}),
+    "PARAMETERS_FLOAT32": (own(with_constant), {"numbers": ["0.3"], "count": 1}),
+    "NAN_ON_OVERFLOW": (brought(overflowing, format="dense"), {}),
+    "TRUSTS_LIST": (own(on_trust), {}),
+    "DECIDES_ITSELF": (own(by_itself), {}),
+}
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("code", NOTES)
+def test_what_should_be_known_is_noted_and_is_a_finding_of_the_run(code: str):
+    import json
+
+    from mdnum.verbs.run_page import TEXTS
+
+    make, values = NOTES[code]
+    one = make(argon())
+    notes = {key: json.loads(text) for key, text in one.model.notes}
+    assert code in notes and values.items() <= notes[code].items()
+    clean = ("ENERGY_JUMPS",) if code in ("TRUSTS_LIST", "DECIDES_ITSELF") else ()
+    assert set(notes) == {code, *clean}
+    assert TEXTS.finding(code, **notes[code], energy_unit="eV", length_unit="Å").code == code
+    assert one.imposable == (code == "TRUSTS_LIST")
+    if clean:
+        # of two ends
+        assert one.model.smoothness.energy_jump == pytest.approx(0.2 * DEPTH, rel=1e-5)
+        assert one.program["potential"]["notes"] == notes
+
+
+@pytest.mark.jax_md
+def test_numbers_that_belong_to_atoms_stay_with_them_when_atoms_are_sorted():
+    atoms = argon()
+    charges = np.random.default_rng(3).uniform(0.5, 1.5, len(atoms))
+    held, space = jnp.asarray(charges), general(atoms, False)
+
+    def energy(R, neighbor, **kw):
+        i, j, _ = entries(neighbor, len(R))
+        return jnp.sum(over(space, R, neighbor, held[i] * held[j], **kw))
+
+    one = simulation(energy, atoms, format="dense")
+    assert one.model.labeled
+    compared(one, atoms, np.outer(charges, charges))
+
+
+@pytest.mark.jax_md
+def test_units_are_those_that_the_function_is_written_in():
+    atoms = argon()
+    small = atoms.copy()
+    small.set_cell(atoms.cell.array / 10, scale_atoms=True)
+    space = general(small, False)
+
+    def energy(R, neighbor, **kw):
+        # nanometers and kJ/mol
+        each = lambda d, real, depth: energies(10 * d, real, depth)  # noqa: E731
+        return jnp.sum(over(space, R, neighbor, DEPTH * 96.48533212331002, each, **kw))
+
+    function = mdnum.energy_function(energy, RADIUS / 10, units=("nm", "kJ/mol"), format="dense")
+    one = mdnum.simulation(atoms, function, timestep=0.002, skin=0.2)
+    assert one.r_cut == pytest.approx(RADIUS) and one.program["potential"]["units"] == "nm, kJ/mol"
+    compared(one, atoms)
+    with pytest.raises(mdnum.InputError, match="furlong"):
+        mdnum.energy_function(energy, 1.0, units=("furlong", "eV"))
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_atom_and_no_edges_are_a_simulation(count: int):
+    atoms = Atoms(f"Ar{count}", positions=[[0, 0, 0], [7, 0, 0]][:count], cell=np.eye(3) * 14, pbc=True)
+    one = own(energies)(atoms)
+    found = one.evaluate()
+    assert found.energy == 0 and not found.forces.any()
+
+
+@pytest.mark.jax_md
+def test_a_box_that_needs_several_images_is_refused_with_the_repeats_that_do():
+    atoms = Atoms("Ar", cell=np.diag([5.0, 7.0, 20.0]), pbc=True)
+    with pytest.raises(mdnum.InputError) as caught:
+        own(energies)(atoms)
+    assert "2 x 2 x 1" in caught.value.remedy
+
+
+def test_the_operation_that_makes_a_number_that_is_not_finite_is_named():
+    inner = jax.jit(lambda x: jnp.sqrt(x) * 2)
+    named = first_not_finite(jax.grad(lambda x: inner(x * x)), jnp.zeros(()))
+    assert named.startswith("div") and "test_admission.py" in named
