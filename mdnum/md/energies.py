@@ -239,7 +239,10 @@ def energy_function(
         seen = ", ".join(type(part).__name__ for part in parts)
         raise InputError(f"no energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)")
     start = others[0] if not first and len(others) > 1 else None
-    name = name or getattr(function, "__qualname__", "").split(".")[0].replace("<lambda>", "") or "energy function"
+    if not name:
+        # jax-md's are all called alike, but for what makes them
+        outer, name = getattr(function, "__qualname__", "").split(".")[0], getattr(function, "__name__", "")
+        name = {"<lambda>": "", "fn_mapped": outer, "energy_fn": outer}.get(name, name) or "energy function"
     how = recognized(function, parameters is not None or start is not None, name)
     how = replace(how, images=lists is not None and "MultiImage" in type(lists).__name__)
     if how.parameters and parameters is None and start is None:

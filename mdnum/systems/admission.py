@@ -253,6 +253,10 @@ class Trial:
         if not self.pbc.any():
             self._known("cell" if how.native else "")
             return
+        if not (self.inside < len(self.x)).any():
+            self.notes["UNTRIED"] = {}
+            self._known("cell" if "cell" in how.keywords or how.native else "columns" * ("box" in how.keywords))
+            return
         boxes = ["cell"] if how.native else [box for word, *of in _BOXES if word in how.keywords for box in of]
         found = [(fractional, box) for fractional in (False, True)[: 2 - how.native] for box in (*boxes, "")]
         kept = None
@@ -268,7 +272,7 @@ class Trial:
         if kept is None:
             here, there = (self.there(x)[0] for x in self._moves(self.cell)[-2:])
             raise AdmissionError("ANOTHER_BOX", self.name, here=there, there=here)
-        if not self.call.how.strain and self.call.how.box != "cell":
+        if not self.call.how.strain and not self.call.how.box:
             raise AdmissionError("CELL_IGNORED" if how.native else "NO_STRAIN", self.name)
 
     def _known(self, box: str) -> None:
@@ -317,6 +321,7 @@ class Trial:
         idx = self.within(np.where(own, self.inside, n), self.x, reach)
         none = self.there(idx=np.full_like(idx, n))[0]
         *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
+        none = none if np.isfinite(none) else 0.0
         size = max(abs(here[0] - none), np.abs(here[1]).max() * self.model.r_cut, 1e-13 * abs(here[0]))
         return all(abs(one[0] - here[0]) <= 10 * _SAME[self.double] * size for one in moved)
 
@@ -365,7 +370,7 @@ class Trial:
             self.notes["FIXED_BOX"] = {}
         if not self.double:
             self.notes["SINGLE_INSIDE"] = {}
-        if rounded := single_numbers(self.trace):
+        elif rounded := single_numbers(self.trace):
             self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
 
     def _converted(self, idx) -> tuple[Any, ...]:
@@ -397,18 +402,19 @@ class Trial:
         else:
             raise AdmissionError("FORCES_WRONG", self.name, found=found, force=float(terms.sum()))
         how = self.call.how
-        if how.fractional and not how.strain:
+        if how.real_slope and not how.strain:
             raise AdmissionError("NO_STRAIN", self.name)
         if not how.box or not self.pbc.all():
             return
         strain = rng.standard_normal((3, 3))
         strain = 0.05 * (strain + strain.T)
-        _, (by_x, by_cell, _, by_strain) = self.program(*self._converted(idx))
+        by_x, by_cell, by_box, by_strain = map(np.asarray, self.program(*self._converted(idx))[1])
+        x, cell = (one / self.call.length @ strain for one in (self.x, self.cell))
         if how.strain:
-            stress = np.sum(np.asarray(by_strain) * strain)
+            stress = np.sum(by_strain * strain)
         else:
-            stress = np.sum(np.asarray(by_x) * (self.x / self.call.length @ strain))
-            stress += np.sum(np.asarray(by_cell) * (self.cell / self.call.length @ strain))
+            by_cell = by_cell if how.box == "cell" else by_box if how.box == "rows" else by_box.T
+            stress = np.sum(by_cell * cell) + (0.0 if how.fractional else np.sum(by_x * x))
         step /= self.model.r_cut
 
         def at(h: float) -> float:
@@ -496,7 +502,10 @@ def _single_arithmetic(jaxpr: Any) -> bool:
 
 
 def single_numbers(closed: Any) -> list[str]:
-    """Numbers of a program that were rounded to single precision, as they were most likely written."""
+    """Numbers of a program that were rounded to single precision, as they were most likely written.
+
+    One that was widened again has the value of one in single precision, and no more digits than that needs.
+    """
     held = list(closed.consts)
     for equation in _equations(closed.jaxpr):
         held += [one.val for one in equation.invars if hasattr(one, "val")]
@@ -504,8 +513,11 @@ def single_numbers(closed: Any) -> list[str]:
             held += getattr(inner, "consts", ())
     numbers: dict[str, None] = {}
     for one in held:
-        if getattr(one, "dtype", None) == np.float32 and np.size(one) <= 64:
-            for number in np.ravel(np.asarray(one)):
+        if getattr(one, "dtype", None) in (np.float32, np.float64) and np.size(one) <= 64:
+            for wide in np.ravel(np.asarray(one)):
+                number = np.float32(wide)
+                if number != wide:
+                    continue
                 # halves and whole numbers lose nothing, and what has all digits was computed
                 short = len(str(number).strip("-0.").replace(".", "")) <= _DIGITS
                 if np.isfinite(number) and short and float(str(number)) != float(number):
@@ -521,14 +533,15 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
     def finite(values) -> bool:
         return all(np.isfinite(one).all() for one in map(np.asarray, values) if one.dtype.kind == "f")
 
-    def run(jaxpr: Any, consts: Any, values: Any) -> list[Any]:
+    def run(jaxpr: Any, consts: Any, values: Any, outer: str = "place unknown") -> list[Any]:
         known: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *values], strict=True))
         for equation in jaxpr.eqns:
+            place = _line(equation) or outer
             ins = [one.val if hasattr(one, "val") else known[one] for one in equation.invars]
             inner = next((equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params), None)
             whole = hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(ins)
             if inner is not None and whole and equation.primitive.name not in ("scan", "while"):
-                outs = run(inner.jaxpr, inner.consts, ins)
+                outs = run(inner.jaxpr, inner.consts, ins, place)
             else:
                 params = equation.primitive.get_bind_params(equation.params)
                 # earlier versions return functions among the arguments, too
@@ -536,7 +549,7 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
                 outs = equation.primitive.bind(*more, *ins, **params)
                 outs = outs if equation.primitive.multiple_results else [outs]
             if not found and finite(ins) and not finite(outs):
-                found.append(f"{equation.primitive.name} ({_line(equation)})")
+                found.append(f"{equation.primitive.name} ({place})")
             known |= dict(zip(equation.outvars, outs, strict=True))
         return [one.val if hasattr(one, "val") else known[one] for one in jaxpr.outvars]
 
@@ -549,5 +562,5 @@ def _line(equation: Any) -> str:
     frames = getattr(equation.source_info.traceback, "frames", ())
     place = next((one for one in frames if "/jax/" not in one.file_name and "equinox" not in one.file_name), None)
     if place is None:
-        return "place unknown"
+        return ""
     return f"{place.file_name.rpartition('/')[2]}:{place.line_num} {place.function_name}"

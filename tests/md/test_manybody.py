@@ -17,8 +17,9 @@ from ase.build import bulk
 from ase.neighborlist import neighbor_list
 from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_weber, tersoff
 
+import mdnum
 from mdnum.errors import InputError
-from mdnum.md import jaxmd, manybody, tetrahedral
+from mdnum.md import jaxmd, tetrahedral
 from mdnum.md.embedded_atom import embedded_atom as made_eam
 from mdnum.md.embedded_atom import read_setfl
 
@@ -274,20 +275,6 @@ def test_the_1989_constants_differ_from_those_of_1988():
     assert newer.lambda3 == 0.0 and older.lambda3 > 0 and newer.sources != older.sources
 
 
-def argon_of_jax_md(displacement):
-    """Argon off its lattice, and jax-md's energy function of it."""
-    from jax_md import energy as jax_md_energy
-
-    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
-    atoms.rattle(0.2, seed=5)
-    given = {"sigma": 3.405, "epsilon": 0.0103, "r_onset": 5.0 / 3.405, "r_cutoff": 6.5 / 3.405}
-    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
-        displacement, 1.0, neighbor_list_fn=lambda *_, **__: None,
-        **{name: jaxmd.scalar(value) for name, value in given.items()},
-    )  # fmt: skip
-    return atoms, energy_fn
-
-
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
     "format",
@@ -295,30 +282,26 @@ def argon_of_jax_md(displacement):
 )
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones
+    from jax_md import energy as jax_md_energy
 
     bent = 3 * 5.26 * np.array([[1, 0, 0], [0.1, 1, 0], [0.05, -0.1, 1]])
-    atoms, energy_fn = argon_of_jax_md(jaxmd.displacement(jnp.asarray(bent)))
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
+    atoms.rattle(0.2, seed=5)
     atoms.set_cell(bent, scale_atoms=True)
-    potential = manybody.from_jax_md(energy_fn, 6.5, format)
+    given = {"sigma": 3.405, "epsilon": 0.0103, "r_onset": 5.0 / 3.405, "r_cutoff": 6.5 / 3.405}
+    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
+        jaxmd.displacement(jnp.asarray(bent)), 1.0, neighbor_list_fn=lambda *_, **__: None,
+        **{name: jaxmd.scalar(value) for name, value in given.items()},
+    )  # fmt: skip
+    function = mdnum.energy_function(energy_fn, 6.5, format=format)
+    simulation = mdnum.simulation(atoms, function, timestep=0.002, skin=0.3)
+    potential = simulation.model
+    assert potential.call.how.box == "cell" and potential.smoothness.order == 1 and not potential.notes
     energy, forces, stress = evaluate(potential, atoms)
     atoms.calc = LennardJones(sigma=3.405, epsilon=0.0103, rc=6.5, ro=5.0, smooth=True)
     assert abs(energy - atoms.get_potential_energy()) <= 1e-13 * abs(energy)
     np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
-    assert math.isnan(potential.smoothness.energy_jump)
-    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions, format)
-    potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
-
-
-@pytest.mark.jax_md
-def test_an_energy_function_that_ignores_the_cell_is_found_out():
-    from jax_md import space
-
-    atoms, energy_fn = argon_of_jax_md(space.periodic(jaxmd.scalar(3 * 5.26))[0])
-    potential = manybody.from_jax_md(energy_fn, 6.5, "dense", name="boxed")
-    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions)
-    with pytest.raises(InputError, match=r"boxed: .* ignores the cell"):
-        potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
 
 
 def test_setfl_keeps_every_digit(tmp_path):
