@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Float, UInt8
 
 from mdnum.errors import InputError
-from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
+from mdnum.gradients.crossings import Crossings, crossings, of_energy, onto_crossings
 from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
@@ -314,7 +314,8 @@ def reverse(
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential with its flips, or an integrator that is no linear `KickDrift`.
+        InputError: a many-body potential that decides by itself with its flips, or an integrator that is no
+            linear `KickDrift`.
 
     Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
     """
@@ -343,9 +344,9 @@ class StretchReversal:
         simulation = tape.simulation
         force = simulation.force
         check_kick(simulation.integrator)
-        if guard is not None and not isinstance(force, PairForce):
+        if guard is not None and not simulation.imposable:
             raise InputError(
-                "what flips add is known for pair potentials only",
+                "what flips add is known for pair potentials, and for energies that the list decides",
                 remedy="Use the method symmetric for a many-body potential",
                 where=simulation.name,
             )
@@ -490,8 +491,12 @@ def transposed(
             share = pace.share(number, integrator.timestep)
             here = (x, arriving, jnp.asarray(force.cell.matrix))
             sums = (share * after.frame[0], share * after.frame[1])
+            pull = None
+            if isinstance(force, ManyBodyForce):
+                onto = (after.v + half * after.x) / mass_row
+                pull = of_energy(force, tables, told, met, span[1], x, (onto, *sums))
             push, weights, by_radius, by_scale = onto_crossings(
-                met, after.x, after.v, here, sums, masses, integrator.timestep, carry.r_cut.shape[0]
+                met, after.x, after.v, here, sums, masses, integrator.timestep, carry.r_cut.shape[0], pull
             )
             after = after._replace(
                 x=after.x + push,

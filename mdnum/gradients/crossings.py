@@ -15,14 +15,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
+from mdnum.md.decide import Tables
 from mdnum.md.ledger import FlipTable
+from mdnum.md.pairforce import ManyBodyForce
 from mdnum.systems.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -147,6 +150,7 @@ def onto_crossings(
     masses: Float[Array, "atoms"],
     timestep: Float[Array, ""],
     types: int,
+    pull: Float[Array, "most"] | None = None,
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, ""]]:
     """The transpose of the saltation of one step's crossings.
 
@@ -159,6 +163,7 @@ def onto_crossings(
         here: these wrapped positions and velocities themselves, and the lattice vectors.
         onto_sums: cotangents of potential energy and virial per time, as frames at equal times see them.
         timestep: internal time. types: number of pair types.
+        pull: cotangent of each distance, where a crossing does not act along its pair alone.
 
     Returns:
         what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
@@ -167,9 +172,10 @@ def onto_crossings(
     dtype = onto_x.dtype
     half = (0.5 * timestep).astype(dtype)
     x, v, matrix = here
-    pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
-    onto_potential, onto_virial = onto_sums
-    pull = pull + (onto_potential * met.potential + onto_virial * met.virial).astype(dtype)
+    if pull is None:
+        pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
+        onto_potential, onto_virial = onto_sums
+        pull = pull + (onto_potential * met.potential + onto_virial * met.virial).astype(dtype)
     applied = jnp.where(met.kind >= 0, pull, 0)
     along = applied * met.normal.astype(dtype)
     push = jnp.zeros_like(onto_x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
@@ -177,6 +183,51 @@ def onto_crossings(
     by_radius = jnp.zeros(types, jnp.float64).at[kind].add(-applied.astype(jnp.float64))
     by_scale = jnp.sum(applied * _along(met, x - half * v, matrix)).astype(jnp.float64)
     return push, -pull.astype(jnp.float64), by_radius, by_scale
+
+
+def of_energy(
+    force: ManyBodyForce,
+    tables: Tables,
+    bits: UInt8[Array, "words atoms"],
+    met: Met,
+    count: Int[Array, ""],
+    x: Float[Array, "3 atoms"],
+    onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, "most"]:
+    """The cotangents of the distances at which an energy gets or loses a pair: E(with) - E(without).
+
+    Not the pair alone, but all whose energy it is part of feel it. The pair is put at its cutoff; the others
+    of the same step are as they are at its end.
+
+    Args:
+        met: whose `push` is one over the radial speed, negative where the pair leaves.
+        count: of its crossings.
+        x: this step's wrapped positions.
+        onto: cotangents of the velocities, over the masses, and of potential energy and virial.
+    """
+    w, potential, virial = onto
+    index, atom = tables.index, jnp.arange(x.shape[1])
+    slots = jnp.arange(8, dtype=jnp.uint8)[None, :, None]
+    matrix, unit = force.cell.matrix.astype(force.dtype), jnp.eye(3, dtype=force.dtype)
+    short = 0.5 * (force.potential.r_cut - _along(met, x, jnp.asarray(force.cell.matrix)))
+
+    def one(k, found):
+        i, j, normal = met.i[k], met.j[k], met.normal[:, k] * short[k]
+        pair = ((index == j) & (atom == i)) | ((index == i) & (atom == j))
+        pair = jnp.sum(pair.astype(jnp.uint8) << slots, axis=1, dtype=jnp.uint8)
+        at = x.at[:, j].add(normal.astype(x.dtype)).at[:, i].add(-normal.astype(x.dtype))
+        ends = [
+            force.energy_of(tables, force.neighbors(at, tables, held)) for held in (bits | pair, bits & ~pair)
+        ]
+
+        def change(x, scale):
+            return ends[0](x, matrix, scale * unit) - ends[1](x, matrix, scale * unit)
+
+        here = at.T.astype(force.dtype), jnp.ones((), force.dtype)
+        jump, slope = jax.jvp(change, here, (w.T.astype(force.dtype), virial.astype(force.dtype)))
+        return found.at[k].set(met.push[k] * (potential * jump - slope))
+
+    return lax.fori_loop(0, count, one, jnp.zeros_like(met.push)).astype(x.dtype)
 
 
 def _along(
@@ -266,5 +317,8 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     safe = np.where(speed == 0, np.inf, speed)
     force, kind = ledger.force_jump, np.asarray(simulation.type_of(low, high), np.int64)
     energy, virial = ledger.energy_jump, force * np.asarray(simulation.decider.r_cut)[kind]
+    if not simulation.pairwise:
+        # what it does is found where it is transposed (`of_energy`)
+        force, energy, virial = np.where(ledger.entered, 1.0, -1.0), 0 * safe, 0 * safe
     unknown = np.full(len(row), np.nan)
     return Crossings(ledger, row, i, j, normal, safe, force, energy, virial, kind, images, grazing, unknown)

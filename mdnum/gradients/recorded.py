@@ -147,7 +147,12 @@ class EventAware(Method):
     description = "the derivative of the steps plus what moving the time of every flip does"
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
-        return pairs_only(problem.simulation)
+        simulation = problem.simulation
+        if simulation.pairwise:
+            return pairs_only(simulation)
+        if not simulation.imposable:
+            return "it is for pair potentials, and for energies that take a listed pair wherever it is"
+        return without_kick(simulation.integrator)
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         made = passed(problem, names, guard=self.guard, budget=self.budget, progress=progress)
