@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.errors import NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import FORCE, MODEL, SCALE, WEIGHT, AdjointCarry, reverse
 from mdnum.gradients.crossings import Crossings
@@ -31,6 +32,7 @@ from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
 from mdnum.md.fixed_point import forgotten_bits
 from mdnum.md.integrators import without_kick
+from mdnum.systems.admission import second_derivative
 from mdnum.systems.schema import ONSET_FRACTION
 from mdnum.systems.simulation import Simulation
 
@@ -80,7 +82,8 @@ def passed(
             graze, all of them: that is the program of event-aware, which need not be compiled twice.
 
     Raises:
-        InputError: saltation without a pair potential. NumericalError: the run blew up.
+        InputError: saltation without a pair potential. NumericalError: the run blew up, or second
+            derivatives of an energy function are not finite.
     """
 
     def watch(stretch: TapeStretch, trace: AdjointCarry) -> None:
@@ -95,6 +98,13 @@ def passed(
         progress=in_phase(progress, "reverse pass"), watch=watch,
     )  # fmt: skip
     gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
+    lost = not all(np.isfinite(one).all() for one in gradient.values())
+    if lost and not problem.simulation.pairwise and (operation := second_derivative(problem.simulation)):
+        raise NumericalError(
+            f"second derivatives of the energy function are not finite; the first operation is {operation}",
+            where=problem.simulation.model.name,
+            remedy="Mask the argument of that operation, not only its result",
+        )
     return ReversePass(tape, parts, gradient, crossings if saltation else [], speed)
 
 

@@ -44,7 +44,9 @@ class Convention:
     keyword: str = ""  # by which the list is given; empty where it follows the positions
     keywords: tuple[str, ...] = ()  # those of KEYWORDS that it takes
     images: bool = False  # the list has an integer shift for each entry
-    box: str = ""  # how it follows the box: "cell" (rows), "columns" or "rows" of box=; empty where it keeps its own
+    box: str = (
+        ""  # how it follows the box: "cell" (rows), "columns" or "rows" of box=; empty where it keeps its own
+    )
     strain: bool = False  # whether perturbation= strains what it sees
     fractional: bool = False  # positions are fractional coordinates
     # whether derivatives by fractional coordinates are those by real ones, as jax-md's spaces define them
@@ -107,7 +109,7 @@ class Call:
             if strain is not None:
                 x, cell = x @ strain, cell @ strain
         else:
-            # the function's derivative by its box may not be one at fixed positions; by the perturbation it is
+            # jax-md's derivative by a box is none at fixed positions; that by a perturbation is
             held = lax.stop_gradient(cell)
             missing = jnp.all(held == 0, axis=1)[:, None]
             whole = jnp.where(missing, jnp.eye(3, dtype=held.dtype), held)
@@ -139,7 +141,7 @@ def _real_slope_jvp(primals, tangents):
 def with_images(
     neighbor: Any, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
 ) -> Any:
-    """A list whose entries have the integer shifts of their nearest images, as `custom_partition` makes it."""
+    """A list with the integer shifts of nearest images, as `jax_md.custom_partition` makes it."""
     n, dense = x.shape[0], neighbor.format.name == "Dense"
     here, other = (jnp.arange(n)[:, None], neighbor.idx) if dense else neighbor.idx
     d = x[jnp.where(other < n, other, 0)] - x[jnp.where(here < n, here, 0)]
@@ -210,8 +212,8 @@ def energy_function(
     (box in rows or columns, real or fractional positions) is found by trial calls when a simulation is made.
 
     Example:
-        >>> shape = jax_md.energy.lennard_jones_neighbor_list(displacement, box, r_cutoff=mdnum.md.jaxmd.scalar(2.5))
-        >>> mdnum.simulation(atoms, mdnum.energy_function(shape, 2.5), units="lj", timestep=0.002)
+        >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)
+        >>> mdnum.simulation(atoms, mdnum.energy_function(made, 2.5), units="lj", timestep=0.002)
 
     Args:
         given: the energy function, or a tuple of it and its neighbor functions (and, between them, a function
@@ -237,7 +239,9 @@ def energy_function(
     others = [part for part in parts if part is not lists]
     if not others or not callable(function := others[0 if first else -1]):
         seen = ", ".join(type(part).__name__ for part in parts)
-        raise InputError(f"no energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)")
+        raise InputError(
+            f"no energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)"
+        )
     start = others[0] if not first and len(others) > 1 else None
     if not name:
         # jax-md's are all called alike, but for what makes them
@@ -250,9 +254,10 @@ def energy_function(
     length, energy = _scales(units, name)
     tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
     made = Call(function, how, length, energy, name)
+    unit = (units,) if isinstance(units, str) and units else tuple(units)
     return EnergyFunction(
-        tree, made, float(r_cut) * length, format=format or "", name=name, species=tuple(species), start=start,
-        lists=lists, unit=(units,) if isinstance(units, str) and units else tuple(units), compare=compare,
+        tree, made, float(r_cut) * length, format=format or "", name=name, species=tuple(species),
+        start=start, lists=lists, unit=unit, compare=compare,
     )  # fmt: skip
 
 
@@ -272,8 +277,8 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
             f"{name} takes a graph and no neighbor list: no list can be given to it as it is",
-            remedy="Wrap it: def energy(parameters, R, neighbor, cell), which makes the graph of neighbor.idx "
-            "and mdnum.md.jaxmd.displacement(cell)",
+            remedy="Wrap it: def energy(parameters, R, neighbor, cell), which makes the graph of "
+            "neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )
     open_ended = any(one.kind == kinds.VAR_KEYWORD for one in given)
     allowed = {one.name for one in given}

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from mdnum.errors import InputError
 from mdnum.md.jaxmd import Format, NeighborList
 
 
@@ -82,7 +80,7 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """The energy of positions and lattice vectors that are multiplied, as rows, by a deformation near 1."""
+        """The energy of positions and lattice vectors, as rows, times a deformation near 1."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(

@@ -395,8 +395,8 @@ class ManyBodyForce(eqx.Module):
     """Forces of an energy function over a jax-md neighbor list, by automatic differentiation."""
 
     potential: Any  # energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`
-    # cell, zero, thresholds, decider, policy: as in PairForce. The energy is evaluated in the force's dtype, but
-    # for numbers that its function holds
+    # cell, zero, thresholds, decider, policy: as in PairForce. The energy is evaluated in the force's dtype,
+    # but for numbers that its function holds
     cell: Cell
     zero: Int[Array, ""]
     thresholds: Float[Array, "types"]
@@ -455,7 +455,10 @@ class ManyBodyForce(eqx.Module):
         x, own = positions.T.astype(self.dtype), self.potential
         if own.labeled:
             names = jnp.append(tables.order, atoms).astype(jnp.int32)
-            x, acted_on = self.placed(x, tables), jnp.zeros_like(names[acted_on]).at[tables.order].set(names[acted_on])
+            x, acted_on = (
+                self.placed(x, tables),
+                jnp.zeros_like(names[acted_on]).at[tables.order].set(names[acted_on]),
+            )
         return jaxmd.as_neighbor_list(acted_on, x, own.format, own.self_edges)
 
     @property
@@ -465,7 +468,7 @@ class ManyBodyForce(eqx.Module):
 
     def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
         """Sorted positions in the order in which the energy function knows its atoms."""
-        # the table is in sorted order and so is everything that an energy sees which takes all atoms for alike
+        # an energy that takes all atoms for alike sees the table's sorted order
         return jnp.zeros_like(x).at[tables.order].set(x) if self.potential.labeled else x
 
     def energy_of(

@@ -14,8 +14,8 @@ from ase.calculators.calculator import Calculator
 from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from numpy import ndarray
 
-from mdnum.md.jaxmd import as_neighbor_list
 from mdnum.md.energies import EnergyFunction
+from mdnum.md.jaxmd import as_neighbor_list
 from mdnum.references.independent import ClassicalCalculator, PairForm, edges_of
 
 

@@ -1,4 +1,4 @@
-"""What an energy function is, found by calling it before a simulation is made of it, and what is wrong with it.
+"""What an energy function is, and what is wrong with it, found by calling it before it is simulated.
 
 A signature does not say whether positions are fractional, whether lattice vectors are rows or columns, or
 whether the box that is given counts at all. A wrong guess gives energies that look right. So the function is
@@ -255,9 +255,13 @@ class Trial:
             return
         if not (self.inside < len(self.x)).any():
             self.notes["UNTRIED"] = {}
-            self._known("cell" if "cell" in how.keywords or how.native else "columns" * ("box" in how.keywords))
+            self._known(
+                "cell" if "cell" in how.keywords or how.native else "columns" * ("box" in how.keywords)
+            )
             return
-        boxes = ["cell"] if how.native else [box for word, *of in _BOXES if word in how.keywords for box in of]
+        boxes = (
+            ["cell"] if how.native else [box for word, *of in _BOXES if word in how.keywords for box in of]
+        )
         found = [(fractional, box) for fractional in (False, True)[: 2 - how.native] for box in (*boxes, "")]
         kept = None
         for fractional, box in found:
@@ -291,7 +295,9 @@ class Trial:
         n = len(self.x)
         # the same with neighbors, some of them twice, where there is padding
         first = np.where(self.inside[:, :1] < n, self.inside[:, :1], (np.arange(n) == 0)[:, None])
-        padded = all(np.isfinite(one).all() for one in self.there(idx=np.where(self.inside < n, self.inside, first)))
+        padded = all(
+            np.isfinite(one).all() for one in self.there(idx=np.where(self.inside < n, self.inside, first))
+        )
         operation = first_not_finite(jax.grad(self.bare, 1), *self._converted(self.inside))
         raise AdmissionError("NAN_BY_PADDING" if padded else "NOT_FINITE", self.name, operation=operation)
 
@@ -328,7 +334,9 @@ class Trial:
     def _follows(self) -> bool:
         """Whether a box that is slightly sheared counts, and counts as what it is."""
         cell, n = self.cell + self.cell @ _SHEAR, len(self.x)
-        near = self.within(self.idx, self.x, 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(cell), axis=0))))
+        near = self.within(
+            self.idx, self.x, 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(cell), axis=0)))
+        )
         # pairs that no face of the box is between are where they were
         straight = self.x[:, None] - self.x[np.minimum(near, n - 1)]
         apart = np.linalg.norm(straight, axis=-1)
@@ -362,7 +370,9 @@ class Trial:
             self.notes["TRUSTS_LIST"] = {"inside": energy, "skin": skin}
         none = self.there(idx=np.full_like(self.inside, n))
         if not all(np.isfinite(one).all() for one in none):
-            operation = first_not_finite(jax.grad(self.bare, 1), *self._converted(np.full_like(self.inside, n)))
+            operation = first_not_finite(
+                jax.grad(self.bare, 1), *self._converted(np.full_like(self.inside, n))
+            )
             self.notes["NO_EDGES_NAN"] = {"operation": operation}
         if not np.isfinite(self.there(code=1)[0]):
             self.notes["NAN_ON_OVERFLOW"] = {}
@@ -423,45 +433,53 @@ class Trial:
 
         found, size = slope(at), self.scale * self.call.unit
         if abs(found - stress * self.call.unit) > allowed * size + 10 * noise * self.model.r_cut:
-            raise AdmissionError("STRESS_WRONG", self.name, found=found, stress=float(stress * self.call.unit))
+            raise AdmissionError(
+                "STRESS_WRONG", self.name, found=found, stress=float(stress * self.call.unit)
+            )
 
     def at_the_cutoff(self) -> EnergyFunction:
         """The function with what a crossing of its cutoff does, of the pairs that are nearest to it."""
-        n, r_cut = len(self.x), self.model.r_cut
+        n, r_cut, size = len(self.x), self.model.r_cut, self.scale * self.call.unit
         r = np.where(self.idx < n, self.distances(self.idx, self.x), np.inf)
-        rows, slots = np.unravel_index(np.argsort(np.abs(r - r_cut), axis=None)[:6], r.shape)
-        jumps, pushes, acts = [0.0], [0.0], []
-        for i, slot in zip(rows.tolist(), slots.tolist(), strict=True):
+        box = Cell.create(self.cell, tuple(self.pbc.tolist()))
+        found, acts = [], []
+        for place in np.argsort(np.abs(r - r_cut), axis=None)[:6].tolist():
+            i, slot = divmod(place, r.shape[1])
             j = int(self.idx[i, slot])
             if not i < j < n or abs(r[i, slot] - r_cut) > 0.2 * r_cut:
                 continue
-            box = Cell.create(self.cell, tuple(self.pbc.tolist()))
             toward = np.stack(displacement(box, self.x[i], self.x[j])) / r[i, slot]
-            change = []
-            for factor in (1 - 1e-7, 1 + 1e-3):
+            ends = []
+            # what is continuous is a hundredth of itself, or less, at the second distance
+            for factor in (1 - 1e-5, 1 - 1e-7, 1 + 1e-3):
                 x = self.x.copy()
                 x[j] += toward * (r_cut * factor - r[i, slot])
                 listed = self.within(self.idx, x, r_cut)
                 pair = np.zeros_like(listed, bool)
                 pair[i], pair[j] = self.idx[i] == j, self.idx[j] == i
-                ends = [self.there(x, np.where(pair, held, listed).astype(np.int32)) for held in (self.idx, n)]
-                change.append((ends[0][0] - ends[1][0], np.abs(ends[0][1] - ends[1][1]).max()))
-            (jump, push), (beyond, _) = change
-            jumps.append(jump)
-            pushes.append(float(push))
-            if not self.same(1e3 * jump, 0.0):
-                acts.append(abs(beyond - jump) <= 0.1 * abs(jump))
-        if len(jumps) == 1:
+                (ahead, f), (behind, g) = (
+                    self.there(x, np.where(pair, held, listed).astype(np.int32)) for held in (self.idx, n)
+                )
+                ends.append((ahead - behind, float(np.abs(f - g).max())))
+            wide, near, beyond = ends
+            real = [
+                abs(b) > 0.3 * abs(a) and abs(b) * unit > 1e-12 * size
+                for a, b, unit in zip(wide, near, (1, r_cut), strict=True)
+            ]
+            found.append([one if is_real else 0.0 for one, is_real in zip(near, real, strict=True)])
+            if any(real):
+                k = real.index(True)
+                acts.append(abs(beyond[k] - near[k]) <= 0.1 * abs(near[k]))
+        if not found:
             return self.model
+        jumps, pushes = zip(*found, strict=True)
         jump, push = max(jumps, key=abs), max(pushes)
-        order = -1.0 if acts else 0.0 if push > 1e-5 * self.scale * self.call.unit / r_cut else 1.0
+        order = -1.0 if jump else 0.0 if push else 1.0
         if order == -1:
             self.notes["ENERGY_JUMPS"] = {"jump": jump, "push": push}
             # the jump of every crossing where all are alike; of others it is not known before
-            alike = len(self.symbols) == 1 and all(abs(one - jump) <= 1e-6 * abs(jump) for one in jumps[1:])
-            jump, push = (jump, push) if alike else (float("nan"), float("nan"))
-        else:
-            jump, push = 0.0, push if order == 0 else 0.0
+            if len(self.symbols) > 1 or any(abs(one - jump) > 1e-6 * abs(jump) for one in jumps):
+                jump = push = float("nan")
         trusts = all(acts) if acts else self.model.trusts_list
         if acts and not trusts:
             self.notes.pop("TRUSTS_LIST", None)
@@ -471,6 +489,24 @@ class Trial:
 
 #: What a keyword may hold, in the order in which it is tried.
 _BOXES = (("cell", "cell"), ("box", "columns", "rows"))
+
+
+def second_derivative(simulation: Simulation) -> str:
+    """The first operation that makes second derivatives of an energy function not finite; empty for none."""
+    if not isinstance(simulation.model, EnergyFunction):
+        return ""
+    with jaxmd.standard_promotion():
+        trial = Trial(simulation)
+        arguments = trial._converted(trial.inside)
+
+        def along(parameters, x, *rest):
+            return jax.jvp(
+                lambda x: jax.grad(trial.bare, 1)(parameters, x, *rest), (x,), (jnp.ones_like(x),)
+            )[1]
+
+        if np.isfinite(np.asarray(jax.jit(along)(*arguments))).all():
+            return ""
+        return first_not_finite(along, *arguments)
 
 
 # --- reading a program --------------------------------------------------------------------------------
@@ -538,7 +574,9 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
         for equation in jaxpr.eqns:
             place = _line(equation) or outer
             ins = [one.val if hasattr(one, "val") else known[one] for one in equation.invars]
-            inner = next((equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params), None)
+            inner = next(
+                (equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params), None
+            )
             whole = hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(ins)
             if inner is not None and whole and equation.primitive.name not in ("scan", "while"):
                 outs = run(inner.jaxpr, inner.consts, ins, place)
@@ -560,7 +598,9 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
 def _line(equation: Any) -> str:
     """File, line and function in which an operation was written."""
     frames = getattr(equation.source_info.traceback, "frames", ())
-    place = next((one for one in frames if "/jax/" not in one.file_name and "equinox" not in one.file_name), None)
+    place = next(
+        (one for one in frames if "/jax/" not in one.file_name and "equinox" not in one.file_name), None
+    )
     if place is None:
         return ""
     return f"{place.file_name.rpartition('/')[2]}:{place.line_num} {place.function_name}"

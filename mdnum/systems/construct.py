@@ -15,9 +15,9 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
+from mdnum.md.energies import EnergyFunction
 from mdnum.md.fixed_point import FixedPointDecider, FixedPointUnits
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.energies import EnergyFunction
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
 from mdnum.md.potentials import Channels, CutPotential, PairFunction, PairPotential, each_term, pair_type

@@ -132,13 +132,13 @@ def _interactions(simulation: Simulation) -> dict[str, Any]:
     if not simulation.pairwise:
         known = {"kind": model.name, **_leaves(model)}
         if isinstance(model, EnergyFunction):
-            how = model.call.how
+            how, notes = model.call.how, {code: json.loads(values) for code, values in model.notes or ()}
             known |= {
-                "convention": how.label, "list": model.format, "units": ", ".join(model.unit) or "the simulation's",
+                "convention": how.label, "list": model.format,
+                "units": ", ".join(model.unit) or "the system's",
                 "coordinates": "fractional" if how.fractional else "real", "box": how.box or "its own",
                 "imposable": model.trusts_list, "order": "of the structure" if model.labeled else "any",
-                **({"notes": {code: json.loads(values) for code, values in model.notes}} if model.notes else {}),
-                **_code(model.call.function),
+                **({"notes": notes} if notes else {}), **_code(model.call.function),
             }  # fmt: skip
         return {"potential": known}
     tables = {name: _pair_tables(simulation, term) for name, term in model.terms.items()}

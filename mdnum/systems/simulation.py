@@ -329,8 +329,8 @@ class Simulation:
         """The same system with other pair terms or a many-body potential, and decisions at their radii.
 
         Raises:
-            InputError: the longest radius and the skin do not fit the box, or a many-body potential is neither
-                in float64 nor in float32.
+            InputError: the longest radius and the skin do not fit the box, or a many-body potential is in
+                neither float64 nor float32.
         """
         radii = tuple(np.atleast_1d(np.asarray(model.r_cut, np.float64)).tolist())
         check_radius(self.cell, max(radii), self.rule.skin)
@@ -382,7 +382,8 @@ class Simulation:
         check_radius(cell, self.r_cut, 0.0)
         if not self.pairwise and getattr(self.model, "fixed_box", False):
             message = f"{self.model.name} keeps the box that it was made with"
-            raise InputError(message, where=self.name, remedy="Let it take box= (jax_md.space.periodic_general)")
+            remedy = "Let it take box= (jax_md.space.periodic_general)"
+            raise InputError(message, where=self.name, remedy=remedy)
         cell = cell if self.fixed_point is None else self.fixed_point.cell(cell)
         return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
 

@@ -22,8 +22,8 @@ from mdnum.gradients.problem import Problem
 from mdnum.gradients.recorded import EventAware, Forward, Symmetric
 from mdnum.gradients.tape import KEPT, RunTape
 from mdnum.gradients.unrolled import Unrolled, departure, marks
-from mdnum.md.jaxmd import neighbor_vectors
 from mdnum.md.energies import EnergyFunction
+from mdnum.md.jaxmd import neighbor_vectors
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 

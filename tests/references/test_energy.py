@@ -18,8 +18,8 @@ from ase.build import bulk
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 import mdnum
-from mdnum.md.jaxmd import displacement
 from mdnum.md.energies import EnergyFunction
+from mdnum.md.jaxmd import displacement
 from mdnum.md.pairforce import ManyBodyForce
 from mdnum.plain import plain
 from mdnum.references import energy_check

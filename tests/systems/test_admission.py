@@ -16,9 +16,12 @@ from ase.build import bulk
 from ase.geometry import get_distances
 
 import mdnum
+from mdnum.forks import choices, fork
+from mdnum.gradients.losses import FinalProjection
 from mdnum.md import jaxmd
 from mdnum.md.jaxmd import displacement as own_displacement
 from mdnum.systems.admission import AdmissionError, first_not_finite
+from mdnum.systems.evaluate import Evaluator
 
 RADIUS, DEPTH = 4.4, 0.3
 SHEAR = np.array([[1, 0, 0], [0.11, 1, 0], [-0.07, 0.09, 1]])
@@ -83,7 +86,9 @@ def parameters_first(atoms: Atoms):
     def energy(params, R, neighbor, **kw):
         return jnp.sum(over(space, R, neighbor, params["depths"][0], **kw))
 
-    lists = SimpleNamespace(allocate=lambda R: jaxmd.as_neighbor_list(np.full((len(R), 1), len(R)), R, "sparse"))
+    lists = SimpleNamespace(
+        allocate=lambda R: jaxmd.as_neighbor_list(np.full((len(R), 1), len(R)), R, "sparse")
+    )
     return lists, lambda key, R, neighbor: {"depths": [jnp.asarray(DEPTH)]}, energy
 
 
@@ -318,7 +323,9 @@ def test_a_defect_closes_the_door(name: str):
 
 def overflowing(atoms: Atoms):
     energy = classical(atoms)
-    return lambda R, neighbor, **kw: jnp.where(neighbor.did_buffer_overflow, jnp.nan, energy(R, neighbor, **kw))
+    return lambda R, neighbor, **kw: jnp.where(
+        neighbor.did_buffer_overflow, jnp.nan, energy(R, neighbor, **kw)
+    )
 
 
 NOTES = {
@@ -410,3 +417,88 @@ def test_the_operation_that_makes_a_number_that_is_not_finite_is_named():
     inner = jax.jit(lambda x: jnp.sqrt(x) * 2)
     named = first_not_finite(jax.grad(lambda x: inner(x * x)), jnp.zeros(()))
     assert named.startswith("div") and "test_admission.py" in named
+
+
+@pytest.mark.jax_md
+def test_second_derivatives_that_are_not_finite_are_named_where_a_gradient_needs_them():
+    @jax.custom_jvp
+    def power(t):
+        return t**1.5
+
+    # at the distance 0 of padding a first derivative of 0, and a second one of infinity
+    power.defjvp(lambda primals, tangents: (power(*primals), 1.5 * jnp.sqrt(primals[0]) * tangents[0]))
+
+    def steep(d, real, depth):
+        r2 = jnp.sum(d**2, axis=-1) / RADIUS**2
+        return depth * jnp.where(real & (r2 < 1), (1 - r2) ** 2 * power(r2), 0.0)
+
+    one = own(steep)(argon())
+    assert not one.model.notes and np.isfinite(one.evaluate().forces).all()
+    problem = mdnum.Problem(one, FinalProjection(), 2)
+    with pytest.raises(mdnum.NumericalError) as caught:
+        mdnum.value_and_grad(problem, ["initial.positions"], "symmetric")({})
+    assert "second" in caught.value.message and "test_admission.py" in caught.value.message
+
+
+@pytest.mark.jax_md
+def test_a_decision_that_is_imposed_has_the_energy_without_the_pair():
+    atoms = argon()
+    one = own(on_trust)(atoms)
+    evaluator = Evaluator(one)
+    _, _, table, tables, x = evaluator._sorted(None, None)
+    bits = one.force.decide(x, tables).bits
+    i, j = table.decided(np.asarray(bits))
+    atom, other = table.place[i[0]], table.place[j[0]]
+    index = np.asarray(tables.index)
+    pair = np.zeros(index.shape, bool)
+    pair[:, :, atom], pair[:, :, other] = index[:, :, atom] == other, index[:, :, other] == atom
+    mask = np.packbits(pair, axis=1, bitorder="little")[:, 0]
+    assert mask.sum(dtype=int) > 0
+    base, without = (
+        one.force(x, tables, decisions=True, given=given, where=where)
+        for given, where in ((None, None), (jnp.zeros_like(bits), jnp.asarray(mask)))
+    )
+    distance = atoms.get_distance(int(i[0]), int(j[0]), mic=True)
+    lost = DEPTH * (1.2 - (distance / RADIUS) ** 2)
+    assert float(base.energy.sum() - without.energy.sum()) == pytest.approx(lost, rel=1e-12)
+    whole = one.force(x, tables, decisions=True, given=bits & ~jnp.asarray(mask))
+    np.testing.assert_array_equal(whole.force, without.force)
+    # what it would have decided itself is returned all the same
+    np.testing.assert_array_equal(whole.decisions.bits, bits)
+
+
+@pytest.mark.jax_md
+def test_single_precision_has_its_own_numbers_and_bounds():
+    atoms = argon()
+    one = own(energies)(atoms)
+    narrow = one.with_policy(mdnum.PrecisionPolicy(*["float32"] * 4))
+    energy, forces, stress = by_hand(atoms)
+    found = narrow.evaluate()
+    assert 1e-9 < abs(found.energy - energy) / energy < 1e-5
+    np.testing.assert_allclose(found.forces, forces, rtol=0, atol=3e-6 * np.abs(forces).max())
+    np.testing.assert_allclose(found.stress, stress, rtol=0, atol=1e-5 * np.abs(stress).max())
+    assert narrow.decider.bounds[0] > 1e7 * one.decider.bounds[0]
+    with pytest.raises(mdnum.InputError, match="float32"):
+        one.with_policy(mdnum.PrecisionPolicy(force="bfloat16"))
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize(("compare", "pairs"), [("r <", 0), ("r2 <=", 1)])
+def test_what_inside_means_is_an_option(compare: str, pairs: int):
+    atoms = Atoms("Ar2", positions=[[0, 0, 0], [RADIUS, 0, 0]], cell=np.eye(3) * 14, pbc=True)
+    function = mdnum.energy_function(
+        partial(native, each=energies), RADIUS, compare=compare, parameters=DEPTH
+    )
+    one = mdnum.simulation(atoms, function, timestep=0.002, skin=0.2)
+    assert len(one.evaluate().i) == pairs
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("each", [on_trust, by_itself])
+def test_a_fork_has_a_counterfactual_where_the_list_decides(each):
+    function = own(each)(argon()).model
+    one = mdnum.simulation(argon(), function, timestep=0.005, skin=0.2, temperature=300, seed=2)
+    twin = choices.parse("precision").make(one)
+    found = fork(twin, 60)
+    assert found.series["B"][-1] > 0
+    assert ("B|A" in found.series) == (each is on_trust)
