@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError, in_a_line
 from mdnum.md import jaxmd
-from mdnum.md.cell import Cell, complete, displacement, wrap_positions
+from mdnum.md.cell import complete, displacement, wrap_positions
 from mdnum.md.energies import Call, EnergyFunction, with_images
 from mdnum.md.manybody import Smoothness
 from mdnum.plain import beside
@@ -77,15 +78,18 @@ class Trial:
         self.model: EnergyFunction = simulation.model
         self.name, self.notes = self.model.name, {}
         self.symbols = simulation.symbols
-        self._check_species(simulation.symbols)
+        unknown, known = set(self.symbols) - set(self.model.species), ", ".join(self.model.species)
+        if known and unknown:
+            raise AdmissionError(
+                "UNKNOWN_SPECIES", self.name, unknown=", ".join(sorted(unknown)), known=known
+            )
         self.pbc = np.array(simulation.pbc)
         self.cell = complete(np.asarray(simulation.cell.matrix), self.pbc)
         self.x, _ = wrap_positions(simulation.cell, simulation.positions)
         self.seed = simulation.draw.seed
-        room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
-        table = simulation.verlet_list(min(max(simulation.rule.skin, 0.1 * simulation.r_cut), room)).build(
-            self.x, simulation.cell
-        )
+        self.box, self.width = simulation.cell, float(np.min(simulation.cell.widths))
+        skin = min(max(simulation.rule.skin, 0.1 * simulation.r_cut), self.width / 2 - simulation.r_cut)
+        table = simulation.verlet_list(skin).build(self.x, simulation.cell)
         # the list in the order of the structure; the skin, and slots that hold nothing
         names = np.append(table.order, len(self.x)).astype(np.int32)
         self.idx = np.full((len(self.x), table.slots), len(self.x), np.int32)
@@ -93,12 +97,6 @@ class Trial:
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
         self._lists()
         self._compile()
-
-    def _check_species(self, symbols: tuple[str, ...]) -> None:
-        unknown = sorted(set(symbols) - set(self.model.species))
-        if self.model.species and unknown:
-            known = ", ".join(self.model.species)
-            raise AdmissionError("UNKNOWN_SPECIES", self.name, unknown=", ".join(unknown), known=known)
 
     @property
     def call(self) -> Call:
@@ -122,14 +120,14 @@ class Trial:
                     self.notes["LIST_FAILED"] = {"error": in_a_line(error)}
         if own is not None:
             self.notes.pop("LIST_FAILED", None)
-            known = {"Dense": "dense", "Sparse": "sparse", "OrderedSparse": "ordered-sparse"}
-            idx, n = own.idx, len(self.x)
-            if own.format.name == "Dense":
-                itself = np.any(np.asarray(idx) == np.arange(n)[:, None])
-            else:
-                itself = np.any((np.asarray(idx[0]) == np.asarray(idx[1])) & (np.asarray(idx[0]) < n))
-            images = self.call.how.images
-            model = replace(model, format=known[own.format.name], self_edges=bool(itself) and not images)
+            form, n = (
+                {"Dense": FORMATS[0], "Sparse": FORMATS[1]}.get(own.format.name, FORMATS[2]),
+                len(self.x),
+            )
+            here, other = (np.arange(n)[:, None], own.idx) if form == "dense" else own.idx
+            itself = bool(np.any((np.asarray(here) == np.asarray(other)) & (np.asarray(other) < n)))
+            # an image of an atom is another one
+            model = replace(model, format=form, self_edges=itself and not self.call.how.images)
         self.model = model
         if model.start is not None and not jax.tree.leaves(model.parameters):
             key, x = jax.random.PRNGKey(self.seed), jnp.asarray(self.x / self.call.length)
@@ -144,13 +142,17 @@ class Trial:
             neighbor = with_images(neighbor, real, cell, box)
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
-    def _arguments(self, idx=None, x=None, cell=None, *, real=None, box=None, strain=None, code=0):
-        cell = (self.cell if cell is None else cell) / self.call.length
-        x = (self.x if x is None else x) / self.call.length
-        given = (
-            x, self.inside if idx is None else idx, x if real is None else real / self.call.length, cell,
-            cell.T if box is None else box / self.call.length, np.eye(3) if strain is None else strain,
-        )  # fmt: skip
+    def _arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
+        """Of `bare`, at real positions in a box, by the convention that is known so far."""
+        call, how = self.call, self.call.how
+        idx = self.inside if idx is None else idx
+        real, cell = (
+            own / call.length for own in (self.x if x is None else x, self.cell if cell is None else cell)
+        )
+        # a function that follows cell= must do so alone
+        box = self.cell.T / call.length if how.box == "cell" else cell if how.box == "rows" else cell.T
+        x = real @ np.linalg.inv(cell) if how.fractional else real
+        given = (x, idx, real, cell, box, np.eye(3))
         return (self.model.parameters, *map(jnp.asarray, given), jnp.asarray(code, jnp.uint8))
 
     def _compile(self) -> None:
@@ -197,33 +199,22 @@ class Trial:
         finally:
             self.model = held
         shape = found[-1]
+        kinds = {(): "number", (1,): "number", (len(self.x),): "atoms"}
         if isinstance(shape, Mapping):
-            key = next((key for key in ("total", "energy") if key in shape), None)
-            if key is None or shape[key] not in ((), (1,)):
-                raise AdmissionError("NO_ENERGY", self.name, seen=f"a dictionary with {', '.join(shape)}")
-            return key
-        if shape in ((), (1,)):
-            return "number"
-        if shape == (len(self.x),):
-            return "atoms"
+            kinds = {shape[key]: key for key in ("energy", "total") if shape.get(key) in ((), (1,))}
+            shape = next(reversed(kinds), shape)
+        if isinstance(shape, tuple) and shape in kinds:
+            return kinds[shape]
         raise AdmissionError("NO_ENERGY", self.name, seen=f"{shape!r}")
 
-    def energy(self, *args: Any, **keywords: Any) -> float:
-        """Its own energy; arguments as for `_arguments`."""
-        return float(self.program(*self._arguments(*args, **keywords))[0])
-
-    def there(self, x=None, idx=None, cell=None, **keywords) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
-        """Energy and forces in the simulation's units, at real positions, by the convention that is known."""
-        how, call = self.call.how, self.call
-        x, cell = (self.x if x is None else x), (self.cell if cell is None else cell)
-        given = x @ np.linalg.inv(cell) * call.length if how.fractional else x
-        # a function that follows cell= must do so alone
-        box = self.cell.T if how.box == "cell" else cell if how.box == "rows" else cell.T
-        out = self.program(*self._arguments(idx, given, cell, real=x, box=box, **keywords))
-        slope = np.asarray(out[1][0])
+    def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
+        """Energy and forces in the simulation's units; arguments as for `_arguments`."""
+        how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
+        energy, (slope, *_) = self.program(*self._arguments(idx, x, cell, code))
+        slope = np.asarray(slope)
         if how.fractional and not how.real_slope:
             slope = slope @ np.linalg.inv(cell / call.length).T
-        return float(out[0]) * call.unit, -slope * call.unit / call.length
+        return float(energy) * call.unit, -slope * call.unit / call.length
 
     def same(self, a: float, b: float) -> bool:
         """Whether two energies are the same within rounding."""
@@ -236,8 +227,7 @@ class Trial:
 
     def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
         """Of the listed pairs, some number for padding."""
-        box = Cell.create(self.cell, tuple(self.pbc.tolist()))
-        d = displacement(box, x[:, None], x[np.minimum(idx, len(x) - 1)])
+        d = displacement(self.box, x[:, None], x[np.minimum(idx, len(x) - 1)])
         return np.sqrt(sum(c * c for c in d))
 
     # --- what it is -----------------------------------------------------------------------------------
@@ -250,21 +240,17 @@ class Trial:
                 ignores; no way to strain what it sees.
         """
         self.double, how = not _single_arithmetic(self.trace), self.call.how
+        words = ("cell",) if how.native else how.keywords
         if not self.pbc.any():
             self._known("cell" if how.native else "")
             return
         if not (self.inside < len(self.x)).any():
             self.notes["UNTRIED"] = {}
-            self._known(
-                "cell" if "cell" in how.keywords or how.native else "columns" * ("box" in how.keywords)
-            )
+            self._known("cell" if "cell" in words else "columns" * ("box" in words))
             return
-        boxes = (
-            ["cell"] if how.native else [box for word, *of in _BOXES if word in how.keywords for box in of]
-        )
-        found = [(fractional, box) for fractional in (False, True)[: 2 - how.native] for box in (*boxes, "")]
+        boxes = [box for word, *of in _BOXES if word in words for box in of]
         kept = None
-        for fractional, box in found:
+        for fractional, box in product((False, True)[: 2 - how.native], (*boxes, "")):
             self._with(fractional=fractional, box=box)
             if self._takes_images():
                 kept = kept or (fractional, "")
@@ -284,22 +270,23 @@ class Trial:
         how = self.call.how
         self._with(box=box)
         energy, forces = self.there()
-        by_strain = np.asarray(self.program(*self._converted(self.inside))[1][3])
+        by_strain = np.asarray(self.program(*self._arguments(self.inside))[1][3])
         strain = box != "cell" and "perturbation" in how.keywords and bool(np.any(by_strain))
         used = ("cell",) if box == "cell" else ("box",) * bool(box) + ("perturbation",) * strain
         self._with(strain=strain, keywords=tuple(word for word in how.keywords if word in used))
         self.scale = max(abs(energy), float(np.abs(forces).max(initial=0.0)) * self.model.r_cut, 1e-12)
-        self.scale /= self.call.unit
         if np.isfinite(energy) and np.isfinite(forces).all():
             return
         n = len(self.x)
         # the same with neighbors, some of them twice, where there is padding
         first = np.where(self.inside[:, :1] < n, self.inside[:, :1], (np.arange(n) == 0)[:, None])
-        padded = all(
-            np.isfinite(one).all() for one in self.there(idx=np.where(self.inside < n, self.inside, first))
-        )
-        operation = first_not_finite(jax.grad(self.bare, 1), *self._converted(self.inside))
+        filled = self.there(idx=np.where(self.inside < n, self.inside, first))
+        padded = all(np.isfinite(one).all() for one in filled)
+        operation = self._culprit(self.inside)
         raise AdmissionError("NAN_BY_PADDING" if padded else "NOT_FINITE", self.name, operation=operation)
+
+    def _culprit(self, idx) -> str:
+        return first_not_finite(jax.grad(self.bare, 1), *self._arguments(idx))
 
     def _moves(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
         """Positions with one atom, that has neighbors, moved by each of some vectors; last those unmoved."""
@@ -322,9 +309,8 @@ class Trial:
     def _unmoved(self, vectors, cell=None) -> bool:
         """Whether moving an atom by any of some vectors leaves the energy of its pairs as it is."""
         n, rows = len(self.x), np.arange(len(self.x))[:, None]
-        reach = 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(self.cell), axis=0)))
         own = (self.inside == self._central) | (rows == self._central)
-        idx = self.within(np.where(own, self.inside, n), self.x, reach)
+        idx = self.within(np.where(own, self.inside, n), self.x, 0.45 * self.width)
         none = self.there(idx=np.full_like(idx, n))[0]
         *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
         none = none if np.isfinite(none) else 0.0
@@ -334,12 +320,9 @@ class Trial:
     def _follows(self) -> bool:
         """Whether a box that is slightly sheared counts, and counts as what it is."""
         cell, n = self.cell + self.cell @ _SHEAR, len(self.x)
-        near = self.within(
-            self.idx, self.x, 0.45 * float(np.min(1 / np.linalg.norm(np.linalg.inv(cell), axis=0)))
-        )
+        near = self.within(self.idx, self.x, 0.45 * self.width)
         # pairs that no face of the box is between are where they were
-        straight = self.x[:, None] - self.x[np.minimum(near, n - 1)]
-        apart = np.linalg.norm(straight, axis=-1)
+        apart = np.linalg.norm(self.x[:, None] - self.x[np.minimum(near, n - 1)], axis=-1)
         whole = np.where(np.isclose(apart, self.distances(near, self.x), rtol=1e-9), near, n).astype(np.int32)
         here, there = self.there(idx=whole), self.there(idx=whole, cell=cell)
         size = max(abs(here[0]), np.abs(here[1]).max() * self.model.r_cut)
@@ -357,7 +340,7 @@ class Trial:
             raise AdmissionError("DEPENDS_ON_ORDER", self.name, here=energy, there=other)
         wide = np.pad(self.inside, ((0, 0), (0, 8)), constant_values=n)
         # its own padding between the neighbors was among what was shuffled
-        arguments = self._converted(wide)
+        arguments = self._arguments(wide)
         alone = self._quick(jax.jit(self.bare).trace(*arguments))
         if not self.same(energy, other := float(alone(*arguments)) * self.call.unit):
             raise AdmissionError("DEPENDS_ON_CAPACITY", self.name, here=energy, there=other)
@@ -370,10 +353,7 @@ class Trial:
             self.notes["TRUSTS_LIST"] = {"inside": energy, "skin": skin}
         none = self.there(idx=np.full_like(self.inside, n))
         if not all(np.isfinite(one).all() for one in none):
-            operation = first_not_finite(
-                jax.grad(self.bare, 1), *self._converted(np.full_like(self.inside, n))
-            )
-            self.notes["NO_EDGES_NAN"] = {"operation": operation}
+            self.notes["NO_EDGES_NAN"] = {"operation": self._culprit(np.full_like(self.inside, n))}
         if not np.isfinite(self.there(code=1)[0]):
             self.notes["NAN_ON_OVERFLOW"] = {}
         if not self.call.how.box and self.pbc.any():
@@ -383,11 +363,6 @@ class Trial:
         elif rounded := single_numbers(self.trace):
             self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
 
-    def _converted(self, idx) -> tuple[Any, ...]:
-        how = self.call.how
-        x = self.x @ np.linalg.inv(self.cell) * self.call.length if how.fractional else self.x
-        return self._arguments(idx, x, real=self.x, box=self.cell if how.box == "rows" else self.cell.T)
-
     def _derivatives(self, rng: np.random.Generator) -> None:
         """Forces, and stress where the box counts, against differences of energies."""
         step, allowed = (1e-5, 1e-4) if self.double else (3e-3, 5e-2)
@@ -395,7 +370,7 @@ class Trial:
         # no pair that crosses the cutoff within the difference
         crossing = np.abs(self.distances(self.inside, self.x) - self.model.r_cut) < 20 * step
         idx = np.where(crossing, len(self.x), self.inside).astype(np.int32)
-        noise = (1e-14 if self.double else 1e-6) * self.scale * self.call.unit / step
+        noise = (1e-14 if self.double else 1e-6) * self.scale / step
         along = rng.standard_normal(self.x.shape)
         along /= np.linalg.norm(along, axis=1).max()
 
@@ -418,7 +393,7 @@ class Trial:
             return
         strain = rng.standard_normal((3, 3))
         strain = 0.05 * (strain + strain.T)
-        by_x, by_cell, by_box, by_strain = map(np.asarray, self.program(*self._converted(idx))[1])
+        by_x, by_cell, by_box, by_strain = map(np.asarray, self.program(*self._arguments(idx))[1])
         x, cell = (one / self.call.length @ strain for one in (self.x, self.cell))
         if how.strain:
             stress = np.sum(by_strain * strain)
@@ -431,24 +406,22 @@ class Trial:
             by = np.eye(3) + h * strain
             return self.there(self.x @ by, idx, self.cell @ by)[0]
 
-        found, size = slope(at), self.scale * self.call.unit
-        if abs(found - stress * self.call.unit) > allowed * size + 10 * noise * self.model.r_cut:
-            raise AdmissionError(
-                "STRESS_WRONG", self.name, found=found, stress=float(stress * self.call.unit)
-            )
+        found, size = slope(at), self.scale
+        stress = float(stress) * self.call.unit
+        if abs(found - stress) > allowed * size + 10 * noise * self.model.r_cut:
+            raise AdmissionError("STRESS_WRONG", self.name, found=found, stress=stress)
 
     def at_the_cutoff(self) -> EnergyFunction:
         """The function with what a crossing of its cutoff does, of the pairs that are nearest to it."""
-        n, r_cut, size = len(self.x), self.model.r_cut, self.scale * self.call.unit
+        n, r_cut, size = len(self.x), self.model.r_cut, self.scale
         r = np.where(self.idx < n, self.distances(self.idx, self.x), np.inf)
-        box = Cell.create(self.cell, tuple(self.pbc.tolist()))
         found, acts = [], []
         for place in np.argsort(np.abs(r - r_cut), axis=None)[:6].tolist():
             i, slot = divmod(place, r.shape[1])
             j = int(self.idx[i, slot])
             if not i < j < n or abs(r[i, slot] - r_cut) > 0.2 * r_cut:
                 continue
-            toward = np.stack(displacement(box, self.x[i], self.x[j])) / r[i, slot]
+            toward = np.stack(displacement(self.box, self.x[i], self.x[j])) / r[i, slot]
             ends = []
             # what is continuous is a hundredth of itself, or less, at the second distance
             for factor in (1 - 1e-5, 1 - 1e-7, 1 + 1e-3):
@@ -497,7 +470,7 @@ def second_derivative(simulation: Simulation) -> str:
         return ""
     with jaxmd.standard_promotion():
         trial = Trial(simulation)
-        arguments = trial._converted(trial.inside)
+        arguments = trial._arguments()
 
         def along(parameters, x, *rest):
             return jax.jvp(
