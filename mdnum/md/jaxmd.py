@@ -163,14 +163,8 @@ def as_neighbor_list(
         self_edges: list each atom as its own neighbor, as jax-md does where its `mask_self` is false.
         code: of the list's error, as if it had overflowed.
     """
-    partition = upstream().partition
-    formats = {
-        "dense": partition.Dense,
-        "sparse": partition.Sparse,
-        "ordered-sparse": partition.OrderedSparse,
-    }
-    if format not in formats:
-        raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(formats)}")
+    if format not in _FORMATS:
+        raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(_FORMATS)}")
     atoms = idx_dense.shape[0]
     own = jnp.arange(atoms, dtype=jnp.int32)[:, None]
     idx = jnp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(jnp.int32)
@@ -183,13 +177,27 @@ def as_neighbor_list(
         if format == "ordered-sparse":
             real = real & (receiver < sender)
         idx = jnp.stack([jnp.where(real, receiver, atoms), jnp.where(real, sender, atoms)]).astype(jnp.int32)
+    return listed(idx, reference_position, format, code)
+
+
+_FORMATS = {"dense": "Dense", "sparse": "Sparse", "ordered-sparse": "OrderedSparse"}
+
+
+def listed(
+    idx: Int[Array, "..."],
+    reference_position: Float[Array, "atoms 3"] | np.ndarray,
+    format: Format,
+    code: Any = 0,
+) -> NeighborList:
+    """As `as_neighbor_list`, of entries that are in the format already."""
+    partition = upstream().partition
     return partition.NeighborList(
         idx=idx,
         reference_position=jnp.asarray(reference_position),
         error=partition.PartitionError(jnp.asarray(code, jnp.uint8)),
         cell_list_capacity=None,
         max_occupancy=idx.shape[-1],
-        format=formats[format],
+        format=getattr(partition, _FORMATS[format]),
         cell_size=None,
         cell_list_fn=_refuse_update,  # type: ignore[arg-type]
         update_fn=_refuse_update,  # type: ignore[arg-type]

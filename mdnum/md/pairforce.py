@@ -449,6 +449,8 @@ class ManyBodyForce(eqx.Module):
         from mdnum.md import jaxmd
 
         words, slots, atoms = tables.index.shape
+        if tables.edges is not None:
+            return self._of_edges(positions, tables, bits)
         shifts = jnp.arange(slots, dtype=jnp.uint8)[None, :, None]
         inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
         acted_on = jnp.where(inside, tables.index, atoms).reshape(words * slots, atoms).T
@@ -460,6 +462,27 @@ class ManyBodyForce(eqx.Module):
                 jnp.zeros_like(names[acted_on]).at[tables.order].set(names[acted_on]),
             )
         return jaxmd.as_neighbor_list(acted_on, x, own.format, own.self_edges)
+
+    def _of_edges(self, positions, tables: Tables, bits) -> Any:
+        """As `neighbors`, of a list of edges, without the slots that hold nothing."""
+        from mdnum.md import jaxmd
+
+        own, atoms = self.potential, positions.shape[1]
+        assert tables.edges is not None
+        other, first, slot = tables.edges
+        byte = bits.at[slot // 8, first].get(mode="fill", fill_value=0)
+        inside = (byte >> (slot % 8).astype(jnp.uint8)) & jnp.uint8(1) == 1
+        x, ends = (
+            self.placed(positions.T.astype(self.dtype), tables),
+            jnp.where(inside, tables.edges[:2], atoms),
+        )
+        if own.labeled:
+            ends = jnp.append(tables.order, atoms).astype(jnp.int32)[ends]
+            # where a pair is listed once, its smaller label comes first
+            ends = jnp.sort(ends, axis=0) if own.format == "ordered-sparse" else ends
+        if own.self_edges:
+            ends = jnp.concatenate([ends, jnp.tile(jnp.arange(atoms, dtype=jnp.int32), (2, 1))], axis=1)
+        return jaxmd.listed(ends, x, own.format)
 
     @property
     def dtype(self) -> np.dtype:

@@ -323,7 +323,10 @@ class Simulation:
             kinds = pair_type(species[index], species[:atoms], len(self.symbols))
             types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
         # not jnp.asarray, which compiles a program for every shape
-        return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order))
+        edges = None
+        if not self.pairwise and self.model.format != "dense":
+            edges = jax.device_put(_edges(np.asarray(index), once=self.model.format == "ordered-sparse"))
+        return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
         """The same system with other pair terms or a many-body potential, and decisions at their radii.
@@ -417,3 +420,18 @@ class Simulation:
         i, j = i[order], j[order]
         dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
         return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+def _edges(index: Int[np.ndarray, "slots atoms"], once: bool) -> Int[np.ndarray, "3 edges"]:
+    """The pairs of a table as `Tables.edges` has them, those of one atom together.
+
+    Args:
+        once: whether a pair is listed once.
+    """
+    atoms = index.shape[1]
+    first, slot = np.nonzero((index < (np.arange(atoms) if once else atoms)).T)
+    # every length is compiled for; that of a liquid's lists varies by less than a sixteenth
+    step = max(64, 1 << max(0, len(first).bit_length() - 4))
+    edges = np.full((3, step * (len(first) // step + 1)), atoms, np.int32)
+    edges[:, : len(first)] = index[slot, first], first, slot
+    return edges

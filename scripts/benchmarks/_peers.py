@@ -31,7 +31,7 @@ def float64(value: float) -> Any:
     return scalar(value)
 
 
-def jax_md_neighbors(simulation: Simulation) -> tuple[Any, Any, Any, Any]:
+def jax_md_neighbors(simulation: Simulation, form: str = "OrderedSparse") -> tuple[Any, Any, Any, Any]:
     """jax-md's energy and its list over the simulation's start: (energy, shift, list, positions)."""
     from jax_md import energy, partition, space
 
@@ -46,12 +46,12 @@ def jax_md_neighbors(simulation: Simulation) -> tuple[Any, Any, Any, Any]:
         r_onset=float64(0.8 * simulation.r_cut),
         r_cutoff=float64(simulation.r_cut),
         dr_threshold=float64(simulation.rule.skin),
-        format=partition.OrderedSparse,
+        format=getattr(partition, form),
     )
     return energy_fn, shift, neighbor_fn.allocate(positions), positions
 
 
-def jax_md_loop(simulation: Simulation) -> Loop:
+def jax_md_loop(simulation: Simulation, form: str = "OrderedSparse") -> Loop:
     """The loop of jax-md's documentation: velocity Verlet and a list update at each step of a fori_loop.
 
     Its Lennard-Jones is switched between an onset and the cutoff, because jax-md has no hard one; pairs and
@@ -59,7 +59,7 @@ def jax_md_loop(simulation: Simulation) -> Loop:
     """
     from jax_md import simulate
 
-    energy_fn, shift, neighbors, positions = jax_md_neighbors(simulation)
+    energy_fn, shift, neighbors, positions = jax_md_neighbors(simulation, form)
     init, apply = simulate.nve(energy_fn, shift, float(simulation.integrator.timestep))
     state = init(jax.random.key(0), positions, float64(1.0), neighbor=neighbors)
     state = state.set(momentum=jnp.asarray(simulation.velocities))
