@@ -1,8 +1,8 @@
 """jax-md's graph network as a potential, and the same run in float32 beside it.
 
-The network is what `jax_md.energy.graph_network_neighbor_list` returns, with random weights. Its own cutoff is a
-little longer than `r_cut`, so that the list decides which pairs are edges: then one run can be given the
-decisions of the other.
+The network is what `jax_md.energy.graph_network_neighbor_list` returns, with random weights. Its own cutoff
+is a little longer than `r_cut`, so that the list decides which pairs are edges: then one run can be given
+the decisions of the other.
 """
 
 import ase.build

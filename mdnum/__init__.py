@@ -19,9 +19,9 @@ Verbs take either, or the name or path of a system file, and leave a folder:
     bounce, demonstrate the same questions about a ball
 
 Nouns: `Simulation` and its `parameters` by path, pair potentials (`LennardJones`, `Morse`, `SoftSphere`,
-`PairFunction` for one of your own), `Cut`, `Term` for several that add, integrators (`VelocityVerlet`,
-`Langevin`; `KickDrift` and `Integrator` to write one), `PrecisionPolicy`, `Problem` with `value_and_grad` and
-`method` for gradients, and `MdnumCalculator` for ASE.
+`PairFunction` for one of your own), `energy_function` for any energy over a neighbor list, `Cut`, `Term` for
+several that add, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and `Integrator` to write one),
+`PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and `MdnumCalculator` for ASE.
 
 The names below are imported on first use (PEP 562), because jax takes half a second to import and
 jax_md takes six, and `mdnum --help` needs neither.

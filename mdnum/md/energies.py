@@ -76,11 +76,11 @@ class Call:
     unit: float = 1.0  # its unit of energy, in the simulation's
     name: str = "energy function"
 
-    def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Array:
-        """Its energy in its own units, of positions as it wants them.
+    def raw(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
+        """What it returns for positions as it wants them.
 
         Args:
-            given: the keywords of the convention, and for its own one "cell".
+            given: the keywords of the convention, and for mdnum's own "cell".
         """
         how = self.how
         args = (parameters, x) if how.parameters or how.native else (x,)
@@ -93,10 +93,12 @@ class Call:
             keywords[how.keyword] = neighbor
         # jax-md and what is written like it mixes widths
         with jaxmd.standard_promotion():
-            out = jax.named_call(self.function, name=self.name.replace(" ", "_"))(*args, **keywords)
-        if how.returns == "atoms":
-            return jnp.sum(out)
-        return jnp.reshape(out if how.returns == "number" else out[how.returns], ())
+            return jax.named_call(self.function, name=self.name.replace(" ", "_"))(*args, **keywords)
+
+    def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Array:
+        """Its energy in its own units; arguments as for `raw`."""
+        out, kind = self.raw(parameters, x, neighbor, given), self.how.returns
+        return jnp.sum(out if kind in ("number", "atoms") else out[kind])
 
     def __call__(self, parameters: Any, x: Array, neighbor: Any, cell: Array, strain: Any = None) -> Array:
         """The energy.

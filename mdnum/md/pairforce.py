@@ -469,7 +469,7 @@ class ManyBodyForce(eqx.Module):
 
         own, atoms = self.potential, positions.shape[1]
         assert tables.edges is not None
-        other, first, slot = tables.edges
+        _, first, slot = tables.edges
         byte = bits.at[slot // 8, first].get(mode="fill", fill_value=0)
         inside = (byte >> (slot % 8).astype(jnp.uint8)) & jnp.uint8(1) == 1
         x, ends = (

@@ -9,8 +9,9 @@ the same, by one compiled program.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -24,6 +25,7 @@ from mdnum.md import jaxmd
 from mdnum.md.cell import complete, displacement, wrap_positions
 from mdnum.md.energies import Call, EnergyFunction, with_images
 from mdnum.md.manybody import Smoothness
+from mdnum.numerics.jaxprs import first_not_finite, narrows, single_numbers
 from mdnum.plain import beside
 from mdnum.systems.simulation import Simulation
 
@@ -33,8 +35,6 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 _SAME = {True: 1e-9, False: 1e-5}
 #: Of the box that tells rows from columns: how far it is sheared, not the same way along any two axes.
 _SHEAR = 1e-3 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.7, 0.4, 0.0]])
-#: Digits that a person writes: numbers in single precision with more are weights, or were computed.
-_DIGITS = 6
 
 
 class AdmissionError(InputError):
@@ -76,17 +76,14 @@ class Trial:
 
     def __init__(self, simulation: Simulation):
         self.model: EnergyFunction = simulation.model
-        self.name, self.notes = self.model.name, {}
-        self.symbols = simulation.symbols
+        self.notes: dict[str, dict[str, Any]] = {}
+        self.symbols, self.seed = simulation.symbols, simulation.draw.seed
         unknown, known = set(self.symbols) - set(self.model.species), ", ".join(self.model.species)
         if known and unknown:
-            raise AdmissionError(
-                "UNKNOWN_SPECIES", self.name, unknown=", ".join(sorted(unknown)), known=known
-            )
+            raise self._error("UNKNOWN_SPECIES", unknown=", ".join(sorted(unknown)), known=known)
         self.pbc = np.array(simulation.pbc)
         self.cell = complete(np.asarray(simulation.cell.matrix), self.pbc)
         self.x, _ = wrap_positions(simulation.cell, simulation.positions)
-        self.seed = simulation.draw.seed
         self.box, self.width = simulation.cell, float(np.min(simulation.cell.widths))
         skin = min(max(simulation.rule.skin, 0.1 * simulation.r_cut), self.width / 2 - simulation.r_cut)
         table = simulation.verlet_list(skin).build(self.x, simulation.cell)
@@ -97,6 +94,9 @@ class Trial:
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
         self._lists()
         self._compile()
+
+    def _error(self, code: str, **values: Any) -> AdmissionError:
+        return AdmissionError(code, self.model.name, **values)
 
     @property
     def call(self) -> Call:
@@ -120,10 +120,7 @@ class Trial:
                     self.notes["LIST_FAILED"] = {"error": in_a_line(error)}
         if own is not None:
             self.notes.pop("LIST_FAILED", None)
-            form, n = (
-                {"Dense": FORMATS[0], "Sparse": FORMATS[1]}.get(own.format.name, FORMATS[2]),
-                len(self.x),
-            )
+            n, form = len(self.x), own.format.name.replace("dS", "d-S").lower()
             here, other = (np.arange(n)[:, None], own.idx) if form == "dense" else own.idx
             itself = bool(np.any((np.asarray(here) == np.asarray(other)) & (np.asarray(other) < n)))
             # an image of an atom is another one
@@ -134,26 +131,27 @@ class Trial:
             listed = own if own is not None else jaxmd.as_neighbor_list(self.idx, x, model.format or "dense")
             self.model = replace(model, parameters=model.start(key, x, listed))
 
-    def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """The function's own energy, of positions and a box in its own terms."""
+    def bare(self, parameters, x, idx, real, cell, box, strain, code, whole=False):
+        """The function's own energy, of positions and a box in its own terms; or all that it returns."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
             neighbor = with_images(neighbor, real, cell, box)
-        return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
+        given = {"cell": cell, "box": box, "perturbation": strain}
+        return (call.raw if whole else call.bare)(parameters, x, neighbor, given)
 
     def _arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
         """Of `bare`, at real positions in a box, by the convention that is known so far."""
         call, how = self.call, self.call.how
-        idx = self.inside if idx is None else idx
-        real, cell = (
-            own / call.length for own in (self.x if x is None else x, self.cell if cell is None else cell)
+        idx, x, cell = (
+            own if one is None else one for one, own in ((idx, self.inside), (x, self.x), (cell, self.cell))
         )
+        real, cell = x / call.length, cell / call.length
         # a function that follows cell= must do so alone
         box = self.cell.T / call.length if how.box == "cell" else cell if how.box == "rows" else cell.T
         x = real @ np.linalg.inv(cell) if how.fractional else real
-        given = (x, idx, real, cell, box, np.eye(3))
-        return (self.model.parameters, *map(jnp.asarray, given), jnp.asarray(code, jnp.uint8))
+        given = (x, idx, real, cell, box, np.eye(3), np.uint8(code))
+        return (self.model.parameters, *map(jnp.asarray, given))
 
     def _compile(self) -> None:
         """Find a format, keywords and a result that fit, and compile energy and derivatives."""
@@ -174,7 +172,7 @@ class Trial:
                     raise
                 except Exception as error:
                     failed = failed or in_a_line(error)
-        raise AdmissionError("NOT_CALLABLE", self.name, error=failed, tried=", ".join(formats))
+        raise self._error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _quick(self, traced: Any) -> Any:
         """A program compiled for a few calls."""
@@ -183,38 +181,23 @@ class Trial:
 
     def _returned(self) -> str:
         """What it returns, as `Convention.returns`."""
-        found: list[Any] = []
-
-        function = self.call.function
-
-        def kept(*args, **keywords):
-            out = function(*args, **keywords)
-            found.append(jax.tree.map(lambda leaf: jnp.shape(leaf), out))
-            return jnp.zeros(())
-
-        held = self.model
-        self.model = replace(held, function=replace(self.call, function=kept))
-        try:
-            jax.eval_shape(self.bare, *self._arguments())
-        finally:
-            self.model = held
-        shape = found[-1]
+        out = jax.eval_shape(partial(self.bare, whole=True), *self._arguments())
+        shape = {key: one.shape for key, one in out.items()} if isinstance(out, Mapping) else jnp.shape(out)
         kinds = {(): "number", (1,): "number", (len(self.x),): "atoms"}
         if isinstance(shape, Mapping):
             kinds = {shape[key]: key for key in ("energy", "total") if shape.get(key) in ((), (1,))}
             shape = next(reversed(kinds), shape)
         if isinstance(shape, tuple) and shape in kinds:
             return kinds[shape]
-        raise AdmissionError("NO_ENERGY", self.name, seen=f"{shape!r}")
+        raise self._error("NO_ENERGY", seen=f"{shape!r}")
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
         """Energy and forces in the simulation's units; arguments as for `_arguments`."""
         how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
         energy, (slope, *_) = self.program(*self._arguments(idx, x, cell, code))
-        slope = np.asarray(slope)
-        if how.fractional and not how.real_slope:
-            slope = slope @ np.linalg.inv(cell / call.length).T
-        return float(energy) * call.unit, -slope * call.unit / call.length
+        honest = how.fractional and not how.real_slope
+        by_x = np.linalg.inv(cell).T if honest else np.eye(3) / call.length
+        return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def same(self, a: float, b: float) -> bool:
         """Whether two energies are the same within rounding."""
@@ -239,14 +222,12 @@ class Trial:
             AdmissionError: numbers that are not finite; another box than the simulation's, or one that it
                 ignores; no way to strain what it sees.
         """
-        self.double, how = not _single_arithmetic(self.trace), self.call.how
+        self.double, how = not narrows(self.trace), self.call.how
         words = ("cell",) if how.native else how.keywords
-        if not self.pbc.any():
-            self._known("cell" if how.native else "")
-            return
-        if not (self.inside < len(self.x)).any():
-            self.notes["UNTRIED"] = {}
-            self._known("cell" if "cell" in words else "columns" * ("box" in words))
+        paired = bool((self.inside < len(self.x)).any())
+        if not self.pbc.any() or not paired:
+            self.notes |= {} if paired else {"UNTRIED": {}}
+            self._known("cell" if "cell" in words else "columns" * (self.pbc.any() and "box" in words))
             return
         boxes = [box for word, *of in _BOXES if word in words for box in of]
         kept = None
@@ -261,9 +242,9 @@ class Trial:
         self._known(kept[1] if kept else "")
         if kept is None:
             here, there = (self.there(x)[0] for x in self._moves(self.cell)[-2:])
-            raise AdmissionError("ANOTHER_BOX", self.name, here=there, there=here)
+            raise self._error("ANOTHER_BOX", here=there, there=here)
         if not self.call.how.strain and not self.call.how.box:
-            raise AdmissionError("CELL_IGNORED" if how.native else "NO_STRAIN", self.name)
+            raise self._error("CELL_IGNORED" if how.native else "NO_STRAIN")
 
     def _known(self, box: str) -> None:
         """Keep how the box is followed, and the keywords that this takes; energies must be finite then."""
@@ -273,7 +254,7 @@ class Trial:
         by_strain = np.asarray(self.program(*self._arguments(self.inside))[1][3])
         strain = box != "cell" and "perturbation" in how.keywords and bool(np.any(by_strain))
         used = ("cell",) if box == "cell" else ("box",) * bool(box) + ("perturbation",) * strain
-        self._with(strain=strain, keywords=tuple(word for word in how.keywords if word in used))
+        self._with(strain=strain, keywords=used if set(used) <= set(how.keywords) else how.keywords)
         self.scale = max(abs(energy), float(np.abs(forces).max(initial=0.0)) * self.model.r_cut, 1e-12)
         if np.isfinite(energy) and np.isfinite(forces).all():
             return
@@ -281,9 +262,8 @@ class Trial:
         # the same with neighbors, some of them twice, where there is padding
         first = np.where(self.inside[:, :1] < n, self.inside[:, :1], (np.arange(n) == 0)[:, None])
         filled = self.there(idx=np.where(self.inside < n, self.inside, first))
-        padded = all(np.isfinite(one).all() for one in filled)
-        operation = self._culprit(self.inside)
-        raise AdmissionError("NAN_BY_PADDING" if padded else "NOT_FINITE", self.name, operation=operation)
+        code = "NAN_BY_PADDING" if all(np.isfinite(one).all() for one in filled) else "NOT_FINITE"
+        raise self._error(code, operation=self._culprit(self.inside))
 
     def _culprit(self, idx) -> str:
         return first_not_finite(jax.grad(self.bare, 1), *self._arguments(idx))
@@ -291,8 +271,7 @@ class Trial:
     def _moves(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
         """Positions with one atom, that has neighbors, moved by each of some vectors; last those unmoved."""
         moved = np.arange(len(self.x)) == self._central
-        axes = np.flatnonzero(self.pbc)
-        return [*(self.x + np.outer(moved, vectors[axis]) for axis in axes), self.x]
+        return [*(self.x + np.outer(moved, vector) for vector in vectors[self.pbc]), self.x]
 
     def _takes_images(self) -> bool:
         """Whether an atom may move by a lattice vector, and by none of another convention."""
@@ -311,9 +290,8 @@ class Trial:
         n, rows = len(self.x), np.arange(len(self.x))[:, None]
         own = (self.inside == self._central) | (rows == self._central)
         idx = self.within(np.where(own, self.inside, n), self.x, 0.45 * self.width)
-        none = self.there(idx=np.full_like(idx, n))[0]
+        none = np.nan_to_num(self.there(idx=np.full_like(idx, n))[0])
         *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
-        none = none if np.isfinite(none) else 0.0
         size = max(abs(here[0] - none), np.abs(here[1]).max() * self.model.r_cut, 1e-13 * abs(here[0]))
         return all(abs(one[0] - here[0]) <= 10 * _SAME[self.double] * size for one in moved)
 
@@ -337,13 +315,13 @@ class Trial:
         self._derivatives(rng)
         shuffled = rng.permuted(self.inside, axis=1).astype(np.int32)
         if not self.same(energy, other := self.there(idx=shuffled)[0]):
-            raise AdmissionError("DEPENDS_ON_ORDER", self.name, here=energy, there=other)
+            raise self._error("DEPENDS_ON_ORDER", here=energy, there=other)
         wide = np.pad(self.inside, ((0, 0), (0, 8)), constant_values=n)
         # its own padding between the neighbors was among what was shuffled
         arguments = self._arguments(wide)
         alone = self._quick(jax.jit(self.bare).trace(*arguments))
         if not self.same(energy, other := float(alone(*arguments)) * self.call.unit):
-            raise AdmissionError("DEPENDS_ON_CAPACITY", self.name, here=energy, there=other)
+            raise self._error("DEPENDS_ON_CAPACITY", here=energy, there=other)
         order = rng.permutation(n)
         place = np.append(np.argsort(order), n).astype(np.int32)
         other = self.there(self.x[order], place[self.inside[order]])[0]
@@ -351,16 +329,16 @@ class Trial:
         if not self.same(energy, skin := self.there(idx=self.idx)[0]):
             self.model = replace(self.model, trusts_list=True)
             self.notes["TRUSTS_LIST"] = {"inside": energy, "skin": skin}
-        none = self.there(idx=np.full_like(self.inside, n))
-        if not all(np.isfinite(one).all() for one in none):
-            self.notes["NO_EDGES_NAN"] = {"operation": self._culprit(np.full_like(self.inside, n))}
-        if not np.isfinite(self.there(code=1)[0]):
-            self.notes["NAN_ON_OVERFLOW"] = {}
-        if not self.call.how.box and self.pbc.any():
-            self.notes["FIXED_BOX"] = {}
-        if not self.double:
-            self.notes["SINGLE_INSIDE"] = {}
-        elif rounded := single_numbers(self.trace):
+        none = np.full_like(self.inside, n)
+        if not all(np.isfinite(one).all() for one in self.there(idx=none)):
+            self.notes["NO_EDGES_NAN"] = {"operation": self._culprit(none)}
+        found = {
+            "NAN_ON_OVERFLOW": not np.isfinite(self.there(code=1)[0]),
+            "FIXED_BOX": not self.call.how.box and self.pbc.any(),
+            "SINGLE_INSIDE": not self.double,
+        }
+        self.notes |= {code: {} for code, is_so in found.items() if is_so}
+        if self.double and (rounded := single_numbers(self.trace)):
             self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
 
     def _derivatives(self, rng: np.random.Generator) -> None:
@@ -380,36 +358,30 @@ class Trial:
         found = slope(lambda h: self.there(self.x + h * along, idx)[0])
         for real_slope in (False, True)[: 1 + self.call.how.fractional]:
             self._with(real_slope=real_slope)
-            forces = self.there(idx=idx)[1]
-            terms = -np.sum(forces * along, axis=1)
+            terms = -np.sum(self.there(idx=idx)[1] * along, axis=1)
             if abs(found - terms.sum()) <= allowed * np.sqrt(np.sum(terms**2)) + 10 * noise:
                 break
         else:
-            raise AdmissionError("FORCES_WRONG", self.name, found=found, force=float(terms.sum()))
-        how = self.call.how
-        if how.real_slope and not how.strain:
-            raise AdmissionError("NO_STRAIN", self.name)
+            raise self._error("FORCES_WRONG", found=found, force=float(terms.sum()))
+        if (how := self.call.how).real_slope and not how.strain:
+            raise self._error("NO_STRAIN")
         if not how.box or not self.pbc.all():
             return
         strain = rng.standard_normal((3, 3))
         strain = 0.05 * (strain + strain.T)
         by_x, by_cell, by_box, by_strain = map(np.asarray, self.program(*self._arguments(idx))[1])
         x, cell = (one / self.call.length @ strain for one in (self.x, self.cell))
-        if how.strain:
-            stress = np.sum(by_strain * strain)
-        else:
-            by_cell = by_cell if how.box == "cell" else by_box if how.box == "rows" else by_box.T
-            stress = np.sum(by_cell * cell) + (0.0 if how.fractional else np.sum(by_x * x))
+        by_cell = {"cell": by_cell, "rows": by_box, "columns": by_box.T}[how.box]
+        whole = np.sum(by_cell * cell) + (0.0 if how.fractional else np.sum(by_x * x))
+        stress = float(np.sum(by_strain * strain) if how.strain else whole) * self.call.unit
         step /= self.model.r_cut
 
         def at(h: float) -> float:
             by = np.eye(3) + h * strain
             return self.there(self.x @ by, idx, self.cell @ by)[0]
 
-        found, size = slope(at), self.scale
-        stress = float(stress) * self.call.unit
-        if abs(found - stress) > allowed * size + 10 * noise * self.model.r_cut:
-            raise AdmissionError("STRESS_WRONG", self.name, found=found, stress=stress)
+        if abs((found := slope(at)) - stress) > allowed * self.scale + 10 * noise * self.model.r_cut:
+            raise self._error("STRESS_WRONG", found=found, stress=stress)
 
     def at_the_cutoff(self) -> EnergyFunction:
         """The function with what a crossing of its cutoff does, of the pairs that are nearest to it."""
@@ -435,14 +407,10 @@ class Trial:
                 )
                 ends.append((ahead - behind, float(np.abs(f - g).max())))
             wide, near, beyond = ends
-            real = [
-                abs(b) > 0.3 * abs(a) and abs(b) * unit > 1e-12 * size
-                for a, b, unit in zip(wide, near, (1, r_cut), strict=True)
-            ]
-            found.append([one if is_real else 0.0 for one, is_real in zip(near, real, strict=True)])
-            if any(real):
-                k = real.index(True)
-                acts.append(abs(beyond[k] - near[k]) <= 0.1 * abs(near[k]))
+            units = ((1, 0), (r_cut, 1))
+            real = [abs(near[k]) > max(0.3 * abs(wide[k]), 1e-12 * size / unit) for unit, k in units]
+            found.append([near[k] * real[k] for k in (0, 1)])
+            acts += [abs(beyond[k] - near[k]) <= 0.1 * abs(near[k]) for k in (0, 1) if real[k]][:1]
         if not found:
             return self.model
         jumps, pushes = zip(*found, strict=True)
@@ -473,107 +441,9 @@ def second_derivative(simulation: Simulation) -> str:
         arguments = trial._arguments()
 
         def along(parameters, x, *rest):
-            return jax.jvp(
-                lambda x: jax.grad(trial.bare, 1)(parameters, x, *rest), (x,), (jnp.ones_like(x),)
-            )[1]
+            slope = lambda x: jax.grad(trial.bare, 1)(parameters, x, *rest)  # noqa: E731
+            return jax.jvp(slope, (x,), (jnp.ones_like(x),))[1]
 
         if np.isfinite(np.asarray(jax.jit(along)(*arguments))).all():
             return ""
         return first_not_finite(along, *arguments)
-
-
-# --- reading a program --------------------------------------------------------------------------------
-
-
-def _equations(jaxpr: Any) -> Iterator[Any]:
-    """Of a program and all that it calls."""
-    for equation in jaxpr.eqns:
-        yield equation
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
-            if _is_program(inner):
-                yield from _equations(getattr(inner, "jaxpr", inner))
-
-
-def _is_program(value: Any) -> bool:
-    return hasattr(value, "eqns") or hasattr(value, "jaxpr")
-
-
-def _single_arithmetic(jaxpr: Any) -> bool:
-    """Whether arrays of numbers are computed in less than double precision on the way to the energy."""
-    for equation in _equations(jaxpr):
-        for out in equation.outvars:
-            dtype = getattr(out.aval, "dtype", None)
-            narrow = dtype is not None and jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 8
-            ins = [getattr(one.aval, "dtype", None) for one in equation.invars]
-            if narrow and equation.primitive.name == "convert_element_type" and ins == [np.dtype(np.float64)]:
-                return True
-    return False
-
-
-def single_numbers(closed: Any) -> list[str]:
-    """Numbers of a program that were rounded to single precision, as they were most likely written.
-
-    One that was widened again has the value of one in single precision, and no more digits than that needs.
-    """
-    held = list(closed.consts)
-    for equation in _equations(closed.jaxpr):
-        held += [one.val for one in equation.invars if hasattr(one, "val")]
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
-            held += getattr(inner, "consts", ())
-    numbers: dict[str, None] = {}
-    for one in held:
-        if getattr(one, "dtype", None) in (np.float32, np.float64) and np.size(one) <= 64:
-            for wide in np.ravel(np.asarray(one)):
-                number = np.float32(wide)
-                if number != wide:
-                    continue
-                # halves and whole numbers lose nothing, and what has all digits was computed
-                short = len(str(number).strip("-0.").replace(".", "")) <= _DIGITS
-                if np.isfinite(number) and short and float(str(number)) != float(number):
-                    numbers[str(number)] = None
-    return list(numbers)
-
-
-def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
-    """The first operation of a function that makes of finite numbers one that is not, and its place."""
-    closed = jax.make_jaxpr(function)(*args)
-    found: list[str] = []
-
-    def finite(values) -> bool:
-        return all(np.isfinite(one).all() for one in map(np.asarray, values) if one.dtype.kind == "f")
-
-    def run(jaxpr: Any, consts: Any, values: Any, outer: str = "place unknown") -> list[Any]:
-        known: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *values], strict=True))
-        for equation in jaxpr.eqns:
-            place = _line(equation) or outer
-            ins = [one.val if hasattr(one, "val") else known[one] for one in equation.invars]
-            inner = next(
-                (equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params), None
-            )
-            whole = hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(ins)
-            if inner is not None and whole and equation.primitive.name not in ("scan", "while"):
-                outs = run(inner.jaxpr, inner.consts, ins, place)
-            else:
-                params = equation.primitive.get_bind_params(equation.params)
-                # earlier versions return functions among the arguments, too
-                more, params = params if isinstance(params, tuple) else ((), params)
-                outs = equation.primitive.bind(*more, *ins, **params)
-                outs = outs if equation.primitive.multiple_results else [outs]
-            if not found and finite(ins) and not finite(outs):
-                found.append(f"{equation.primitive.name} ({place})")
-            known |= dict(zip(equation.outvars, outs, strict=True))
-        return [one.val if hasattr(one, "val") else known[one] for one in jaxpr.outvars]
-
-    run(closed.jaxpr, closed.consts, jax.tree.leaves(args))
-    return found[0] if found else "an operation on numbers that were not finite before"
-
-
-def _line(equation: Any) -> str:
-    """File, line and function in which an operation was written."""
-    frames = getattr(equation.source_info.traceback, "frames", ())
-    place = next(
-        (one for one in frames if "/jax/" not in one.file_name and "equinox" not in one.file_name), None
-    )
-    if place is None:
-        return ""
-    return f"{place.file_name.rpartition('/')[2]}:{place.line_num} {place.function_name}"

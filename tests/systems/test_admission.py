@@ -20,7 +20,8 @@ from mdnum.forks import choices, fork
 from mdnum.gradients.losses import FinalProjection
 from mdnum.md import jaxmd
 from mdnum.md.jaxmd import displacement as own_displacement
-from mdnum.systems.admission import AdmissionError, first_not_finite
+from mdnum.numerics.jaxprs import first_not_finite
+from mdnum.systems.admission import AdmissionError
 from mdnum.systems.evaluate import Evaluator
 
 RADIUS, DEPTH = 4.4, 0.3
@@ -155,8 +156,13 @@ CONVENTIONS = {
 }
 
 
+def some(names, fast: tuple[str, ...]):
+    """The fast ones in every run, all of them at night."""
+    return [name if name in fast else pytest.param(name, marks=pytest.mark.nightly) for name in names]
+
+
 @pytest.mark.jax_md
-@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize("name", some(CONVENTIONS, ("fractional", "first", "rows")))
 def test_each_convention_is_recognized_and_has_the_numbers_of_numpy(name: str):
     make, label, box, fractional = CONVENTIONS[name]
     atoms = argon()
@@ -310,7 +316,20 @@ DEFECTS = {
 
 
 @pytest.mark.jax_md
-@pytest.mark.parametrize("name", DEFECTS)
+@pytest.mark.parametrize(
+    "name",
+    some(
+        DEFECTS,
+        (
+            "DEPENDS_ON_ORDER",
+            "DEPENDS_ON_CAPACITY",
+            "NAN_BY_PADDING",
+            "ANOTHER_BOX",
+            "CELL_IGNORED",
+            "NO_ENERGY",
+        ),
+    ),
+)
 def test_a_defect_closes_the_door(name: str):
     with pytest.raises(AdmissionError) as caught:
         DEFECTS[name](argon())
@@ -339,7 +358,7 @@ NOTES = {
 
 
 @pytest.mark.jax_md
-@pytest.mark.parametrize("code", NOTES)
+@pytest.mark.parametrize("code", some(NOTES, ("PARAMETERS_FLOAT32", "TRUSTS_LIST", "NO_EDGES_NAN")))
 def test_what_should_be_known_is_noted_and_is_a_finding_of_the_run(code: str):
     import json
 
@@ -376,6 +395,7 @@ def test_numbers_that_belong_to_atoms_stay_with_them_when_atoms_are_sorted():
     compared(one, atoms, np.outer(charges, charges))
 
 
+@pytest.mark.nightly
 @pytest.mark.jax_md
 def test_units_are_those_that_the_function_is_written_in():
     atoms = argon()
@@ -419,6 +439,7 @@ def test_the_operation_that_makes_a_number_that_is_not_finite_is_named():
     assert named.startswith("div") and "test_admission.py" in named
 
 
+@pytest.mark.nightly
 @pytest.mark.jax_md
 def test_second_derivatives_that_are_not_finite_are_named_where_a_gradient_needs_them():
     @jax.custom_jvp
@@ -493,6 +514,7 @@ def test_what_inside_means_is_an_option(compare: str, pairs: int):
     assert len(one.evaluate().i) == pairs
 
 
+@pytest.mark.nightly
 @pytest.mark.jax_md
 @pytest.mark.parametrize("each", [on_trust, by_itself])
 def test_a_fork_has_a_counterfactual_where_the_list_decides(each):
