@@ -123,7 +123,7 @@ class Call:
         if how.images:
             neighbor = with_images(neighbor, x, cell, given["box"])
         if how.strain:
-            given["perturbation"] = strain.T
+            given["perturbation"] = jnp.asarray(strain).T
         if how.fractional:
             x = (_real_slope if how.real_slope else jnp.matmul)(x, jnp.linalg.inv(cell))
         return self.bare(parameters, x, neighbor, given) * self.unit
@@ -199,8 +199,8 @@ def energy_function(
     r_cut: float,
     *,
     parameters: Any = None,
-    format: str | None = None,
-    units: tuple[str, str] | str = (),
+    format: jaxmd.Format | None = None,
+    units: tuple[str, str] | str = "",
     species: tuple[str, ...] = (),
     name: str = "",
     compare: str = "r <",
@@ -258,7 +258,7 @@ def energy_function(
     made = Call(function, how, length, energy, name)
     unit = (units,) if isinstance(units, str) and units else tuple(units)
     return EnergyFunction(
-        tree, made, float(r_cut) * length, format=format or "", name=name, species=tuple(species),
+        tree, made, float(r_cut) * length, format=format or "any", name=name, species=tuple(species),
         start=start, lists=lists, unit=unit, compare=compare,
     )  # fmt: skip
 

@@ -210,10 +210,9 @@ def multi_image(neighbor: NeighborList, shifts: Float[Array, "... 3"], box: Floa
     Args:
         shifts: lattice vectors to add to the second atom. box: lattice vectors as columns, length.
     """
-    from jax_md.custom_partition import NeighborListMultiImage
-
+    kind: Any = upstream().custom_partition.NeighborListMultiImage
     idx = neighbor.idx if neighbor.format is upstream().partition.Dense else tuple(neighbor.idx)
-    return NeighborListMultiImage(
+    return kind(
         idx=idx, shifts=shifts, reference_position=neighbor.reference_position, reference_box=box, box=box,
         search_shifts=jnp.zeros((1, 3)), format=neighbor.format, max_occupancy=neighbor.max_occupancy,
         update_fn=_refuse_update, did_buffer_overflow=neighbor.did_buffer_overflow,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mdnum.md.jaxmd import Format, NeighborList
+from mdnum.md.jaxmd import NeighborList
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ManyBody(eqx.Module):
     Attributes:
         pbc: which axes are periodic.
         name: as in a system file.
-        format: the neighbor list format that energy takes.
+        format: the neighbor list format that energy takes; "any" before it was tried.
         smoothness: at r_cut.
         sources: papers of the form and its constants.
         r_cut: longest interaction radius, length; a field, or computed from the constants.
@@ -53,7 +53,7 @@ class ManyBody(eqx.Module):
 
     pbc: tuple[bool, bool, bool] = eqx.field(static=True, kw_only=True, default=(True, True, True))
     name: str = eqx.field(static=True, kw_only=True, default="")
-    format: Format = eqx.field(static=True, kw_only=True, default="dense")
+    format: Any = eqx.field(static=True, kw_only=True, default="dense")
     smoothness: Smoothness = eqx.field(static=True, kw_only=True, default=_UNKNOWN)
     sources: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
     trusts_list: bool = eqx.field(static=True, kw_only=True, default=False)

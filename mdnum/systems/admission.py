@@ -30,7 +30,7 @@ from mdnum.plain import beside
 from mdnum.systems.simulation import Simulation
 
 _TEXTS = beside(__file__)
-FORMATS = ("dense", "sparse", "ordered-sparse")
+FORMATS: tuple[jaxmd.Format, ...] = ("dense", "sparse", "ordered-sparse")
 #: Relative difference of energies that are the same, by whether all arithmetic is in double precision.
 _SAME = {True: 1e-9, False: 1e-5}
 #: Of the box that tells rows from columns: how far it is sheared, not the same way along any two axes.
@@ -128,7 +128,13 @@ class Trial:
         self.model = model
         if model.start is not None and not jax.tree.leaves(model.parameters):
             key, x = jax.random.PRNGKey(self.seed), jnp.asarray(self.x / self.call.length)
-            listed = own if own is not None else jaxmd.as_neighbor_list(self.idx, x, model.format or "dense")
+            listed = (
+                own
+                if own is not None
+                else jaxmd.as_neighbor_list(
+                    self.idx, x, FORMATS[0] if model.format == "any" else model.format
+                )
+            )
             self.model = replace(model, parameters=model.start(key, x, listed))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code, whole=False):
@@ -155,7 +161,7 @@ class Trial:
 
     def _compile(self) -> None:
         """Find a format, keywords and a result that fit, and compile energy and derivatives."""
-        formats = (self.model.format,) if self.model.format else FORMATS
+        formats = FORMATS if self.model.format == "any" else (self.model.format,)
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on
         sets = [tuple(w for w in words if w != left) for left in ("", "box", "cell", "perturbation")]
@@ -224,10 +230,10 @@ class Trial:
         """
         self.double, how = not narrows(self.trace), self.call.how
         words = ("cell",) if how.native else how.keywords
-        paired = bool((self.inside < len(self.x)).any())
-        if not self.pbc.any() or not paired:
+        paired, periodic = ((self.inside < len(self.x)).any(), self.pbc.any())
+        if not periodic or not paired:
             self.notes |= {} if paired else {"UNTRIED": {}}
-            self._known("cell" if "cell" in words else "columns" * (self.pbc.any() and "box" in words))
+            self._known("cell" if "cell" in words else "columns" if periodic and "box" in words else "")
             return
         boxes = [box for word, *of in _BOXES if word in words for box in of]
         kept = None

@@ -441,7 +441,7 @@ def _function(run: RunView) -> Iterator[Finding]:
 
 def _potential(run: RunView) -> Iterator[Finding]:
     """What the trial calls of an energy function found."""
-    units = {"energy_unit": run.units.energy, "length_unit": run.units.length}
+    units: dict[str, Any] = {"energy_unit": run.units.energy, "length_unit": run.units.length}
     for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
         yield TEXTS.finding(code, **values, **units)
 
