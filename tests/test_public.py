@@ -24,7 +24,6 @@ DOCUMENTED = set(re.findall(r"`(mdnum(?:\.[a-z]+)+)`", PAGE))
 #: Scripts that look into the package itself: its files, its pages, its processes.
 INSIDE = {
     "accelerator.py": {"mdnum.md"},
-    "_peers.py": {"mdnum.md.jaxmd"},
     "_processes.py": {"mdnum.provenance"},
     "lost_flips.py": {"mdnum.plain"},
     "make_systems.py": {"mdnum.systems.load", "mdnum.systems.structures"},

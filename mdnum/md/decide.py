@@ -164,9 +164,9 @@ class Tables(NamedTuple):
     # pair type of each slot (None where there is only one), same shape
     types: UInt8[Array, "words 8 atoms"] | None
     order: Int[Array, "atoms"]  # sorted atom k is atom order[k], shape (atoms,)
-    # second atom, first atom and slot of each listed pair, padded with the number of atoms, shape (3, edges);
-    # for energies over edges alone
-    edges: Int[Array, "3 edges"] | None = None
+    # of energies over a list: second atom, first atom and slot of each listed pair, padded with the number of
+    # atoms, shape (3, edges); of those that take dense lists the neighbors of each atom, (atoms, slots)
+    edges: Int[Array, "first second"] | None = None
 
     def groups(self) -> tuple[Int[Array, "groups 4 atoms"], UInt8[Array, "groups 4 atoms"] | None]:
         """Neighbors and pair types, GROUP slots at a time."""

@@ -448,40 +448,27 @@ class ManyBodyForce(eqx.Module):
         """The list that the energy function receives: the pairs that are decided to be inside, no others."""
         from mdnum.md import jaxmd
 
-        words, slots, atoms = tables.index.shape
-        if tables.edges is not None:
-            return self._of_edges(positions, tables, bits)
-        shifts = jnp.arange(slots, dtype=jnp.uint8)[None, :, None]
-        inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
-        acted_on = jnp.where(inside, tables.index, atoms).reshape(words * slots, atoms).T
-        x, own = positions.T.astype(self.dtype), self.potential
-        if own.labeled:
-            names = jnp.append(tables.order, atoms).astype(jnp.int32)
-            x, acted_on = (
-                self.placed(x, tables),
-                jnp.zeros_like(names[acted_on]).at[tables.order].set(names[acted_on]),
-            )
-        return jaxmd.as_neighbor_list(acted_on, x, own.format, own.self_edges)
-
-    def _of_edges(self, positions, tables: Tables, bits) -> Any:
-        """As `neighbors`, of a list of edges, without the slots that hold nothing."""
-        from mdnum.md import jaxmd
-
         own, atoms = self.potential, positions.shape[1]
-        assert tables.edges is not None
-        _, first, slot = tables.edges
+        x, edges = self.placed(positions.T.astype(self.dtype), tables), tables.edges
+        names = jnp.append(tables.order, atoms).astype(jnp.int32)
+        itself = jnp.arange(atoms, dtype=jnp.int32)
+        if own.format == "dense":
+            edges = tables.index.reshape(-1, atoms).T if edges is None else edges
+            inside = (bits.T[:, :, None] >> jnp.arange(8, dtype=jnp.uint8)) & jnp.uint8(1) == 1
+            idx = jnp.where(inside.reshape(edges.shape), edges, atoms).astype(jnp.int32)
+            if own.labeled:
+                idx = jnp.zeros_like(idx).at[tables.order].set(names[idx])
+            idx = jnp.concatenate([idx, itself[:, None]], axis=1) if own.self_edges else idx
+            return jaxmd.listed(idx, x, own.format)
+        assert edges is not None, "an energy over edges needs them in its tables"
+        _, first, slot = edges
         byte = bits.at[slot // 8, first].get(mode="fill", fill_value=0)
         inside = (byte >> (slot % 8).astype(jnp.uint8)) & jnp.uint8(1) == 1
-        x, ends = (
-            self.placed(positions.T.astype(self.dtype), tables),
-            jnp.where(inside, tables.edges[:2], atoms),
-        )
+        ends = jnp.where(inside, edges[:2], atoms)
         if own.labeled:
-            ends = jnp.append(tables.order, atoms).astype(jnp.int32)[ends]
             # where a pair is listed once, its smaller label comes first
-            ends = jnp.sort(ends, axis=0) if own.format == "ordered-sparse" else ends
-        if own.self_edges:
-            ends = jnp.concatenate([ends, jnp.tile(jnp.arange(atoms, dtype=jnp.int32), (2, 1))], axis=1)
+            ends = jnp.sort(names[ends], axis=0) if own.format == "ordered-sparse" else names[ends]
+        ends = jnp.concatenate([ends, jnp.tile(itself, (2, 1))], axis=1) if own.self_edges else ends
         return jaxmd.listed(ends, x, own.format)
 
     @property

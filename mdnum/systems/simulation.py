@@ -324,8 +324,8 @@ class Simulation:
             types = jax.device_put(kinds.astype(np.uint8).reshape(shape))
         # not jnp.asarray, which compiles a program for every shape
         edges = None
-        if not self.pairwise and self.model.format != "dense":
-            edges = jax.device_put(_edges(np.asarray(index), once=self.model.format == "ordered-sparse"))
+        if not self.pairwise:
+            edges = jax.device_put(_edges(np.asarray(index), self.model.format))
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
@@ -422,14 +422,12 @@ class Simulation:
         return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-def _edges(index: Int[np.ndarray, "slots atoms"], once: bool) -> Int[np.ndarray, "3 edges"]:
-    """The pairs of a table as `Tables.edges` has them, those of one atom together.
-
-    Args:
-        once: whether a pair is listed once.
-    """
+def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
+    """The pairs of a table as `Tables.edges` has them, those of one atom together."""
     atoms = index.shape[1]
-    first, slot = np.nonzero((index < (np.arange(atoms) if once else atoms)).T)
+    if form == "dense":
+        return np.ascontiguousarray(index.T, np.int32)
+    first, slot = np.nonzero((index < (np.arange(atoms) if form == "ordered-sparse" else atoms)).T)
     # every length is compiled for; that of a liquid's lists varies by less than a sixteenth
     step = max(64, 1 << max(0, len(first).bit_length() - 4))
     edges = np.full((3, step * (len(first) // step + 1)), atoms, np.int32)

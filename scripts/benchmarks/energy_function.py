@@ -1,6 +1,7 @@
 """What does an energy function of jax-md cost here, beside jax-md's own loop over the same function?
 
-Answer. TO BE MEASURED It takes 200 s.
+Answer. Over edges 1.1 times its CPU time with 500 atoms and 0.6 times with 4,000, over dense lists 1.7 and
+1.4 times. It takes 400 s.
 
 The function is jax-md's switched Lennard-Jones over a Lennard-Jones liquid, with a list of the format that it
 asks for. jax-md's loop is that of its documentation, velocity Verlet and an update of the list at each step;
@@ -27,7 +28,7 @@ from _peers import float64, jax_md_loop, orthorhombic
 
 import mdnum
 from mdnum.md.jaxmd import upstream
-from mdnum.rollout.engine import Engine
+from mdnum.rollout import Engine
 from mdnum.systems import Simulation
 
 
