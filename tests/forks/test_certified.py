@@ -89,7 +89,7 @@ def test_two_runs_of_one_program_are_protected_by_their_bounds_alone(found):
 
     # what decides inside its energy function is not certified
     class ManyBody(Simulation):
-        pairwise = False
+        imposable = False
 
     other = ManyBody(**{name: getattr(a, name) for name in a.__dataclass_fields__})
     dates = certified(replace(same, twin=pair(other, other)))
