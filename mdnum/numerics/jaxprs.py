@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+from mdnum.numerics.exact import interpreted
+
+#: Operations that are looked into: what is in their parameters is a program, called once.
+_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
+          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
+#: Candidates that are tried before giving up.
+_MOST = 12
 
 #: Digits that a person writes: numbers in single precision with more are weights, or were computed.
 _DIGITS = 6
@@ -54,41 +66,147 @@ def single_numbers(closed: Any) -> list[str]:
     return list(numbers)
 
 
-def first_not_finite(function: Callable[..., Any], *args: Any) -> str:
-    """The first operation of a function that makes of finite numbers one that is not, and its place."""
-    closed, found = jax.make_jaxpr(function)(*args), []
+@dataclass(frozen=True)
+class Operation:
+    """An operation whose result is not finite."""
 
-    def finite(values: Any) -> bool:
-        return all(np.isfinite(one).all() for one in map(np.asarray, values) if one.dtype.kind == "f")
+    name: str  # of the primitive, such as "div"
+    source: str  # file:line:function that wrote it, innermost one outside of JAX; empty where it is not known
+    functions: tuple[str, ...]  # all functions on the way to it, outermost first
+    index: tuple[int, ...]  # of the first number that is not finite, in the result
+    shape: tuple[int, ...]  # of the result
+    rounds: tuple[int, ...]  # rounds of the loops around it, outermost first
+    # the numbers at that place of inputs that have the shape of the result, or no shape
+    inputs: tuple[float, ...]
+    count: int  # how many operations ran before it
 
-    def run(program: Any, consts: Any, values: Any, outer: str) -> list[Any]:
-        known: dict[Any, Any] = dict(
-            zip([*program.constvars, *program.invars], [*consts, *values], strict=True)
+
+def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
+    """The operation that makes the result of a function of arrays not finite; it is not compiled.
+
+    Returns:
+        None where every number of the result is finite, or one of the arguments is not.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    if count_bad(leaves):
+        return None
+    program = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))(*leaves)
+
+    def run(mended: list[int]) -> tuple[int, Operation | None]:
+        interpreter = _Interpreter(mended)
+        return count_bad(interpreter.closed(program, leaves)), interpreter.found
+
+    mended: list[int] = []
+    before, candidate = run(mended)
+    first = candidate
+    for _ in range(_MOST if before else 0):
+        if candidate is None or run([*mended, candidate.count])[0] < before:
+            return candidate or first
+        # one that is masked away: made finite, so that the search goes on behind it
+        mended.append(candidate.count)
+        _, candidate = run(mended)
+    return first if before else None
+
+
+def count_bad(tree: Any) -> int:
+    """How many numbers are not finite."""
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(tree) if is_inexact(leaf)]
+    return sum(int((~np.isfinite(leaf)).sum()) for leaf in leaves)
+
+
+def is_inexact(leaf: Any) -> bool:
+    return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
+
+
+@dataclass
+class _Interpreter:
+    """One run of a program, operation by operation, up to and including its end."""
+
+    mended: list[int]  # numbers of operations whose results are made finite
+    found: Operation | None = None  # the first operation at fault
+    count: int = 0  # operations so far
+    rounds: list[int] = field(default_factory=list)  # of the loops that it is in
+
+    def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
+        """The results of a program."""
+        return interpreted(program, inputs, self._equation)
+
+    def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
+        name, params = equation.primitive.name, equation.params
+        if name == "scan":
+            return self._scan(params, inputs)
+        if name == "while":
+            return self._while(params, inputs)
+        if name == "cond":
+            chosen = int(np.clip(int(inputs[0]), 0, len(params["branches"]) - 1))
+            return self.closed(params["branches"][chosen], inputs[1:])
+        inner = next((params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params), None)
+        if name in _CALLS and isinstance(inner, Jaxpr | ClosedJaxpr):
+            return self.closed(inner, inputs)
+        made = equation.primitive.bind(*inputs, **params)
+        results = list(made) if equation.primitive.multiple_results else [made]
+        self.count += 1
+        if not count_bad(results):
+            return results
+        if self.count in self.mended:
+            return [jnp.nan_to_num(one, posinf=0, neginf=0) if is_inexact(one) else one for one in results]
+        if self.found is None and not count_bad(inputs):
+            self.found = self._operation(equation, inputs, results)
+        return results
+
+    def _scan(self, params: Any, inputs: list[Any]) -> list[Any]:
+        body, length = params["jaxpr"], params["length"]
+        if "ft_in" in params:  # jax 0.11.2
+            fixed, carry, rows = map(list, params["ft_in"].update(inputs).unpack())
+        else:
+            ends = np.cumsum([params["num_consts"], params["num_carry"]])
+            fixed, carry, rows = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
+        carries = len(carry)
+        out: dict[int, list[Any]] = {}
+        for k in reversed(range(length)) if params["reverse"] else range(length):
+            self.rounds.append(k)
+            made = self.closed(body, [*fixed, *carry, *(row[k] for row in rows)])
+            self.rounds.pop()
+            carry, out[k] = made[:carries], made[carries:]
+        shapes = [atom.aval for atom in body.jaxpr.outvars[carries:]]
+        stacked = [
+            jnp.stack([out[k][n] for k in range(length)]) if length else jnp.zeros((0, *one.shape), one.dtype)
+            for n, one in enumerate(shapes)
+        ]
+        return [*carry, *stacked]
+
+    def _while(self, params: Any, inputs: list[Any]) -> list[Any]:
+        first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+        carry, k = list(inputs[second:]), 0
+        while bool(self.closed(params["cond_jaxpr"], [*inputs[:first], *carry])[0]):
+            self.rounds.append(k)
+            carry = self.closed(params["body_jaxpr"], [*inputs[first:second], *carry])
+            self.rounds.pop()
+            k += 1
+        return carry
+
+    def _operation(self, equation: Any, inputs: list[Any], results: list[Any]) -> Operation:
+        values = np.asarray(next(one for one in results if count_bad(one)), np.float64)
+        index = tuple(int(k) for k in np.argwhere(~np.isfinite(values))[0])
+        given = tuple(
+            float(np.asarray(one, np.float64)[index if np.shape(one) else ()])
+            for one in inputs
+            if is_inexact(one) and np.shape(one) in ((), values.shape)
         )
-        for equation in program.eqns:
-            place, primitive = _line(equation) or outer, equation.primitive
-            ins = [one.val if hasattr(one, "val") else known[one] for one in equation.invars]
-            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
-            if hasattr(inner, "consts") and primitive.name not in ("scan", "while", "cond"):
-                outs = run(inner.jaxpr, inner.consts, ins, place)
-            else:
-                params = primitive.get_bind_params(equation.params)
-                # earlier versions of jax return functions among the arguments, too
-                more, params = params if isinstance(params, tuple) else ((), params)
-                outs = primitive.bind(*more, *ins, **params)
-                outs = outs if primitive.multiple_results else [outs]
-            if not found and finite(ins) and not finite(outs):
-                found.append(f"{primitive.name} ({place})")
-            known |= dict(zip(equation.outvars, outs, strict=True))
-        return [one.val if hasattr(one, "val") else known[one] for one in program.outvars]
-
-    run(closed.jaxpr, closed.consts, jax.tree.leaves(args), "place unknown")
-    return found[0] if found else "an operation on numbers that were not finite before"
+        where = (index, values.shape, tuple(self.rounds), given, self.count)
+        return Operation(equation.primitive.name, *_written(equation), *where)
 
 
-def _line(equation: Any) -> str:
-    """File, line and function in which an operation was written, outside of jax."""
-    for one in getattr(equation.source_info.traceback, "frames", ()):
-        if "/jax/" not in one.file_name and "/equinox/" not in one.file_name:
-            return f"{one.file_name.rpartition('/')[2]}:{one.line_num} {one.function_name}"
-    return ""
+def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
+    """Where an operation was written, and the functions on the way there, outermost first."""
+    traceback, inside = equation.source_info.traceback, f"{Path(jax.__file__).parent}/"
+    frames = [
+        one
+        for one in (traceback.frames if traceback is not None else ())
+        if not one.file_name.startswith(inside) and Path(one.file_name).name != Path(__file__).name
+    ]
+    if not frames:
+        return "", ()
+    names = [name for one in reversed(frames) for name in one.function_name.split(".") if name != "<locals>"]
+    here = frames[0]
+    return f"{Path(here.file_name).name}:{here.line_num}:{here.function_name}", tuple(names)

@@ -105,7 +105,7 @@ def independent(subject: Simulation | System) -> Reference:
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):
-        conversion = "none: the function, called operation by operation"
+        conversion = "none: the function, compiled for itself alone"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
     return Reference(

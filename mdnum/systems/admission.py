@@ -25,7 +25,7 @@ from mdnum.md import jaxmd
 from mdnum.md.cell import complete, displacement, wrap_positions
 from mdnum.md.energies import Call, EnergyFunction, with_images
 from mdnum.md.manybody import Smoothness
-from mdnum.numerics.jaxprs import first_not_finite, narrows, single_numbers
+from mdnum.numerics.jaxprs import Operation, first_not_finite, narrows, single_numbers
 from mdnum.plain import beside
 from mdnum.systems.simulation import Simulation
 
@@ -272,7 +272,7 @@ class Trial:
         raise self._error(code, operation=self._culprit(self.inside))
 
     def _culprit(self, idx) -> str:
-        return first_not_finite(jax.grad(self.bare, 1), *self._arguments(idx))
+        return _named(first_not_finite(jax.value_and_grad(self.bare, 1), *self._arguments(idx)))
 
     def _moves(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
         """Positions with one atom, that has neighbors, moved by each of some vectors; last those unmoved."""
@@ -438,6 +438,11 @@ class Trial:
 _BOXES = (("cell", "cell"), ("box", "columns", "rows"))
 
 
+def _named(found: Operation | None) -> str:
+    """An operation and where it was written."""
+    return "one of several" if found is None else f"{found.name} ({found.source or 'in a function of jax'})"
+
+
 def second_derivative(simulation: Simulation) -> str:
     """The first operation that makes second derivatives of an energy function not finite; empty for none."""
     if not isinstance(simulation.model, EnergyFunction):
@@ -452,4 +457,4 @@ def second_derivative(simulation: Simulation) -> str:
 
         if np.isfinite(np.asarray(jax.jit(along)(*arguments))).all():
             return ""
-        return first_not_finite(along, *arguments)
+        return _named(first_not_finite(along, *arguments))

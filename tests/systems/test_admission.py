@@ -337,7 +337,8 @@ def test_a_defect_closes_the_door(name: str):
     operation = {"NAN_BY_PADDING": "div", "NOT_FINITE": "log", "NOT_FINITE, a matrix": "rem"}.get(name)
     if operation is not None:
         assert caught.value.values["operation"].startswith(operation)
-        assert ".py:" in caught.value.values["operation"]
+        # what jax compiles as one has no line of its own
+        assert ("test_admission.py" in caught.value.values["operation"]) == (operation == "log")
 
 
 def overflowing(atoms: Atoms):
@@ -436,7 +437,7 @@ def test_a_box_that_needs_several_images_is_refused_with_the_repeats_that_do():
 def test_the_operation_that_makes_a_number_that_is_not_finite_is_named():
     inner = jax.jit(lambda x: jnp.sqrt(x) * 2)
     named = first_not_finite(jax.grad(lambda x: inner(x * x)), jnp.zeros(()))
-    assert named.startswith("div") and "test_admission.py" in named
+    assert named is not None and named.name == "div" and "test_admission.py" in named.source
 
 
 @pytest.mark.nightly

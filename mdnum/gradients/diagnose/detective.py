@@ -8,15 +8,13 @@ where mending it mends the program's own result: a number that is masked away la
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import AdjointCarry, StretchReversal, transposed
@@ -25,13 +23,8 @@ from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md.cell import HostCell
 from mdnum.md.decide import GROUP
-from mdnum.numerics.exact import interpreted
+from mdnum.numerics.jaxprs import Operation, count_bad, first_not_finite, is_inexact
 
-#: Operations that are looked into: what is in their parameters is a program, called once.
-_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
-          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
-#: Candidates that are tried before giving up.
-_MOST = 12
 #: Part of a step by the functions on the way to an operation; the first that is there counts.
 _PARTS = (
     ("onto_crossings", "crossings"),
@@ -64,152 +57,6 @@ class NotFinite:
     distance: float = float("nan")  # of the pair, length; NaN where there is none
 
 
-@dataclass(frozen=True)
-class Operation:
-    """An operation whose result is not finite."""
-
-    name: str  # of the primitive, such as "div"
-    source: str  # file:line:function that wrote it, innermost one outside of JAX; empty where it is not known
-    functions: tuple[str, ...]  # all functions on the way to it, outermost first
-    index: tuple[int, ...]  # of the first number that is not finite, in the result
-    shape: tuple[int, ...]  # of the result
-    rounds: tuple[int, ...]  # rounds of the loops around it, outermost first
-    # the numbers at that place of inputs that have the shape of the result, or no shape
-    inputs: tuple[float, ...]
-    count: int  # how many operations ran before it
-
-
-def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """The operation that makes the result of a function of arrays not finite; it is not compiled.
-
-    Returns:
-        None where every number of the result is finite, or one of the arguments is not.
-    """
-    leaves, tree = jax.tree.flatten(args)
-    if _bad(leaves):
-        return None
-    program = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))(*leaves)
-
-    def run(mended: list[int]) -> tuple[int, Operation | None]:
-        interpreter = _Interpreter(mended)
-        return _bad(interpreter.closed(program, leaves)), interpreter.found
-
-    mended: list[int] = []
-    before, candidate = run(mended)
-    first = candidate
-    for _ in range(_MOST if before else 0):
-        if candidate is None or run([*mended, candidate.count])[0] < before:
-            return candidate or first
-        # one that is masked away: made finite, so that the search goes on behind it
-        mended.append(candidate.count)
-        _, candidate = run(mended)
-    return first if before else None
-
-
-def _bad(tree: Any) -> int:
-    """How many numbers are not finite."""
-    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(tree) if _inexact(leaf)]
-    return sum(int((~np.isfinite(leaf)).sum()) for leaf in leaves)
-
-
-def _inexact(leaf: Any) -> bool:
-    return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
-
-
-@dataclass
-class _Interpreter:
-    """One run of a program, operation by operation, up to and including its end."""
-
-    mended: list[int]  # numbers of operations whose results are made finite
-    found: Operation | None = None  # the first operation at fault
-    count: int = 0  # operations so far
-    rounds: list[int] = field(default_factory=list)  # of the loops that it is in
-
-    def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
-        """The results of a program."""
-        return interpreted(program, inputs, self._equation)
-
-    def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
-        name, params = equation.primitive.name, equation.params
-        if name == "scan":
-            return self._scan(params, inputs)
-        if name == "while":
-            return self._while(params, inputs)
-        if name == "cond":
-            chosen = int(np.clip(int(inputs[0]), 0, len(params["branches"]) - 1))
-            return self.closed(params["branches"][chosen], inputs[1:])
-        inner = next((params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params), None)
-        if name in _CALLS and isinstance(inner, Jaxpr | ClosedJaxpr):
-            return self.closed(inner, inputs)
-        made = equation.primitive.bind(*inputs, **params)
-        results = list(made) if equation.primitive.multiple_results else [made]
-        self.count += 1
-        if not _bad(results):
-            return results
-        if self.count in self.mended:
-            return [jnp.nan_to_num(one, posinf=0, neginf=0) if _inexact(one) else one for one in results]
-        if self.found is None and not _bad(inputs):
-            self.found = self._operation(equation, inputs, results)
-        return results
-
-    def _scan(self, params: Any, inputs: list[Any]) -> list[Any]:
-        body, length = params["jaxpr"], params["length"]
-        if "ft_in" in params:  # jax 0.11.2
-            fixed, carry, rows = map(list, params["ft_in"].update(inputs).unpack())
-        else:
-            ends = np.cumsum([params["num_consts"], params["num_carry"]])
-            fixed, carry, rows = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
-        carries = len(carry)
-        out: dict[int, list[Any]] = {}
-        for k in reversed(range(length)) if params["reverse"] else range(length):
-            self.rounds.append(k)
-            made = self.closed(body, [*fixed, *carry, *(row[k] for row in rows)])
-            self.rounds.pop()
-            carry, out[k] = made[:carries], made[carries:]
-        shapes = [atom.aval for atom in body.jaxpr.outvars[carries:]]
-        stacked = [
-            jnp.stack([out[k][n] for k in range(length)]) if length else jnp.zeros((0, *one.shape), one.dtype)
-            for n, one in enumerate(shapes)
-        ]
-        return [*carry, *stacked]
-
-    def _while(self, params: Any, inputs: list[Any]) -> list[Any]:
-        first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-        carry, k = list(inputs[second:]), 0
-        while bool(self.closed(params["cond_jaxpr"], [*inputs[:first], *carry])[0]):
-            self.rounds.append(k)
-            carry = self.closed(params["body_jaxpr"], [*inputs[first:second], *carry])
-            self.rounds.pop()
-            k += 1
-        return carry
-
-    def _operation(self, equation: Any, inputs: list[Any], results: list[Any]) -> Operation:
-        values = np.asarray(next(one for one in results if _bad(one)), np.float64)
-        index = tuple(int(k) for k in np.argwhere(~np.isfinite(values))[0])
-        given = tuple(
-            float(np.asarray(one, np.float64)[index if np.shape(one) else ()])
-            for one in inputs
-            if _inexact(one) and np.shape(one) in ((), values.shape)
-        )
-        where = (index, values.shape, tuple(self.rounds), given, self.count)
-        return Operation(equation.primitive.name, *_written(equation), *where)
-
-
-def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
-    """Where an operation was written, and the functions on the way there, outermost first."""
-    traceback, inside = equation.source_info.traceback, str(Path(jax.__file__).parent)
-    frames = [
-        one
-        for one in (traceback.frames if traceback is not None else ())
-        if not one.file_name.startswith(inside) and Path(one.file_name).name != Path(__file__).name
-    ]
-    if not frames:
-        return "", ()
-    names = [name for one in reversed(frames) for name in one.function_name.split(".") if name != "<locals>"]
-    here = frames[0]
-    return f"{Path(here.file_name).name}:{here.line_num}:{here.function_name}", tuple(names)
-
-
 def detective(
     problem: Problem,
     names: Sequence[str],
@@ -235,14 +82,14 @@ def detective(
     if not np.isfinite(tape.value):
         return _in_forward(tape)
     back = StretchReversal(tape, wanted(full), GUARD * radial_speed(simulation) if saltation else None)
-    if _bad(back.onto_total):
+    if count_bad(back.onto_total):
         made = first_not_finite(jax.grad(lambda total: tape.loss.value(total, tape.frames)), tape.total)
         return _blamed(tape.steps, "loss", made)
     for stretch in tape.backward():
         before = back.carry
         _, trace = back.through(stretch)
         row = _last_bad(trace, stretch.rows)
-        if row is None and _bad(back.carry):
+        if row is None and count_bad(back.carry):
             # what a crossing before the first row of a stretch adds is seen in the carry alone
             row = 0
         if row is not None:
@@ -255,8 +102,8 @@ def detective(
 
 def _last_bad(trace: AdjointCarry, rows: int) -> int | None:
     """The latest row whose carry is not finite."""
-    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if _inexact(leaf)]
-    return next((row for row in reversed(range(rows)) if _bad([leaf[row] for leaf in leaves])), None)
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if is_inexact(leaf)]
+    return next((row for row in reversed(range(rows)) if count_bad([leaf[row] for leaf in leaves])), None)
 
 
 def _in_forward(tape: RunTape) -> NotFinite:

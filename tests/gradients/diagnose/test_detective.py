@@ -11,9 +11,10 @@ from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import NumericalError
 from mdnum.gradients import Problem, value_and_grad
-from mdnum.gradients.diagnose.detective import detective, first_not_finite
+from mdnum.gradients.diagnose.detective import detective
 from mdnum.gradients.losses import Custom, VelocityAutocorrelation
 from mdnum.gradients.parameters import with_values
+from mdnum.numerics.jaxprs import first_not_finite
 from mdnum.systems import build
 
 APART = 3e-3
