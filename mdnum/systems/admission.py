@@ -399,7 +399,7 @@ class Trial:
             j = int(self.idx[i, slot])
             if not i < j < n or abs(r[i, slot] - r_cut) > 0.2 * r_cut:
                 continue
-            toward = np.stack(displacement(self.box, self.x[i], self.x[j])) / r[i, slot]
+            toward = np.concatenate(displacement(self.box, self.x[[i]], self.x[[j]])) / r[i, slot]
             ends = []
             # what is continuous is a hundredth of itself, or less, at the second distance
             for factor in (1 - 1e-5, 1 - 1e-7, 1 + 1e-3):
