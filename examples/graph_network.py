@@ -5,20 +5,25 @@ is a little longer than `r_cut`, so that the list decides which pairs are edges:
 the decisions of the other.
 """
 
+from typing import Any
+
 import ase.build
 import jax
+import jax.numpy as jnp
 import jax_md
 
 import mdnum
 from mdnum.md.jaxmd import scalar
 
 SIDE = 2 * 5.26
+# jax-md annotates a float where it keeps the digits of an array alone
+cutoff: Any = scalar(4.7)
 atoms = ase.build.bulk("Ar", "fcc", a=5.26, cubic=True) * 2
 atoms.rattle(0.1, seed=1)
 
 displacement, _ = jax_md.space.periodic(scalar(SIDE))
 network = jax_md.energy.graph_network_neighbor_list(
-    displacement, SIDE, scalar(4.7), 0.3, key=jax.random.key(0), mlp_sizes=(8, 8)
+    displacement, jnp.asarray(SIDE), cutoff, 0.3, key=jax.random.key(0), mlp_sizes=(8, 8)
 )
 potential = mdnum.energy_function(network, 4.5, units=("Å", "meV"))
 simulation = mdnum.simulation(

@@ -163,8 +163,9 @@ class EnergyOnNeighborList(ClassicalCalculator):
             return own.deformed(x, neighbor, cell, jnp.eye(3) + strain)
 
         # hardly optimized: to compile takes less time than each operation by itself
+        options: Any = {"xla_backend_optimization_level": 0}
         slopes = jax.jit(jax.value_and_grad(energy, argnums=(0, 1))).lower(x, jnp.zeros((3, 3)))
-        total, (slope, strain) = slopes.compile({"xla_backend_optimization_level": 0})(x, jnp.zeros((3, 3)))
+        total, (slope, strain) = slopes.compile(options)(x, jnp.zeros((3, 3)))
         results = {"energy": float(total), "forces": -np.asarray(slope)}
         if atoms.cell.rank == 3:
             results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(strain) / atoms.get_volume())
