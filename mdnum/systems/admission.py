@@ -322,7 +322,7 @@ class Trial:
         shuffled = rng.permuted(self.inside, axis=1).astype(np.int32)
         if not self.same(energy, other := self.there(idx=shuffled)[0]):
             raise self._error("DEPENDS_ON_ORDER", here=energy, there=other)
-        wide = np.pad(self.inside, ((0, 0), (0, 8)), constant_values=n)
+        wide = np.concatenate([self.inside, np.full((n, 8), n, np.int32)], axis=1)
         # its own padding between the neighbors was among what was shuffled
         arguments = self._arguments(wide)
         alone = self._quick(jax.jit(self.bare).trace(*arguments))
