@@ -101,6 +101,7 @@ if TYPE_CHECKING:
     from mdnum.verbs.frame import read as read
     from mdnum.verbs.grad import grad as grad
     from mdnum.verbs.outcome import Outcome as Outcome
+    from mdnum.verbs.recorder import Recorder as Recorder
     from mdnum.verbs.run import run as run
 
     audit_calculator = _audit

@@ -13,7 +13,7 @@ EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
 #: Their paths through the package are those of other tests: of objects, of the verbs and of terms.
-_LONG = ("fork", "graph_network", "morse", "pair_network", "two_terms")
+_LONG = ("fork", "graph_network", "jax_md_recorder", "morse", "pair_network", "two_terms")
 
 
 @pytest.mark.parametrize(

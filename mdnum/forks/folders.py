@@ -115,6 +115,17 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         return _compared(first, second, where)
 
 
+def compare_recordings(a: Path, b: Path) -> FolderFork:
+    """Where the decisions of two recorded loops diverge, by their folders; steps are frames."""
+    one, two = RunFolder.open(a), RunFolder.open(b)
+    steps = min(one.rows("frames"), two.rows("frames")) - 1
+    names = ("rule", "i", "j", "rank")
+    same = all(np.array_equal(one.read("members")[name], two.read("members")[name]) for name in names)
+    fork, flips = _alone(one, two, "flips", names[1:], steps, "frame") if same else (0, [])
+    channel, nearest = "" if fork is None else "pair", sorted(flips, key=lambda flip: abs(flip.margin))
+    return FolderFork("flips", a, b, (), (), steps, None, fork, channel, same, decisions=tuple(nearest))
+
+
 def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bool = True) -> Any:
     """The simulation or the ball's system of a run folder.
 
@@ -202,11 +213,11 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 
 
 def _alone(
-    first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int
+    first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
     """The first step at which a flip is in one table alone, and those flips."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
-    names = ("step", *labels, "entered", *["terms"] * all("terms" in one for one in known))
+    names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
     tables = [folder.read(table, [*names, "margin", "bound", *further]) for folder in (first, second)]
     rows = [

@@ -116,6 +116,8 @@ class RunFolder:
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
         # what the schemas of its tables say besides what its own files do: `system`, and further `units`
         self.told: dict[str, Any] = {}
+        #: whether rows are on disk as soon as `flush` has been called, in any folder
+        self.in_parts = False
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], layout: Layout) -> RunFolder:
@@ -305,6 +307,11 @@ class RunFolder:
         if parts.is_dir() and not any(parts.iterdir()):
             parts.rmdir()
         self.close()
+
+    def flush(self, *last: str) -> None:
+        """Writes what was appended, some tables after the others: a kill leaves no row of theirs too many."""
+        for name in sorted(self._streams, key=last.count):
+            self._streams[name].flush()
 
     def merge(self) -> None:
         """Makes one file of each table that has rows; they can be read before the folder is finished."""
@@ -595,7 +602,8 @@ class RunFolder:
                 raise ValueError(f"a folder of {self.kind} is declared without a table {name!r}")
             own = self.layout.described
             describe = lambda schema: described(schema, name, self.about, own)  # noqa: E731
-            self._streams[name] = TableStream(self.path, name, self.layout, describe=describe)
+            args = (self.path, name, self.layout)
+            self._streams[name] = TableStream(*args, describe=describe, in_parts=self.in_parts)
         return self._streams[name]
 
     def _reader(self, name: str) -> TableStream:

@@ -48,7 +48,7 @@ class TableStream:
 
     def __init__(
         self, root: Path, name: str, layout: Layout | None, check: Callable[[Path], None] | None = None,
-        describe: Callable[[pa.Schema], pa.Schema] = pa.Schema.remove_metadata,
+        describe: Callable[[pa.Schema], pa.Schema] = pa.Schema.remove_metadata, in_parts: bool = False,
     ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
             raise FolderError(f"no table is called {name!r}", where=str(root))
@@ -70,8 +70,8 @@ class TableStream:
         self.parts_folder = root / "parts"
         self._buffer: list[Mapping[str, Any]] = []
         self._buffered = 0
-        # of what is resumed from the rows that it has
-        self._in_parts = layout is not None and layout.resumes_from == "checkpoint.npz"
+        # of what is resumed from the rows that it has, or may be killed at any time
+        self._in_parts = in_parts or (layout is not None and layout.resumes_from == "checkpoint.npz")
         self._writing: _Writing | None = None
         self._schema: pa.Schema | None = None
         files = self.files()

@@ -18,6 +18,7 @@ from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import EarlierFramesError
 from mdnum.trajectories.frame import AtomIndices, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
+from mdnum.trajectories.images import NARROW, ImageFlips
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.resolution import Resolution
@@ -77,7 +78,7 @@ def _usable(
     streams = []
     for one in files:
         one.check = FrameCheck(atoms, str(one.path), radius, one.bits, species=species)
-        one.repeats = RepeatedFrames(one.drop_repeats)
+        one.repeats = RepeatedFrames(one.drop_repeats, one.remembered)
         streams.append(one.repeats(map(one.check, one.frames())))
     while True:
         try:
@@ -142,6 +143,7 @@ class Followed:
     flux: list[tuple[int, float]] = field(default_factory=list)  # (flips, moment) where velocities were used
     reach: float = float("nan")  # the usual distance of a pair at the threshold, length; nan without one
     ranked: bool = False  # whether it is mostly the order of distances that decides there, and no radius
+    images: ImageFlips | None = None  # where several images of an atom can be inside
 
 
 @dataclass
@@ -214,11 +216,16 @@ def _hand_on(
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
         one.reach, one.ranked = _threshold(one.rule, members)
+        if not one.rule.directed and lattice_of(frame.box).narrowest < NARROW * one.rule.reach:
+            one.images = ImageFlips()
         sink("members", {"rule": np.full(len(members), number), **vars(members)})
     else:
         one.neighbors.step(flips)
     if len(flips):
         sink("flips", flips.columns(number))
+    if one.images is not None and (rows := one.images.step(frame, one.tracker)) is not None:
+        same = {"rule": number, "frame": at}
+        sink("images", {**{name: np.full(len(rows["i"]), value) for name, value in same.items()}, **rows})
     fewest, mean, most = one.neighbors.count()
     entered = int(np.count_nonzero(flips.entered))
     row = {

@@ -22,10 +22,7 @@ _ASE_SUFFIXES = frozenset({".traj", ".json", ".db", ".bundle", ".castep", ".xsf"
 # Amber's, of which MDAnalysis reads those that are whole
 _NETCDF = frozenset({"nc", "ncdf", "netcdf"})
 #: What to do with frames that are not in a file.
-IN_MEMORY = (
-    "Give the path of a trajectory; arrays (frames, atoms, 3) go into mdnum.trajectories.NeighborFlips("
-    "MDAnalysis.Universe.empty(atoms).load_new(array), r_cut=...)"
-)
+IN_MEMORY = "Give the path of a trajectory; arrays go into mdnum.flips(array, cell=...) or a mdnum.Recorder"
 
 
 def _concrete(reader: Any) -> None:

@@ -7,6 +7,7 @@ restart that rounds otherwise repeats times and not bits: of two frames the firs
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -36,6 +37,7 @@ class RepeatedFrames:
 
     Attributes:
         drop: leave them out when frames are passed on.
+        most: frames that are remembered, the latest.
         frames: how many there are.
         again: ranges of other frames whose times were there before, with numbers as in `stretches`, the first
             and the last time (time, to), and how many there are (frames).
@@ -44,6 +46,7 @@ class RepeatedFrames:
     """
 
     drop: bool = False
+    most: float = math.inf
     frames: int = 0
     stretches: list[dict[str, Any]] = field(default_factory=list)
     # (place, number) of each frame known, and how far back the last one was found; 0 where it is new
@@ -59,6 +62,10 @@ class RepeatedFrames:
     def __call__(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Passes frames on, without those that repeat others if they are to be left out."""
         for frame in frames:
+            every: list[dict[Any, Any]] = [self._known, self._wrapped, self._times]
+            for held in every:
+                if len(held) > self.most:
+                    del held[next(iter(held))]
             if not (
                 self.see(frame.index, self._digest(frame)) | self.had(frame.index, frame.time) and self.drop
             ):

@@ -54,6 +54,7 @@ class Trajectory(ABC):
     _ids: np.ndarray | None = None
     # whether frames that repeat earlier ones are left out; which did, and what was found of frames, when read
     drop_repeats = False
+    remembered = math.inf  # frames with which later ones are compared
     repeats: RepeatedFrames
     check: FrameCheck
     universe: Any = None  # the MDAnalysis Universe behind it, where there is one

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, replace
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain
 from numbers import Real
 from pathlib import Path
@@ -19,7 +20,7 @@ from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
-from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering, keywords_checked
+from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, answering, keywords_checked, refuse
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -50,9 +51,10 @@ _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.
 
 @keywords_checked
 def flips(
-    trajectory: str | Path,
+    trajectory: Any,
     other: str | Path | None = None,
     *,
+    cell: Any = None,
     topology: str | Path | None = None,
     cutoffs: float | Sequence[float] = (),
     pairs: _Pairs | Sequence[_Pairs] = (),
@@ -68,11 +70,14 @@ def flips(
 
     Example:
         >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
+        >>> mdnum.flips(positions, cell=box_lengths, cutoffs=2.5)
 
     Args:
         trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
-            may stand behind an @ ("run.xtc@100:", "run.xtc@::10").
-        other: another one of the same atoms: where do the two diverge?
+            may stand behind an @ ("run.xtc@100:", "run.xtc@::10"). Or an array (frames, atoms, 3) of lengths,
+            or a list of ASE's Atoms; `Recorder` takes more.
+        other: another file of the same atoms: where do the two diverge?
+        cell: of an array: lengths, or lattice vectors as rows; of all frames, or one for each.
         topology: what the atoms are, where the trajectory does not say.
         cutoffs: a length in the file's unit, or several, a rule each; default the cutoff of the mdnum run
             that the file belongs to. One rule needs no sequence here, nor in `pairs` and `nearest`.
@@ -92,24 +97,59 @@ def flips(
             exception: what came before is kept, and the summary names the frame.
         FolderError: the folder cannot be used.
     """
-    from mdnum.trajectories.follow import follow
-    from mdnum.trajectories.lost import FrameMotion
+    from mdnum.trajectories.arrays import ArrayFrames
     from mdnum.trajectories.readers import open_trajectory
-    from mdnum.trajectories.resolution import grid_effect, infer
 
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
+    files = {"other": other is not None, "topology": topology is not None, "format": format is not None}
+    if in_memory := hasattr(trajectory, "shape") or type(trajectory) in (list, tuple):
+        refuse(files, "of files", "Leave it out for arrays")
+    else:
+        refuse({"cell": cell is not None}, "of arrays", "Leave it out: a file has boxes of its own")
+    open_one = partial(open_trajectory, topology=topology, format=format)
     asked = rules(cutoffs, pairs, nearest, most)
     if other is not None:
         from mdnum.verbs.flips_compare import compare
 
         _refuse_topology_first(trajectory, other, topology)
-        a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
+        a, b = map(open_one, (trajectory, other))
         a.drop_repeats = b.drop_repeats = drop_repeats
         return compare(a, b, asked or _default_rules(a), between, **keep)
-    opened = open_trajectory(trajectory, topology, format=format)
+    opened = ArrayFrames.of(trajectory, cell) if in_memory else open_one(trajectory)
     opened.drop_repeats = drop_repeats
-    asked = asked or _default_rules(opened)
+    with examining(opened, asked or _default_rules(opened), between, window, **keep) as one:
+        of = opened.count or 0
+        one.interrupted = one.rows.drain(one.answer.folder, one.passes, one.found, of, one.answer.log)
+    return one.answer.outcome
+
+
+@dataclass
+class Examination:
+    """Frames on their way into a folder: a file's are pulled, those of a `Recorder` are pushed."""
+
+    answer: Answer  # its folder takes what follows from the tables, when all frames were examined
+    rows: HeldRows  # to be handed over to the folder by then
+    passes: Iterator[Pass]  # a step for each frame but the first, which was examined
+    found: Pass  # what was found so far
+    interrupted: bool = False  # whether there were more
+
+
+@contextmanager
+def examining(
+    opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
+    live: bool = False, **keep: Unpack[Keep],
+) -> Iterator[Examination]:  # fmt: skip
+    """A new folder whose tables are filled inside, with what follows from them; arguments as of `flips`.
+
+    Args:
+        live: whether frames are those of a program that runs: their numbers are steps, between which it
+            decides nothing, and it may be killed, so that rows are kept in part files.
+    """
+    from mdnum.trajectories.follow import follow
+    from mdnum.trajectories.lost import FrameMotion
+    from mdnum.trajectories.resolution import grid_effect, infer
+
     groups = selected(opened, between)
     sample = opened.sample()
     resolution = infer(sample, opened.bits, opened.format)
@@ -119,20 +159,22 @@ def flips(
     found, began = next(passes), time.perf_counter()
     with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
         folder, log = answer.folder, answer.log
-        atoms = opened.table.columns
+        folder.in_parts, atoms = live, opened.table.columns
         for end in "ij":
             folder.look_up("flips", end, {f"{name}_{end}": values for name, values in atoms.items()})
-        interrupted = rows.drain(folder, passes, found, opened.count or 0, log)
+        yield (one := Examination(answer, rows, passes, found))
         read = time.perf_counter()
         frames = folder.read("frames")
         steps = _steps(frames, opened)
         timed = steps["timed"] and found.odd is None
         motion = FrameMotion.of(sample, resolution, *groups, timed=timed)
-        told = [
-            _rule_told(folder, number, one, found, frames, steps, opened, groups, window, motion, log)
-            | {"grid": grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)}
-            for number, one in enumerate(found.rules)
+        told: list[dict[str, Any]] = [
+            _rule_told(folder, number, rule, found, frames, steps, opened, groups, window, motion, log)
+            | {"grid": grid_effect(resolution, sample, rule.reach, *groups, ranked=rule.ranked)}
+            for number, rule in enumerate(found.rules)
         ]
+        if live and (np.diff(frames["number"][frames["rule"] == 0]) == 1).all():
+            told = [each | {"stride": {**each["stride"], "between": None}} for each in told]
         answer.result, answer.summary = found, {
             **about(opened, "flips", between),
             "box": sample[0].box.plain(),
@@ -147,10 +189,10 @@ def flips(
             "repeats": opened.repeats.plain(),
             "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
-            **ending(found.stopped, interrupted),
+            **ending(found.stopped, one.interrupted),
             "seconds": time.perf_counter() - began, "seconds_of_frames": read - began,
+            **answer.summary,
         }  # fmt: skip
-    return answer.outcome
 
 
 KINDS = {"flips": Verb(judge, page, FlipsView)}

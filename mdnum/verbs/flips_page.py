@@ -13,6 +13,7 @@ from mdnum.report.browse import Browse
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, listed, many, number, percent, plain
+from mdnum.verbs import flips_loop
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
@@ -38,7 +39,10 @@ Limit = tuple[str, tuple[str, ...], dict[str, Any]]
 
 def judge(view: FlipsView) -> Verdict:
     """Headline, evidence and findings of a trajectory."""
-    found = [*_ended(view), *_of_rules(view), *_others(view)]
+    if view.summary["status"] == "unfinished":
+        return flips_loop.unfinished(view)
+    told = (view.summary.get(name) for name in ("lists", "energy"))
+    found = [*_ended(view), *flips_loop.findings(view, *told), *_of_rules(view), *_others(view)]
     quiet = all(one.severity == "info" for one in found)
     return conclude(found, _evidence(view), headline=_headline(view), best="good" if quiet else "info")
 
@@ -65,6 +69,8 @@ def _headline(view: FlipsView) -> str:
 
 def _evidence(view: FlipsView) -> Iterator[str]:
     yield resolution(view.summary["resolution"], view.unit)
+    if (lists := view.summary.get("lists")) and not lists["lost"]:
+        yield TEXTS("none_lost", **lists)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
         if view.summary["frames"] > 1 and not len(_disagreeing(view, place)):
             yield TEXTS("algebra", **{**one, "rule": view.rule(one)})
@@ -81,7 +87,8 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
         cut = ["cut"] * summary["cut_short"]
         yield TEXTS.finding("STOPPED", *cut, error=summary["stopped"], **values)
     if summary["interrupted"]:
-        yield TEXTS.finding("INTERRUPTED", **values)
+        ended = summary.get("ended_by")
+        yield TEXTS.finding("INTERRUPTED", *["loop"] * bool(ended), **values, error=ended)
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
@@ -230,10 +237,13 @@ def _title(title: str, view: FlipsView, one: Rule) -> str:
 def page(view: FlipsView, verdict: Verdict) -> Page:
     """The page of a trajectory."""
     summary = view.summary
-    size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
+    size = many(summary["atoms"], "atom")
+    if summary["status"] == "unfinished":
+        return view.page(f"{view.name}: neighbor-set flips", size, [], [])
+    size += f", {many(summary['frames'], 'frame')}"
     if view.timed:
         size += f" {view.time(plain(summary['interval']))} apart"
-    sections = [Section("Rules", [_rules(view)], terminal=True)]
+    sections = [Section("Rules", [_rules(view)], terminal=True), *flips_loop.sections(view)]
     for place, one in enumerate(summary["rules"]):
         sections += _rule_sections(view, place, one)
     if (browsed := _busiest(view)) is not None:

@@ -74,12 +74,13 @@ class HeldRows:
         units = {"length": trajectory.length, "decision": trajectory.length, "time": trajectory.time}
         # what the schemas of the tables say
         self._told = {"system": name_of(trajectory), "units": units}
-        self._held: dict[str, list[Mapping[str, np.ndarray]]] = {}
+        #: by table, since they were handed over
+        self.held: dict[str, list[dict[str, np.ndarray]]] = {}
         self._count = self.flips = 0
 
-    def add(self, table: str, columns: Mapping[str, np.ndarray]) -> None:
+    def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
         """Adds rows, equally long columns."""
-        self._held.setdefault(table, []).append(columns)
+        self.held.setdefault(table, []).append(columns)
         rows = len(next(iter(columns.values())))
         self._count += rows
         self.flips += rows * (table == "flips")
@@ -92,22 +93,28 @@ class HeldRows:
             found: what it goes by, with `frames` read so far, and `stopped` where the rest cannot be read.
             of: how many there are, 0 if not known.
         """
-        folder.told = self._told
         with asked_to_stop() as stop:
             while True:
-                if self._count > _ROWS_HELD:
-                    self._hand_over(folder)
+                if self.full:
+                    self.hand_over(folder)
                 counts = {"flips": self.flips} if self.flips else {}
                 log(found.frames, of, {"phase": "run", "unit": "frames", **counts})
                 if (asked := stop()) or next(passes, None) is None or found.stopped is not None:
-                    self._hand_over(folder)
+                    self.hand_over(folder)
                     folder.merge()
                     return asked
 
-    def _hand_over(self, folder: RunFolder) -> None:
-        for table, parts in self._held.items():
+    @property
+    def full(self) -> bool:
+        """Whether there are so many that they should be handed over."""
+        return self._count > _ROWS_HELD
+
+    def hand_over(self, folder: RunFolder) -> None:
+        """Appends the rows to their tables."""
+        folder.told = self._told
+        for table, parts in self.held.items():
             folder.append(table, together(parts))
-        self._held, self._count = {}, 0
+        self.held, self._count = {}, 0
 
 
 class FlipsView(View):

@@ -1,0 +1,197 @@
+"""Frames as a program has them in memory: arrays of numpy, jax or torch that are given one after the other.
+
+ASE, vesin and torch-sim have lattice vectors as rows of a matrix (`cell`), jax-md as columns of an upper
+triangular one (`box`), and often positions in fractions of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.topology import AtomTable
+from mdnum.trajectories.trajectory import SAMPLE, Trajectory
+
+# shapes of a box of all frames
+_SINGLE = ((), (1,), (3,), (6,), (3, 3))
+# atoms from which on coordinates that all lie between 0 and 1 are fractions; spread at which none are
+_MANY, _SPREAD = 64, 10.0
+_UPPER = (
+    "The cell is upper triangular, as boxes are in jax-md, and its rows were taken for the lattice vectors."
+)
+
+
+def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
+    """An array as numpy has it, not copied.
+
+    Raises:
+        InputError: it holds numbers of other kinds, or floats of fewer than 32 bits.
+    """
+    found = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
+    if found.dtype.kind not in kinds or (found.dtype.kind == "f" and found.dtype.itemsize < 4):
+        expected = "float32 or float64" if "f" in kinds else "integers"
+        raise InputError(
+            f"{name} of dtype {found.dtype}; expected {expected}", remedy="Convert them", where=name
+        )
+    return found
+
+
+class ArrayFrames(Trajectory):
+    """Frames that a program gives one by one; each waits until the next is examined.
+
+    Args:
+        name: what they are called on a page.
+        species, cell, box, pbc, fractional, timestep, length, time: as of `mdnum.Recorder`.
+    """
+
+    reader, remembered = "mdnum", 10_000  # a loop may have any number of frames
+
+    def __init__(
+        self, name: str, *, species: Any = None, cell: Any = None, box: Any = None, pbc: Any = None,
+        fractional: bool | None = None, timestep: float | None = None, length: str = "Å", time: str = "ps",
+    ) -> None:  # fmt: skip
+        super().__init__(Path(name), None, slice(None))
+        self.length, self.time = length, "step" if timestep is None else time
+        self.named, self._box, self._fractional = species, (cell, box, pbc), fractional
+        self._timestep = timestep or 1.0
+        self._waiting: deque[Frame] = deque()
+        self._gone, self._first = 0, list[Frame]()
+
+    def read(
+        self,
+        step: int,
+        positions: Any,
+        cell: Any = None,
+        box: Any = None,
+        pbc: Any = None,
+        velocities: Any = None,
+    ) -> Frame:
+        """The next frame, of what `mdnum.Recorder.see` takes.
+
+        Raises:
+            InputError: arrays of another shape or kind than expected, or than before; two boxes.
+        """
+        here, x = self._box_of(cell, box, pbc), host(positions, "positions")
+        if x.ndim != 2 or x.shape[1] != 3:
+            message = f"positions of shape {x.shape}; expected (atoms, 3)"
+            raise InputError(message, remedy="Give one frame; see_many takes several", where="positions")
+        bits, x = 32 if x.dtype == np.float32 else 64, np.array(x, np.float64)
+        if not self._first:
+            self._begin(x, here, bits)
+        if bits != self.bits:
+            message = f"positions were float{self.bits} and are float{bits} at step {step}"
+            raise InputError(message, remedy="Give all frames in one dtype", where="positions")
+        v = (
+            None
+            if velocities is None or self.time == "step"
+            else np.array(host(velocities, "velocities"), float)
+        )
+        if v is not None and v.shape != x.shape:
+            raise InputError(
+                f"velocities of shape {v.shape}, positions of {x.shape}", remedy="Give those of all"
+            )
+        x = x @ here.matrix if self._fractional else x
+        return Frame(int(step), int(step) * self._timestep, x, here, v)
+
+    def put(self, frame: Frame) -> None:
+        """Adds the next frame."""
+        self._waiting.append(frame)
+        if len(self._first) < SAMPLE:
+            self._first.append(frame)
+
+    def _box_of(self, cell: Any, box: Any, pbc: Any) -> Box:
+        cell, box = self._box[:2] if cell is None and box is None else (cell, box)
+        pbc = self._box[2] if pbc is None else pbc
+        name = "cell" if box is None else "box"
+        given = np.zeros(3) if cell is None and box is None else host(cell if box is None else box, name)
+        if given.shape == (6,) and box is None:
+            from ase.geometry import cellpar_to_cell
+
+            given = np.asarray(cellpar_to_cell(given))
+        if (cell is not None and box is not None) or given.shape not in ((), (1,), (3,), (3, 3)):
+            message = f"{name} of shape {given.shape}" if cell is None or box is None else "both cell and box"
+            remedy = "Give one length, three, or three vectors: in rows as cell, or in columns as box"
+            raise InputError(message, remedy=remedy, where=name)
+        matrix = np.eye(3) * given if given.ndim < 2 else np.array(given if box is None else given.T, float)
+        if box is not None and np.triu(matrix, 1).any():
+            message = f"box = {given.tolist()} is not upper triangular, as columns are in jax-md"
+            raise InputError(message, remedy="Give lattice vectors in rows as cell", where="box")
+        repeats = matrix.any(axis=1) if pbc is None else np.broadcast_to(np.asarray(pbc, bool), 3)
+        return Box(matrix, np.array(repeats, bool))
+
+    def _begin(self, x: np.ndarray, box: Box, bits: int) -> None:
+        """Checks what holds for all frames by the first."""
+        fractional, remedy = self._fractional, "Say fractional=True, or fractional=False for lengths"
+        if fractional is None and len(x) >= _MANY and box.shortest > 2 and x.min() >= 0 and x.max() <= 1:
+            message = f"all coordinates lie between 0 and 1, in a box of {box.shortest:g} and more"
+            raise InputError(message, remedy=remedy, where="positions")
+        if fractional and (not box.pbc.all() or np.ptp(x, axis=0).max(initial=0.0) > _SPREAD):
+            message = f"fractional coordinates from {x.min():.3g} to {x.max():.3g}, box {box.matrix.tolist()}"
+            raise InputError(message, remedy=remedy, where="positions")
+        words = (
+            ["X"] * len(x) if self.named is None else [str(one) for one in np.asarray(self.named).tolist()]
+        )
+        if len(words) != len(x):
+            raise InputError(f"{len(words)} species for {len(x)} atoms", remedy="Give one for each atom")
+        self.table, self.bits = AtomTable.plain(words, self.named is not None), bits
+        self.format = f"{'fractional coordinates' if fractional else 'positions'} in float{bits}"
+        if self._box[1] is None and np.triu(box.matrix, 1).any() and not np.tril(box.matrix, -1).any():
+            self.notes = (_UPPER,)
+
+    @classmethod
+    def of(cls, frames: Any, cell: Any = None) -> ArrayFrames:
+        """Frames that are all there: an array, or ASE's Atoms in a list."""
+        found = cls("array")
+        found.time = "frame"
+        for k, (x, given) in enumerate(one_by_one(frames, {"cell": cell})):
+            if hasattr(x, "get_positions"):
+                found.named, given = x.get_chemical_symbols(), {"cell": x.cell.array, "pbc": x.pbc}
+            found.put(found.read(k, getattr(x, "positions", x), **given))
+        if not found._first:
+            raise InputError("no frame in the array", remedy="Give (frames, atoms, 3)", where="positions")
+        return found
+
+    @property
+    def now(self) -> Frame:
+        """The frame that was examined last."""
+        return self._waiting[0]
+
+    def sample(self) -> list[Frame]:
+        """The first frames, as many as there are by now."""
+        return list(self._first)
+
+    @contextmanager
+    def raw_frames(self) -> Iterator[Callable[[int], Any]]:
+        """Gives frames by their place."""
+
+        def get(number: int) -> Frame | None:
+            while self._waiting and self._gone < number:
+                self._waiting.popleft()
+                self._gone += 1
+            return self._waiting[0] if self._waiting else None
+
+        yield get
+
+    def decoded(self, number: int, raw: Any) -> Frame:
+        """A frame is one already."""
+        return raw
+
+
+def one_by_one(frames: Any, given: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """(a frame of many, what belongs to it) of keywords of `mdnum.Recorder.see_many`."""
+    frames = frames if isinstance(frames, list | tuple) else host(frames, "positions")
+    given = {name: one for name, one in given.items() if one is not None}
+    rows = {name for name, one in given.items() if isinstance(one, list) or name in ("energy", "velocities")}
+    rows |= {name for name in given if name in ("cell", "box") and np.shape(given[name]) not in _SINGLE}
+    if wrong := [name for name in sorted(rows) if len(given[name]) != len(frames)]:
+        message = f"{len(given[wrong[0]])} of {wrong[0]} for {len(frames)} frames"
+        raise InputError(message, remedy="Give one for each frame", where=wrong[0])
+    for k, frame in enumerate(frames):
+        yield frame, {name: one[k] if name in rows else one for name, one in given.items()}

@@ -1,0 +1,115 @@
+"""What a loop says of itself beside its positions: its neighbor lists and its energy, counted and judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.report.section import Section, curves, pairs
+from mdnum.store import RunFolder
+from mdnum.verbs.flips_shared import TEXTS, FlipsView
+
+# energies whose steps go with flips: the slope over its error, and the share of the steps' variance; and how
+# many times less an energy without its jumps varies
+_CLEAR, _SHARE, _LESS = 5.0, 0.1, 2.0
+_POINTS = 2_000
+
+
+def loop_told(folder: RunFolder) -> dict[str, Any]:
+    """What the tables say of the program's own lists and energy; None of what it did not give."""
+    loop = folder.read("loop")
+    return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
+
+
+def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
+    known, lost = loop["listed"] >= 0, folder.read("lost")
+    frames, flagged = (np.flatnonzero(loop[name]) for name in ("lost", "overflow"))
+    if not known.any():
+        return None
+    told: dict[str, Any] = {
+        "lists": int(loop["new_list"].sum()), "frames": int(known.sum()), "lost": len(lost["i"]),
+        "listed": float(loop["listed"][known].mean()), "lost_frames": len(frames),
+        "first": int(loop["number"][frames[0]]) if len(frames) else None, "worst": None, "overflow": None,
+    }  # fmt: skip
+    if len(lost["i"]):
+        worst = {name: column[np.argmax(lost["deepest"])] for name, column in lost.items()}
+        told["worst"] = {**worst, "frames": worst["end"] - worst["begin"]}
+    if len(flagged):
+        before = np.concatenate([[0], np.cumsum(loop["overflow"])])
+        first, last = loop["number"][flagged[[0, -1]]].tolist()
+        told["overflow"] = {
+            "frames": len(flagged), "first": first, "last": last,
+            "lost": int(np.count_nonzero(before[lost["end"]] > before[lost["begin"]])),
+            "deepest": float(loop["deepest"][flagged].max()),
+        }  # fmt: skip
+    return told
+
+
+def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
+    """How far the energy gets, and how much of that comes with flips."""
+    energy = loop["energy"]
+    if len(energy) < 4 or not np.isfinite(energy).all():
+        return None
+    frames = folder.read("frames", ["rule", "entered", "left"])
+    net = (frames["entered"] - frames["left"])[frames["rule"] == 0][1 - len(energy) :].astype(float)
+    steps = np.diff(energy) - np.diff(energy).mean()
+    told: dict[str, Any] = {
+        "frames": len(energy), "change": float(energy[-1] - energy[0]), "spread": float(energy.std()),
+        **dict.fromkeys(("slope", "error", "share", "jumps", "rest")),
+    }  # fmt: skip
+    if np.ptp(net) > 0 and steps.any():
+        slope = float(net @ steps) / (scatter := len(net) * net.var())
+        rest = float(((steps - slope * (net - net.mean())) ** 2).sum())
+        told |= {
+            "slope": slope,
+            "error": np.sqrt(rest / (len(net) - 2) / scatter),
+            "share": 1 - rest / (steps @ steps),
+        }
+    if np.isfinite(loop["energy_jump"]).all():
+        jumps = np.cumsum(loop["energy_jump"])
+        told |= {"jumps": float(jumps[-1]), "rest": float((energy - jumps).std())}
+    return told
+
+
+def findings(
+    view: FlipsView, lists: Mapping[str, Any] | None, energy: Mapping[str, Any] | None
+) -> Iterator[Finding]:
+    """On lost pairs, overflow and the energy."""
+    if lists and (worst := lists["worst"]) is not None:
+        values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
+        yield TEXTS.finding("LOST_PAIRS", **{**lists, **values, "deepest": view.length(worst["deepest"])})
+    if lists and (overflow := lists["overflow"]) is not None:
+        values = {**overflow, "deepest": view.length(overflow["deepest"])}
+        yield TEXTS.finding("OVERFLOW", *["harmless"] * (not overflow["lost"]), **values)
+    if energy and energy["rest"] is not None and energy["spread"] > _LESS * energy["rest"]:
+        yield TEXTS.finding("ENERGY_STEPS", "known", **energy)
+    elif energy and energy["rest"] is None and (energy["share"] or 0.0) > _SHARE:
+        yield from [TEXTS.finding("ENERGY_STEPS", **energy)] * (
+            abs(energy["slope"]) > _CLEAR * energy["error"]
+        )
+
+
+def sections(view: FlipsView) -> Iterator[Section]:
+    """On lists and on the energy, where the loop gave them."""
+    rows, energy = view.table("loop"), view.summary.get("energy")
+    some = slice(None, None, -(-len(rows["number"]) // _POINTS) or 1)
+    drawn = {"lists": {"pairs lost": rows["lost"].astype(float)}, "energy": {"energy": rows["energy"]}}
+    if energy and energy["jumps"] is not None:
+        drawn["energy"]["without what flips add"] = rows["energy"] - np.cumsum(rows["energy_jump"])
+    for (name, lines), title in zip(drawn.items(), ("Neighbor lists", "Energy"), strict=True):
+        if told := view.summary.get(name):
+            shown = curves(rows["number"][some], {label: y[some] for label, y in lines.items()}, log=False)
+            yield Section(title, [pairs(TEXTS.rows(name, **told)), TEXTS.plot(f"loop_{name}", shown)])
+
+
+def unfinished(view: FlipsView) -> Verdict:
+    """What is known of a loop that ended before its recorder was closed."""
+    frames, one = view.table("frames"), view.summary["rules"][0]
+    number, entered, left = (frames[name][frames["rule"] == 0] for name in ("number", "entered", "left"))
+    flips, last = int((entered + left).sum()), int(number[-1])
+    values = {"frames": len(number), "flips": flips, "last": last, "rule": view.rule(one)}
+    found = [TEXTS.finding("NOT_CLOSED", **values), *findings(view, **loop_told(view.folder))]
+    return conclude(found, headline=TEXTS("not_closed", **values))

@@ -1,0 +1,275 @@
+"""`mdnum.Recorder`: frames of anybody's loop into the folder that `mdnum flips` makes of a file."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError, MdnumError
+from mdnum.trajectories.arrays import ArrayFrames, one_by_one
+from mdnum.trajectories.listed import ListCheck, PairList
+from mdnum.trajectories.trajectory import SAMPLE
+from mdnum.verbs.flips import WINDOW, Examination, examining, rules
+from mdnum.verbs.flips_loop import loop_told
+from mdnum.verbs.flips_shared import about
+from mdnum.verbs.frame import Outcome
+
+if TYPE_CHECKING:
+    from mdnum.forks.folders import FolderFork
+
+# seconds between writes, and how many times what a write takes
+_EVERY, _TIMES = 2.0, 50.0
+_NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "entered")}
+
+
+class Recorder:
+    """Flips, and pairs that the neighbor list in use lacks, of a loop that somebody else runs.
+
+    The loop stays as it is; what `see` is given ends up in the folder, findings and page that `mdnum.flips`
+    makes of a file with the same frames. Decisions are those that follow from the positions in float64, with
+    a bound for what positions in float32 leave undecided.
+
+    Example:
+        >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
+        ...     for step in range(1000):
+        ...         state = apply(state, neighbor=neighbors)
+        ...         rec.see(step, state.position, neighbors=neighbors)  # the list that its forces are from
+        ...         neighbors = neighbors.update(state.position)
+        >>> print(rec.outcome.verdict.headline)
+        >>> dyn.attach(mdnum.Recorder(5.0, atoms=atoms), interval=1)
+
+    Args:
+        r_cut: the cutoff or several, length; pairs by species, nearest neighbors and `most` as of `flips`.
+        compare: "r2 <", "r2 <=", "r <" or "r <=", by which a pair exactly at the cutoff is outside or inside.
+            How r is rounded is within the bound of a margin, and decides nothing here.
+        atoms: ASE's, for calls without arguments (`dyn.attach`); positions, box, species and, where the
+            calculator has it, the total energy are read from them.
+        pair_energy: u(r), the energy of a pair at a distance up to the cutoff, as it is truncated there
+            (shifts included): each flip then says what it adds to the energy.
+        between, window, out, report: as of `flips`.
+        name: what the loop is called on the page.
+        arrays: `species`, a word or number for each atom; `cell` or `box` where frames are given without: one
+            length, three, or a matrix with lattice vectors as rows (`cell`: ASE, torch, OpenMM) or as columns
+            (`box`: jax-md); `pbc`, the directions that repeat, default all that have a vector; `fractional`,
+            whether positions are fractions of the box, default lengths, which is checked; `timestep`, which
+            makes times of steps and is needed for velocities; `length` and `time`, units in words.
+
+    Raises:
+        InputError: an option cannot be used; by `see`, arrays or a frame cannot be, such as one that holds
+            no finite positions: what came before is kept.
+        FolderError: the folder cannot be used.
+    """
+
+    def __init__(
+        self, r_cut: float | Sequence[float] = (), *, pairs: Any = (), nearest: int | Sequence[int] = (),
+        most: int | None = None, compare: str = "r2 <", atoms: Any = None,
+        pair_energy: Callable[[float], Any] | None = None, between: tuple[str, str] | None = None,
+        window: int = WINDOW, name: str = "loop", out: str | Path | None = None, report: bool = True,
+        **arrays: Any,
+    ) -> None:  # fmt: skip
+        if compare not in ("r2 <", "r2 <=", "r <", "r <="):
+            raise InputError(f"compare = {compare!r}", remedy="Write r2 <, r2 <=, r < or r <=")
+        if compare.endswith("="):
+            r_cut = np.nextafter(np.atleast_1d(np.asarray(r_cut, float)), np.inf).tolist()
+        self._rules = rules(r_cut, pairs, nearest, most)
+        if not self._rules:
+            raise InputError("no rule says which pairs count", remedy="Give r_cut, pairs or nearest")
+        self._source, self._atoms = ArrayFrames(name, **arrays), atoms
+        self._how = {"between": between, "window": window, "out": out, "report": report, "live": True}
+        rule, self._jump = self._rules[0], np.nan
+        if pair_energy is not None:
+            if len(self._rules) > 1 or (radius := getattr(rule, "radius", None)) is None or rule.directed:
+                names = ", ".join(one.name for one in self._rules)
+                raise InputError(f"pair_energy with {names}", remedy="Give it with one r_cut alone")
+            self._jump = float(pair_energy(radius))
+        self._check = ListCheck(rule)
+        # the list in use; energy, list and its flag of each frame that waits
+        self._list: PairList | None = None
+        self._told: deque[tuple[float, PairList | None, bool]] = deque()
+        self._one: Examination | None = None
+        self._stack, self._failed = ExitStack(), None
+        self._outcome: Outcome | None = None
+        self._hooked = self._loop = False
+        # frames that were given, and that were examined
+        self._given = self._done = 0
+        self._spent, self._written, self._cost = 0.0, -np.inf, 0.0
+
+    def see(
+        self, step: int, positions: Any, cell: Any = None, *, box: Any = None, pbc: Any = None,
+        neighbors: Any = None, velocities: Any = None, energy: Any = None,
+    ) -> None:  # fmt: skip
+        """Records a frame; arrays may be of numpy, jax or torch, and are copied.
+
+        Args:
+            step: of the loop.
+            positions: (atoms, 3), length; or fractions of the box.
+            cell, box, pbc: of this frame, where they are not those of all.
+            neighbors: the list in use: jax-md's `NeighborList`, (i, j) or (i, j, S) as ASE, matscipy and
+                vesin have them, or indices (2, pairs) or (atoms, neighbors); left out, the one before.
+            velocities: (atoms, 3), length per time, of lengths also where positions are fractions.
+            energy: the energy that the integrator conserves.
+        """
+        began = perf_counter()
+        if self._outcome is not None or self._failed is not None:
+            raise self._failed or InputError("the recorder is closed", remedy="Make another one")
+        frame = self._source.read(step, positions, cell, box, pbc, velocities)
+        if neighbors is not None:
+            self._list = self._check.given(neighbors, self._source.species)
+        overflow = bool(np.any(np.asarray(getattr(neighbors, "did_buffer_overflow", False))))
+        self._told.append((np.nan if energy is None else float(energy), self._list, overflow))
+        self._source.put(frame)
+        self._given += 1
+        if self._one is not None or self._given >= SAMPLE:
+            self._advance()
+        self._spent += perf_counter() - began
+
+    def see_many(
+        self, positions: Any, cell: Any = None, *, first: int = 0, every: int = 1, **given: Any
+    ) -> None:
+        """Records frames that a scan returned, (frames, atoms, 3), or a list of frames or of ASE's Atoms.
+
+        Args:
+            first, every: the step of the first, and steps from one to the next.
+            cell, given: as of `see`, for all frames; energies and velocities in rows, boxes that do not have
+                the shape of a single one, and lists have an entry for each.
+        """
+        for k, (frame, here) in enumerate(one_by_one(positions, {"cell": cell, **given})):
+            if hasattr(frame, "get_positions"):
+                self.see_atoms(frame, first + every * k)
+            else:
+                self.see(first + every * k, frame, **here)
+
+    def see_atoms(self, atoms: Any, step: int | None = None) -> None:
+        """Records ASE's Atoms, or those of a dynamics of ASE's, whose steps are then counted."""
+        step = int(getattr(atoms, "nsteps", self._given if step is None else step))
+        atoms = getattr(atoms, "atoms", atoms)
+        if self._source.named is None:
+            self._source.named = atoms.get_chemical_symbols()
+        found, speeds = getattr(atoms.calc, "results", {}), atoms.get_velocities()
+        energy = found["energy"] + atoms.get_kinetic_energy() if "energy" in found else None
+        self.see(step, atoms.positions, atoms.cell.array, pbc=atoms.pbc, velocities=speeds, energy=energy)
+
+    def __call__(self, *args: Any, **given: Any) -> None:
+        """`see`, or `see_atoms`: ASE's dynamics call what is attached without arguments."""
+        if len(args) > 1 or given:
+            self.see(*args, **given)
+        elif args or self._atoms is not None:
+            self.see_atoms(*(args or (self._atoms,)))
+        else:
+            raise InputError("called without a frame", remedy="Give Recorder(atoms=...), or call see")
+
+    def hook(self, step: Any, positions: Any, **given: Any) -> None:
+        """`see` inside of jax.jit, fori_loop and scan: the host is called at every step, in order."""
+        from jax.experimental import io_callback
+
+        def seen(step: Any, positions: Any, given: Mapping[str, Any]) -> None:
+            self.see(int(step), positions, **given)
+
+        self._hooked = True
+        io_callback(seen, None, step, positions, given, ordered=True)
+
+    @property
+    def outcome(self) -> Outcome:
+        """What `mdnum.flips` returns; closes the recorder."""
+        return self.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        # of a loop that failed, what came before is kept, and its own error goes on
+        with suppress(*([MdnumError] if error is not None else [])):
+            self.close(error)
+
+    def close(self, error: BaseException | None = None) -> Outcome:
+        """Ends the recording, and judges what was seen.
+
+        Args:
+            error: what ended the loop before its end.
+
+        Raises:
+            InputError: no frame was given, or the first cannot be used.
+        """
+        if self._outcome is not None:
+            return self._outcome
+        if self._hooked:
+            from jax import effects_barrier
+
+            effects_barrier()
+        began = perf_counter()
+        if self._one is None and self._failed is None and self._given:
+            self._advance()
+        if self._one is None:
+            raise self._failed or InputError("no frame was given", remedy="Call see at least once")
+        one, folder = self._one, self._one.answer.folder
+        with self._stack:
+            self._add("lost", self._check.ended(self._done, one.found.rules[0].tracker.bound))
+            one.rows.hand_over(folder)
+            folder.merge()
+            one.interrupted = error is not None and self._failed is None
+            seconds, ended = self._spent + perf_counter() - began, type(error).__name__
+            one.answer.summary = {"seconds": seconds, **loop_told(folder)}
+            one.answer.summary |= {"ended_by": ended} if one.interrupted else {}
+        self._outcome = one.answer.outcome
+        return self._outcome
+
+    def compare(self, other: Recorder) -> FolderFork:
+        """Where the decisions of two loops of one rule diverge; closes both."""
+        from mdnum.forks.folders import compare_recordings
+
+        return compare_recordings(self.outcome.path, other.outcome.path)
+
+    def _advance(self) -> None:
+        """Examines the frames that wait."""
+        try:
+            if self._one is None:
+                self._one = self._stack.enter_context(examining(self._source, self._rules, **self._how))
+                # of a loop that is killed it remains
+                told = {"rules": [{"rule": one.name} for one in self._rules], "status": "unfinished"}
+                told |= about(self._source, "flips", self._how["between"])
+                self._one.answer.folder.write_summary(told)
+            one, rows, folder = self._one, self._one.rows, self._one.answer.folder
+            while self._told:
+                before = len(rows.held.get("flips", ()))
+                # the first was examined to begin with
+                if one.found.frames == self._done and next(one.passes, None) is None and one.found.stopped:
+                    raise one.found.stopped
+                self._after(one, rows.held.get("flips", [])[before:])
+        except MdnumError as error:
+            self._failed = error
+            raise
+        now = perf_counter()
+        due = now - self._written > max(_EVERY, _TIMES * self._cost)
+        if due or rows.full:
+            rows.hand_over(folder)
+        if due:
+            folder.flush("frames")
+            self._written = perf_counter()
+            self._cost = self._written - now
+
+    def _after(self, one: Examination, new: Sequence[dict[str, Any]]) -> None:
+        """What the program itself said of a frame that was examined, beside its flips."""
+        energy, listed, overflow = self._told.popleft()
+        flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
+        if new and not np.isnan(self._jump):
+            flips["energy_jump"] = np.where(flips["entered"], self._jump, -self._jump)
+        row: dict[str, Any] = {"listed": -1, "new_list": False, "lost": 0, "deepest": 0.0}
+        if listed is not None:
+            row, ended = self._check.step(frame, self._done, one.found.rules[0].tracker, flips, listed)
+            self._add("lost", ended)
+        self._loop |= listed is not None or bool(np.isfinite(energy))
+        if self._loop:
+            jump = self._jump * float(2 * np.count_nonzero(flips["entered"]) - len(flips["entered"]))
+            row |= {"frame": self._done, "number": frame.index, "energy": energy, "energy_jump": jump}
+            self._add("loop", [row | {"overflow": overflow}])
+        self._done += 1
+
+    def _add(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        if rows and self._one is not None:
+            self._one.rows.add(table, {name: np.array([row[name] for row in rows]) for name in rows[0]})

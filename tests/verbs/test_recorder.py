@@ -1,0 +1,537 @@
+"""Frames of a loop, given one by one: the outcome of `mdnum flips`, lists in use, energies, a kill."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import ase
+import numpy as np
+import pytest
+from ase.io import write
+
+import mdnum
+from mdnum.errors import InputError
+
+TABLES = ("members", "flips", "frames", "contacts", "lifetimes", "neighbors", "busiest")
+#: A box of jax-md: lattice vectors as columns.
+TILTED = np.array([[6.0, 1.5, -1.0], [0.0, 5.5, 0.8], [0.0, 0.0, 6.2]])
+
+
+def gas(seed: int = 0, frames: int = 24, atoms: int = 24, side: float = 6.0) -> np.ndarray:
+    """Atoms that fly straight."""
+    rng = np.random.default_rng(seed)
+    start, speed = rng.uniform(0, side, (atoms, 3)), rng.normal(0, 0.25, (atoms, 3))
+    return np.array([start + n * speed for n in range(frames)])
+
+
+def recorded(path: Path, frames: np.ndarray, r_cut: float = 2.5, **options: Any) -> mdnum.Outcome:
+    """What a recorder makes of frames."""
+    with mdnum.Recorder(r_cut, out=path, report=False, **options) as one:
+        for step, x in enumerate(frames):
+            one.see(step, x)
+    return one.outcome
+
+
+def same(a: mdnum.Outcome, b: mdnum.Outcome, tables: tuple[str, ...] = TABLES) -> bool:
+    """Whether two folders have the same tables to the last bit."""
+    made = [{name: one.table(name).to_pydict() for name in tables} for one in (a, b)]
+    return repr(made[0]) == repr(made[1])
+
+
+def codes(outcome: mdnum.Outcome) -> set[str]:
+    return {one.code for one in outcome.findings}
+
+
+def images(x: np.ndarray, cell: np.ndarray, radius: float) -> dict[tuple[int, ...], float]:
+    """Distance by (i, j, shift) of all pairs inside, i < j or the first of two opposite images of an atom."""
+    shifts = np.array(list(np.ndindex(7, 7, 7))) - 3
+    between = x[None, None] + (shifts @ cell)[:, None, None] - x[None, :, None]
+    r = np.sqrt((between**2).sum(axis=-1))
+    found = {}
+    for k, i, j in np.argwhere(r < radius).tolist():
+        shift = tuple(shifts[k].tolist())
+        if i < j or (i == j and shift > (0, 0, 0)):
+            found[i, j, *shift] = float(r[k, i, j])
+    return dict(sorted(found.items()))
+
+
+# ---- the same as a file
+
+
+@pytest.mark.parametrize("cell", [np.diag([6.0] * 3), TILTED.T], ids=["cube", "tilted"])
+def test_a_loop_gives_what_a_file_of_its_frames_gives(tmp_path, cell):
+    frames, species = gas(), list("OH" * 12)
+    atoms = [ase.Atoms(species, x, cell=cell, pbc=True, info={"time": k}) for k, x in enumerate(frames)]
+    write(tmp_path / "f.traj", atoms)
+    file = mdnum.flips(tmp_path / "f.traj", cutoffs=2.5, out=tmp_path / "file", report=False)
+    loop = recorded(tmp_path / "loop", frames, cell=cell, species=species)
+    tables = tuple(name for name in TABLES if name != "lifetimes")
+    assert same(file, loop, tables) and loop.table("flips").num_rows > 300
+    for name in ("pairs_flipped", "entered", "ambiguous", "contacts", "lifetime", "chatter", "images"):
+        assert file.summary["rules"][0][name] == loop.summary["rules"][0][name]
+    assert loop.summary["frames"] == 24 and loop.summary["time"] == "step"
+
+
+def test_arrays_give_what_a_file_of_them_gives(tmp_path):
+    frames = gas()
+    cells = np.array([np.diag([6.0 + 0.01 * k] * 3) for k in range(len(frames))])
+    atoms = [ase.Atoms("H24", x, cell=cell, pbc=True) for x, cell in zip(frames, cells, strict=True)]
+    write(tmp_path / "f.traj", atoms)
+    keep = {"cutoffs": 2.5, "report": False}
+    file = mdnum.flips(tmp_path / "f.traj", out=tmp_path / "file", **keep)
+    told = mdnum.flips(atoms, out=tmp_path / "atoms", **keep)
+    assert same(file, told) and file.summary["rules"] == told.summary["rules"]
+    array = mdnum.flips(frames, cell=cells, out=tmp_path / "array", **keep)
+    assert same(told, array, ("members", "frames", "contacts"))
+    with pytest.raises(InputError, match="cell"):
+        mdnum.flips(tmp_path / "f.traj", cell=6.0, **keep)
+    with pytest.raises(InputError, match="topology"):
+        mdnum.flips(frames, cell=6.0, topology=tmp_path / "f.traj", **keep)
+
+
+def test_rules_velocities_and_units_are_those_of_a_file(tmp_path):
+    frames, rng = gas(frames=20), np.random.default_rng(1)
+    speeds = np.broadcast_to((frames[1] - frames[0]) / 0.5, frames.shape)
+    with mdnum.Recorder(
+        2.5, pairs="O-H=2.0", nearest=4, species="OH" * 12 and list("OH" * 12), cell=6.0, out=tmp_path / "r",
+        timestep=0.5, length="nm", time="fs", report=False,
+    ) as one:  # fmt: skip
+        one.see_many(frames, velocities=speeds, energy=rng.normal(size=20), every=10)
+    done = one.outcome
+    assert [rule["rule"] for rule in done.summary["rules"]] == ["r < 2.5", "O-H < 2", "4 nearest"]
+    assert (done.summary["length"], done.summary["time"], done.summary["interval"]) == ("nm", "fs", 5.0)
+    # straight flight is a tenth of what frames that are ten steps apart show
+    assert done.summary["flight"]["factor"] == pytest.approx(0.1, rel=0.01)
+    assert done.table("frames")["number"].to_pylist()[::3] == [10 * k for k in range(20)]
+    assert len(done.table("loop")) == 20 and "ENERGY_STEPS" not in codes(done)
+
+
+# ---- boxes, dtypes and conventions
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_fractions_of_a_box_of_columns_and_its_images(tmp_path, dtype):
+    side, box = 3.4, 0.6 * TILTED
+    frames = gas(1, 8, 9, side)
+    fractions = (frames @ np.linalg.inv(box.T)).astype(dtype)
+    boxes = [(1 + 0.02 * k) * box for k in range(len(frames))]
+    with mdnum.Recorder(2.9, fractional=True, out=tmp_path / "r", report=False) as one:
+        for step, (x, here) in enumerate(zip(fractions, boxes, strict=True)):
+            one.see(step, x, box=here)
+    flips, rows = (one.outcome.table(name).to_pydict() for name in ("flips", "images"))
+    inside = [images(x.astype(float) @ here.T, here.T, 2.9) for x, here in zip(fractions, boxes, strict=True)]
+    assert one.outcome.table("frames")["pairs"].to_pylist() == [len(each) for each in inside]
+    names = ("frame", "i", "j", "shift_a", "shift_b", "shift_c", "entered")
+    wanted = [
+        {(k, *key, True) for key in now.keys() - was.keys()}
+        for k, (was, now) in enumerate(pairwise(inside), 1)
+    ]
+    wanted += [
+        {(k, *key, False) for key in was.keys() - now.keys()}
+        for k, (was, now) in enumerate(pairwise(inside), 1)
+    ]
+    assert set(zip(*(rows[name] for name in names), strict=True)) == set().union(*wanted)
+    assert len(rows["i"]) > len(flips["i"]) > 100
+    bound = flips["bound"][0]
+    assert (1e-6 < bound < 1e-5) if dtype == np.float32 else bound < 1e-13
+    assert one.outcome.summary["resolution"]["kind"] == np.dtype(dtype).name
+
+
+def test_torch_and_jax_arrays_are_those_of_numpy(tmp_path):
+    import jax.numpy as jnp
+
+    frames = gas(frames=6).astype(np.float32)
+
+    class Tensor:
+        """What torch's tensors have."""
+
+        def __init__(self, x):
+            self.x = x
+
+        def detach(self):
+            return self
+
+        cpu = detach
+
+        def numpy(self):
+            return self.x
+
+    made = [
+        recorded(tmp_path / name, [kind(x) for x in frames], cell=6.0)
+        for name, kind in {"n": np.asarray, "j": jnp.asarray, "t": Tensor}.items()
+    ]
+    assert same(made[0], made[1]) and same(made[0], made[2])
+
+
+@pytest.mark.parametrize("compare", ["r2 <", "r2 <=", "r <", "r <="])
+def test_a_pair_exactly_at_the_cutoff_is_inside_by_the_convention(tmp_path, compare):
+    frames = [[[0, 0, 0], [r, 0, 0]] for r in (2.4, 2.5, np.nextafter(2.5, 3) * (1 + 1e-15), 2.5)]
+    done = recorded(tmp_path / "r", [np.array(x, float) for x in frames], compare=compare)
+    assert done.table("frames")["pairs"].to_pylist() == [1, *([1, 0, 1] if "=" in compare else [0, 0, 0])]
+    assert not done.summary["box"]["pbc"][0] and all(done.table("flips")["ambiguous"].to_pylist())
+
+
+def test_what_cannot_be_meant_is_an_error(tmp_path):
+    x, many = gas(frames=1)[0], np.random.default_rng(0).uniform(0, 1, (80, 3))
+    plain = mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "plain")
+    for positions, options, word in (
+        (x[None], {}, "shape"), (x[:, :2], {}, "shape"), (x.astype(np.float16), {}, "float16"),
+        (x, {"box": TILTED.T}, "upper"), (x, {"cell": np.ones((2, 2))}, "shape"), (many, {}, "fractional"),
+        (x, {"cell": 6.0, "box": 6.0}, "both"), (x, {"neighbors": np.zeros((5, 5), int)}, "neighbors"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=word):
+            plain.see(0, positions, **options)
+    with plain:
+        plain.see(0, x)
+    assert plain.outcome.summary["frames"] == 1
+    with pytest.raises(InputError, match="fractional"):
+        mdnum.Recorder(2.5, cell=6.0, fractional=True).see(0, 20 * x)
+    with pytest.raises(InputError, match="fractional"):
+        mdnum.Recorder(2.5, fractional=True).see(0, x)
+    with pytest.raises(InputError, match="species"):
+        mdnum.Recorder(2.5, cell=6.0, species=["H"]).see(0, x)
+    with pytest.raises(InputError, match="r_cut"):
+        mdnum.Recorder()
+    with pytest.raises(InputError, match="compare"):
+        mdnum.Recorder(2.5, compare="<")
+    with pytest.raises(InputError, match="pair_energy"):
+        mdnum.Recorder([2.0, 2.5], pair_energy=lambda r: r)
+    with pytest.raises(InputError, match="no frame"):
+        _ = mdnum.Recorder(2.5, out=tmp_path / "none").outcome
+    with mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r", report=False) as one:
+        one.see(0, x)
+        with pytest.raises(InputError, match="float32"):
+            one.see(1, x.astype(np.float32))
+    with pytest.raises(InputError, match="closed"):
+        one.see(1, x)
+    # rows in the form of jax-md's columns are noted
+    upper = recorded(tmp_path / "u", [x], cell=TILTED)
+    assert "READING" in codes(upper) and upper.summary["frames"] == 1
+
+
+def test_an_atom_that_is_wrapped_changes_no_image(tmp_path):
+    frames, cell = gas(2, 10, 9, 3.4), 0.6 * TILTED.T
+    frames = frames[:1] + 0.2 * (frames - frames[:1])
+    wrapped = np.array([(x @ np.linalg.inv(cell) % 1.0) @ cell for x in frames])
+    made = [recorded(tmp_path / name, x, 2.9, cell=cell) for name, x in (("a", frames), ("b", wrapped))]
+    names = ("frame", "i", "j", "entered", "distance")
+    rows = [one.table("images").to_pydict() for one in made]
+    several = [
+        sorted((*key[:4], round(key[4], 9)) for key in zip(*(one[name] for name in names), strict=True))
+        for one in rows
+    ]
+    assert several[0] == several[1] and len(several[0]) > 30
+    assert rows[0]["shift_a"] != rows[1]["shift_a"]
+
+
+# ---- lists in use
+
+
+def listed(x: np.ndarray, cell: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
+    """A full list (i, j, S), by brute force."""
+    found = list(images(x, cell, reach))
+    rows = np.array(found + [(j, i, *(-np.array(s))) for i, j, *s in found])
+    return rows[:, 0], rows[:, 1], rows[:, 2:]
+
+
+def test_planted_pairs_that_a_list_lacks_are_found_with_their_time(tmp_path):
+    frames, cell = np.repeat(gas(3, 1), 9, axis=0), np.diag([6.0] * 3)
+    inside = images(frames[0], cell, 2.5)
+    (a, b, *_), (c, d, *_), (e, f, *_) = list(inside)[5:8]
+    i, j, _ = listed(frames[0], cell, 3.0)
+    with mdnum.Recorder(2.5, cell=cell, out=tmp_path / "r", report=False) as one:
+        for step, x in enumerate(frames):
+            both = np.isin(i * 24 + j, [24 * a + b, 24 * b + a]) & (2 <= step < 5)
+            half = (i == d) & (j == c) & (step >= 4)
+            keep = ~(both | half)
+            given = (i[keep], j[keep])
+            if step == 7:
+                # half of a half list is the whole of it
+                given = (i[i < j], j[i < j])
+            one.see(10 * step, x, neighbors=given if step != 8 else None)
+    assert (e, f) not in ((a, b), (c, d))
+    lost = one.outcome.table("lost").to_pylist()
+    found = [tuple(row[name] for name in ("i", "j", "missing", "begin", "end", "number")) for row in lost]
+    assert found == [(a, b, 2, 2, 5, 20), (c, d, 1, 4, 7, 40)]
+    depths = [2.5 - inside[key] for key in list(inside)[5:7]]
+    assert [row["deepest"] for row in lost] == pytest.approx(depths, rel=1e-12)
+    told = one.outcome.summary["lists"]
+    assert (told["lost"], told["lost_frames"], told["first"], told["lists"]) == (2, 5, 20, 5)
+    assert "LOST_PAIRS" in codes(one.outcome) and one.outcome.verdict.tone == "error"
+    assert one.outcome.plot("loop_lists") is not None
+
+
+@pytest.mark.parametrize("skin", [0.1, 2.0])
+def test_a_skin_that_is_used_up_loses_what_brute_force_finds(tmp_path, skin):
+    frames, cell = gas(4, 12), np.diag([6.0] * 3)
+    frames = frames[:1] + 0.3 * (frames - frames[:1])
+    i, j, _ = listed(frames[0], cell, 2.5 + skin)
+    with mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r", report=False) as one:
+        one.see(0, frames[0], neighbors=np.array([i, j]))
+        for step, x in enumerate(frames[1:], 1):
+            one.see(step, x)
+    known = {(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True)}
+    wanted = [sum(key[:2] not in known for key in images(x, cell, 2.5)) for x in frames]
+    loop = one.outcome.table("loop").to_pydict()
+    assert loop["lost"] == wanted and (max(wanted) > 5) == (skin < 1)
+    assert ("LOST_PAIRS" in codes(one.outcome)) == (skin < 1)
+    assert loop["new_list"] == [True] + 11 * [False]
+
+
+def test_images_that_a_list_lacks_and_stale_shifts_are_found(tmp_path):
+    x, cell = gas(5, 1, 8, 3.4)[0], 0.6 * TILTED.T
+    i, j, s = listed(x, cell, 2.9)
+    gone = 7
+    keep = ~(
+        ((i == i[gone]) & (j == j[gone]) & (s == s[gone]).all(1))
+        | ((i == j[gone]) & (j == i[gone]) & (s == -s[gone]).all(1))
+    )
+    nearest = len({(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True) if a != b}) // 2
+    moved = x.copy()
+    moved[2] += cell[0]
+    with mdnum.Recorder(2.9, cell=cell, out=tmp_path / "r", report=False) as one:
+        one.see(0, x, neighbors=(i, j, s))
+        one.see(1, x, neighbors=(i[keep], j[keep], s[keep]))
+        one.see(2, x, neighbors=(i, j))
+        # an atom is put into another cell, and the list is not told
+        one.see(3, moved, neighbors=(i, j, s))
+        one.see(4, moved, neighbors=listed(moved, cell, 3.5))
+    own = sum(2 in key[:2] and key[0] != key[1] for key in images(x, cell, 2.9))
+    lost = one.outcome.table("loop")["lost"].to_pylist()
+    assert lost[:2] == [0, 1] and lost[2] == len(i) // 2 - nearest and lost[4] == 0
+    assert 0 < lost[3] <= own
+
+
+class Dense:
+    """What jax-md's dense list has."""
+
+    class format:
+        name = "Dense"
+
+    def __init__(self, rows: np.ndarray, overflow: bool):
+        self.idx, self.did_buffer_overflow = rows, np.array(overflow)
+
+
+@pytest.mark.parametrize("capacity", [8, 14])
+def test_an_overflow_is_harmful_where_pairs_are_lost(tmp_path, capacity):
+    x, cell = gas(6, 1)[0], np.diag([6.0] * 3)
+    i, j, _ = listed(x, cell, 3.0)
+    rows = np.full((24, capacity), 24)
+    near = {key[:2] for key in images(x, cell, 2.5)}
+    for atom in range(24):
+        # those inside first, so that the skin overflows first
+        mine = sorted(j[i == atom].tolist(), key=lambda b: tuple(sorted((atom, b))) not in near)
+        rows[atom, : len(mine)] = mine[:capacity]
+    wanted = sum(b not in rows[a] or a not in rows[b] for a, b in near)
+    assert (wanted > 0) == (capacity == 8)
+    with mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r", report=False) as one:
+        for step in range(5):
+            one.see(step, x, neighbors=Dense(rows, overflow=step in (2, 3)))
+    told = one.outcome.summary["lists"]["overflow"]
+    assert (told["frames"], told["first"], told["last"], told["lost"]) == (2, 2, 3, wanted)
+    severity = {each.code: each.severity for each in one.outcome.findings}
+    assert severity["OVERFLOW"] == ("error" if wanted else "info")
+
+
+@pytest.fixture
+def jax_as_users_have_it():
+    import jax
+
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.mark.nightly
+@pytest.mark.usefixtures("jax_as_users_have_it")
+@pytest.mark.parametrize("kind", ["Dense", "Sparse", "OrderedSparse", "images"])
+def test_lists_of_jax_md_are_read_as_it_means_them(tmp_path, kind):
+    import jax.numpy as jnp
+    from jax_md import custom_partition, partition, space
+
+    box = jnp.asarray(0.75 * TILTED if kind == "images" else TILTED, jnp.float32)
+    cell, reach = np.asarray(box, float).T, 2.3
+    x = np.random.default_rng(0).uniform(0, 1, (20, 3)).astype(np.float32)
+    if kind == "images":
+        made = custom_partition.neighbor_list_multi_image(
+            None, box, reach, 0.1, capacity_multiplier=1.0, fractional_coordinates=True
+        )
+        neighbors = made.allocate(jnp.asarray(x))
+    else:
+        displacement, _ = space.periodic_general(box, fractional_coordinates=True)
+        made = partition.neighbor_list(
+            displacement, box, reach, 0.3, fractional_coordinates=True, disable_cell_list=True,
+            capacity_multiplier=1.0, format=getattr(partition, kind),
+        )  # fmt: skip
+        neighbors = made.allocate(jnp.asarray(x))
+    crowded = (0.4 * x).astype(np.float32)
+    full = neighbors.update(jnp.asarray(crowded))
+    with mdnum.Recorder(reach, box=box, fractional=True, out=tmp_path / "r", report=False) as one:
+        one.see(0, x, neighbors=neighbors)
+        one.see(1, crowded, neighbors=full)
+    inside = images(crowded @ cell, cell, reach)
+    # what it has, from the side of each atom
+    idx, have = [np.asarray(part).tolist() for part in full.idx], set()
+    for k, (i, j) in enumerate(
+        [(i, j) for i, row in enumerate(idx) for j in row] if kind == "Dense" else zip(*idx, strict=True)
+    ):
+        have.add((i, j, *(np.asarray(full.shifts)[k].tolist() if kind == "images" else ())))
+    wanted = 0
+    for i, j, *shift in inside:
+        at = tuple(shift) if kind == "images" else ()
+        sides = (i, j, *at) in have, (j, i, *(-s for s in at)) in have
+        wanted += not (any(sides) if kind == "OrderedSparse" else all(sides))
+    told, loop = one.outcome.summary["lists"], one.outcome.table("loop").to_pydict()
+    assert loop["overflow"] == [False, True] and loop["lost"] == [0, wanted]
+    assert 0 < wanted == told["overflow"]["lost"] < len(inside)
+
+
+# ---- energies
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_energy_that_steps_with_flips_is_told_from_one_that_does_not(tmp_path, known):
+    frames, cell = gas(frames=40), np.diag([6.0] * 3)
+    inside = np.array([len(images(x, cell, 2.5)) for x in frames[:20]])
+    quiet = 3.0 + 0.01 * np.sin(np.arange(20))
+    law = {"pair_energy": lambda r: -0.25 * (r == 2.5)} if known else {}
+    made = {}
+    for name, energy in (("steps", quiet - 0.25 * inside), ("smooth", quiet)):
+        with mdnum.Recorder(2.5, cell=cell, out=tmp_path / name, report=False, **law) as one:
+            one.see_many(frames[:20], energy=energy)
+        made[name] = one.outcome
+    told = made["steps"].summary["energy"]
+    assert told["slope"] == pytest.approx(-0.25, abs=3 * told["error"]) and told["error"] < 1e-3
+    assert "ENERGY_STEPS" in codes(made["steps"]) and "ENERGY_STEPS" not in codes(made["smooth"])
+    if known:
+        assert told["jumps"] == -0.25 * (inside[-1] - inside[0])
+        assert told["rest"] == pytest.approx(float(quiet.std()), rel=1e-9)
+        flips = made["steps"].table("flips").to_pydict()
+        signs = {bool(on): jump for on, jump in zip(flips["entered"], flips["energy_jump"], strict=True)}
+        assert signs == {True: -0.25, False: 0.25}
+    assert made["steps"].plot("loop_energy") is not None
+
+
+# ---- loops of others
+
+
+def test_ase_attaches_a_recorder(tmp_path):
+    from ase.build import bulk
+    from ase.calculators.lj import LennardJones
+    from ase.md.velocitydistribution import MaxwellBoltzmannDistribution
+    from ase.md.verlet import VelocityVerlet
+
+    atoms = bulk("Ar", "fcc", a=5.3, cubic=True).repeat(2)
+    atoms.calc = LennardJones(sigma=3.4, epsilon=0.0104, rc=5.2)
+    MaxwellBoltzmannDistribution(atoms, temperature_K=60, rng=np.random.default_rng(0))
+    dynamics = VelocityVerlet(atoms, 5.0)
+    kept: list[ase.Atoms] = []
+    totals: list[float] = []
+    with (
+        mdnum.Recorder(3.85, atoms=atoms, out=tmp_path / "a", report=False) as one,
+        mdnum.Recorder(3.85, out=tmp_path / "b", report=False) as other,
+    ):
+        dynamics.attach(one, interval=1)
+        dynamics.attach(other, 1, dynamics)
+        dynamics.attach(lambda: kept.append(atoms.copy()), interval=1)
+        dynamics.attach(lambda: totals.append(atoms.get_total_energy()), interval=1)
+        dynamics.run(12)
+    write(tmp_path / "f.traj", kept)
+    file = mdnum.flips(tmp_path / "f.traj", cutoffs=3.85, out=tmp_path / "c", report=False)
+    tables = ("members", "flips", "contacts")
+    assert same(file, one.outcome, tables) and same(file, other.outcome, tables)
+    assert file.table("flips").num_rows > 10
+    assert one.outcome.table("loop")["energy"].to_pylist() == totals and len(totals) == 13
+    assert other.outcome.table("frames")["number"].to_pylist() == list(range(13))
+
+
+def test_a_compiled_loop_calls_the_host_in_order(tmp_path):
+    import jax
+    import jax.numpy as jnp
+
+    frames = gas(frames=15).astype(np.float32)
+    i, j, _ = listed(frames[0].astype(float), np.diag([6.0] * 3), 2.8)
+    pairs, speed = jnp.array([i, j]), jnp.asarray(frames[1] - frames[0])
+    seen = mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "h", report=False)
+
+    @jax.jit
+    def loop(x):
+        def body(x, step):
+            seen.hook(step, x, neighbors=pairs, energy=x.sum())
+            return x + speed, x
+
+        return jax.lax.scan(body, x, jnp.arange(15))[1]
+
+    steps = loop(jnp.asarray(frames[0]))
+    plain = mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "p", report=False)
+    plain.see_many(steps, neighbors=pairs)
+    assert same(seen.outcome, plain.outcome) and seen.outcome.table("flips").num_rows > 100
+    made = [one.outcome.table("loop")["lost"].to_pylist() for one in (seen, plain)]
+    assert made[0] == made[1] and max(made[0]) > 5
+
+
+def test_two_loops_are_compared_by_their_decisions(tmp_path):
+    frames, other = gas(), gas()
+    near = next(k for k in range(10, 20) if len(images(frames[k], np.diag([6.0] * 3), 2.5)) > 70)
+    other[near:, 7] += 0.4
+    made = [mdnum.Recorder(2.5, cell=6.0, out=tmp_path / name, report=False) for name in "abc"]
+    for one, x in zip(made, (frames, other, frames + np.array([0.1, 0, 0])), strict=True):
+        one.see_many(x)
+    found = made[0].compare(made[1])
+    inside = [[set(images(x[k], np.diag([6.0] * 3), 2.5)) for k in range(24)] for x in (frames, other)]
+    fork = next(k for k in range(24) if inside[0][k] != inside[1][k])
+    alone = {key[:2] for key in inside[0][fork] ^ inside[1][fork]}
+    assert found.fork == fork == near and {one.subject[:2] for one in found.decisions} == alone
+    assert found.same_structure and found.steps == 23
+    assert made[0].compare(made[0]).fork is None and made[0].compare(made[2]).fork is None
+
+
+# ---- loops that end early
+
+KILLED = """
+import os, signal, sys
+import numpy as np
+import mdnum
+rng = np.random.default_rng(0)
+x, v = rng.uniform(0, 6, (24, 3)), rng.normal(0, 0.25, (24, 3))
+one = mdnum.Recorder(2.5, cell=6.0, out=sys.argv[1])
+import mdnum.verbs.recorder as recorder
+recorder._EVERY = recorder._TIMES = 0.0
+for step in range(40):
+    one.see(step, x + step * v, neighbors=(np.array([0]), np.array([1])), energy=1.0)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_loop_that_is_killed_leaves_what_was_seen(tmp_path):
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "k")], check=False)
+    assert done.returncode == -9
+    kept = mdnum.read(tmp_path / "k")
+    assert [one.code for one in kept.findings] == ["LOST_PAIRS", "NOT_CLOSED"]
+    assert kept.summary["status"] == "unfinished" and "39" in kept.verdict.headline
+    frames = gas(frames=40)
+    whole = recorded(tmp_path / "w", frames, cell=6.0)
+    assert same(kept, whole, ("members", "flips", "frames")) and kept.table("loop").num_rows == 40
+    with pytest.raises(mdnum.FolderError):
+        mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "k").see_many(frames)
+
+
+def test_an_error_in_the_loop_keeps_what_came_before(tmp_path):
+    frames = gas()
+    with pytest.raises(ZeroDivisionError), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r") as one:
+        one.see_many(frames[:12])
+        _ = 1 / 0
+    assert one.outcome.summary["status"] == "stopped" and one.outcome.summary["frames"] == 12
+    assert "INTERRUPTED" in codes(one.outcome) and (tmp_path / "r" / "report.html").exists()
+    broken = frames.copy()
+    broken[15, 3] = np.nan
+    with pytest.raises(InputError, match="15"), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "n") as one:
+        one.see_many(broken)
+    assert one.outcome.summary["frames"] == 15 and "STOPPED" in codes(one.outcome)
+    with pytest.raises(InputError), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "no") as one:
+        one.see(0, broken[15])
+        one.close()
+    assert not (tmp_path / "no").exists()
