@@ -397,7 +397,7 @@ def test_an_energy_that_steps_with_flips_is_told_from_one_that_does_not(tmp_path
     frames, cell = gas(frames=40), np.diag([6.0] * 3)
     inside = np.array([len(images(x, cell, 2.5)) for x in frames[:20]])
     quiet = 3.0 + 0.01 * np.sin(np.arange(20))
-    law = {"pair_energy": lambda r: -0.25 * (r == 2.5)} if known else {}
+    law: dict[str, Any] = {"pair_energy": lambda r: -0.25 * (r == 2.5)} if known else {}
     made = {}
     for name, energy in (("steps", quiet - 0.25 * inside), ("smooth", quiet)):
         with mdnum.Recorder(2.5, cell=cell, out=tmp_path / name, report=False, **law) as one:
