@@ -44,14 +44,14 @@ class Convention:
     keyword: str = ""  # by which the list is given; empty where it follows the positions
     keywords: tuple[str, ...] = ()  # those of KEYWORDS that it takes
     images: bool = False  # the list has an integer shift for each entry
-    box: str = (
-        ""  # how it follows the box: "cell" (rows), "columns" or "rows" of box=; empty where it keeps its own
-    )
+    # how it follows the box: "cell" (rows), "columns" or "rows" of box=; empty where it keeps its own
+    box: str = ""
     strain: bool = False  # whether perturbation= strains what it sees
     fractional: bool = False  # positions are fractional coordinates
     # whether derivatives by fractional coordinates are those by real ones, as jax-md's spaces define them
     real_slope: bool = False
-    returns: str = "number"  # "number", the key of a dictionary, or "atoms" for an array of one for each
+    # "number", the key of a dictionary, or "atoms" for an array of one for each; empty before it is known
+    returns: str = "number"
 
     @property
     def label(self) -> str:
@@ -76,8 +76,8 @@ class Call:
     unit: float = 1.0  # its unit of energy, in the simulation's
     name: str = "energy function"
 
-    def raw(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """What it returns for positions as it wants them.
+    def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
+        """Its energy in its own units, for positions as it takes them; all that it returns, if `returns` is empty.
 
         Args:
             given: the keywords of the convention, and for mdnum's own "cell".
@@ -93,12 +93,10 @@ class Call:
             keywords[how.keyword] = neighbor
         # jax-md and what is written like it mixes widths
         with jaxmd.standard_promotion():
-            return jax.named_call(self.function, name=self.name.replace(" ", "_"))(*args, **keywords)
-
-    def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Array:
-        """Its energy in its own units; arguments as for `raw`."""
-        out, kind = self.raw(parameters, x, neighbor, given), self.how.returns
-        return jnp.sum(out if kind in ("number", "atoms") else out[kind])
+            out = jax.named_call(self.function, name=self.name.replace(" ", "_"))(*args, **keywords)
+        if not how.returns:
+            return out
+        return jnp.sum(out if how.returns in ("number", "atoms") else out[how.returns])
 
     def __call__(self, parameters: Any, x: Array, neighbor: Any, cell: Array, strain: Any = None) -> Array:
         """The energy.

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mdnum.numerics.exact import bound, interpreted
+from mdnum.numerics.exact import bound, inlined, interpreted
 
 #: Elementwise operations that numpy or scipy calls otherwise than jax.
 _NAMES = {
@@ -42,12 +42,10 @@ def _rule(equation: Any, inputs: Sequence[np.ndarray]) -> list[Any]:
     import scipy.special
 
     name: str = equation.primitive.name
-    params = equation.params
-    inner = params.get("call_jaxpr")
-    if name.startswith("custom_") and inner is not None:
+    if (inner := inlined(equation)) is not None:
         return interpreted(inner, inputs, _rule, np.asarray)
     if name in _KNOWN:
-        return [_KNOWN[name](*inputs, **params)]
+        return [_KNOWN[name](*inputs, **equation.params)]
     for library in (np, scipy.special):
         same = getattr(library, _NAMES.get(name, name), None)
         if isinstance(same, np.ufunc):

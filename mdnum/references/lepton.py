@@ -23,7 +23,7 @@ from ase.geometry.cell import complete_cell
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.potentials import CutPotential, PairFunction
-from mdnum.numerics.exact import interpreted
+from mdnum.numerics.exact import inlined, interpreted
 from mdnum.references.independent import ClassicalCalculator
 from mdnum.safe_path import environment, python
 from mdnum.systems.simulation import Simulation
@@ -79,8 +79,8 @@ def expression(function: Any) -> str:
         return f"({float(np.asarray(value).reshape(()))!r})"
 
     def rule(equation: Any, inputs: Sequence[str]) -> list[str]:
-        name, inner = equation.primitive.name, equation.params.get("call_jaxpr")
-        if name.startswith("custom_") and inner is not None:
+        name = equation.primitive.name
+        if (inner := inlined(equation)) is not None:
             return interpreted(inner, inputs, rule, enter)
         if any(out.aval.size != 1 for out in equation.outvars):
             raise Untranslated(f"{name} of an array")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -84,14 +83,16 @@ class Trial:
         self.pbc = np.array(simulation.pbc)
         self.cell = complete(np.asarray(simulation.cell.matrix), self.pbc)
         self.x, _ = wrap_positions(simulation.cell, simulation.positions)
-        self.box, self.width = simulation.cell, float(np.min(simulation.cell.widths))
-        skin = min(max(simulation.rule.skin, 0.1 * simulation.r_cut), self.width / 2 - simulation.r_cut)
+        self.box, width = simulation.cell, float(np.min(simulation.cell.widths))
+        skin = min(max(simulation.rule.skin, 0.1 * simulation.r_cut), width / 2 - simulation.r_cut)
         table = simulation.verlet_list(skin).build(self.x, simulation.cell)
         # the list in the order of the structure; the skin, and slots that hold nothing
         names = np.append(table.order, len(self.x)).astype(np.int32)
         self.idx = np.full((len(self.x), table.slots), len(self.x), np.int32)
         self.idx[table.order] = names[table.index].T
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
+        # those whose nearest image stays the same in a box that is sheared
+        self.near = self.within(self.inside, self.x, 0.45 * width)
         self._lists()
         self._compile()
 
@@ -128,23 +129,18 @@ class Trial:
         self.model = model
         if model.start is not None and not jax.tree.leaves(model.parameters):
             key, x = jax.random.PRNGKey(self.seed), jnp.asarray(self.x / self.call.length)
-            listed = (
-                own
-                if own is not None
-                else jaxmd.as_neighbor_list(
-                    self.idx, x, FORMATS[0] if model.format == "any" else model.format
-                )
-            )
-            self.model = replace(model, parameters=model.start(key, x, listed))
+            if own is None:
+                form = FORMATS[0] if model.format == "any" else model.format
+                own = jaxmd.as_neighbor_list(self.idx, x, form)
+            self.model = replace(model, parameters=model.start(key, x, own))
 
-    def bare(self, parameters, x, idx, real, cell, box, strain, code, whole=False):
-        """The function's own energy, of positions and a box in its own terms; or all that it returns."""
+    def bare(self, parameters, x, idx, real, cell, box, strain, code):
+        """The function's own energy, of positions and a box in its own terms."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
             neighbor = with_images(neighbor, real, cell, box)
-        given = {"cell": cell, "box": box, "perturbation": strain}
-        return (call.raw if whole else call.bare)(parameters, x, neighbor, given)
+        return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def _arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
         """Of `bare`, at real positions in a box, by the convention that is known so far."""
@@ -168,7 +164,7 @@ class Trial:
         for form in formats:
             for keywords in dict.fromkeys([*sets, ()]):
                 self.model = replace(self.model, format=form)
-                self._with(keywords=keywords)
+                self._with(keywords=keywords, returns="")
                 try:
                     self._with(returns=self._returned())
                     every = jax.jit(jax.value_and_grad(self.bare, argnums=(1, 4, 5, 6)))
@@ -187,7 +183,7 @@ class Trial:
 
     def _returned(self) -> str:
         """What it returns, as `Convention.returns`."""
-        out = jax.eval_shape(partial(self.bare, whole=True), *self._arguments())
+        out = jax.eval_shape(self.bare, *self._arguments())
         shape = {key: one.shape for key, one in out.items()} if isinstance(out, Mapping) else jnp.shape(out)
         kinds = {(): "number", (1,): "number", (len(self.x),): "atoms"}
         if isinstance(shape, Mapping):
@@ -235,7 +231,7 @@ class Trial:
             self.notes |= {} if paired else {"UNTRIED": {}}
             self._known("cell" if "cell" in words else "columns" if periodic and "box" in words else "")
             return
-        boxes = [box for word, *of in _BOXES if word in words for box in of]
+        boxes = ("cell",) * ("cell" in words) + ("columns", "rows") * ("box" in words)
         kept = None
         for fractional, box in product((False, True)[: 2 - how.native], (*boxes, "")):
             self._with(fractional=fractional, box=box)
@@ -294,8 +290,8 @@ class Trial:
     def _unmoved(self, vectors, cell=None) -> bool:
         """Whether moving an atom by any of some vectors leaves the energy of its pairs as it is."""
         n, rows = len(self.x), np.arange(len(self.x))[:, None]
-        own = (self.inside == self._central) | (rows == self._central)
-        idx = self.within(np.where(own, self.inside, n), self.x, 0.45 * self.width)
+        own = (self.near == self._central) | (rows == self._central)
+        idx = np.where(own, self.near, n).astype(np.int32)
         none = np.nan_to_num(self.there(idx=np.full_like(idx, n))[0])
         *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
         size = max(abs(here[0] - none), np.abs(here[1]).max() * self.model.r_cut, 1e-13 * abs(here[0]))
@@ -304,10 +300,10 @@ class Trial:
     def _follows(self) -> bool:
         """Whether a box that is slightly sheared counts, and counts as what it is."""
         cell, n = self.cell + self.cell @ _SHEAR, len(self.x)
-        near = self.within(self.idx, self.x, 0.45 * self.width)
         # pairs that no face of the box is between are where they were
-        apart = np.linalg.norm(self.x[:, None] - self.x[np.minimum(near, n - 1)], axis=-1)
-        whole = np.where(np.isclose(apart, self.distances(near, self.x), rtol=1e-9), near, n).astype(np.int32)
+        direct = np.linalg.norm(self.x[:, None] - self.x[np.minimum(self.near, n - 1)], axis=-1)
+        whole = np.isclose(direct, self.distances(self.near, self.x), rtol=1e-9)
+        whole = np.where(whole, self.near, n).astype(np.int32)
         here, there = self.there(idx=whole), self.there(idx=whole, cell=cell)
         size = max(abs(here[0]), np.abs(here[1]).max() * self.model.r_cut)
         return abs(here[0] - there[0]) <= _SAME[self.double] * size and self._unmoved(cell, cell)
@@ -432,10 +428,6 @@ class Trial:
             self.notes.pop("TRUSTS_LIST", None)
             self.notes["DECIDES_ITSELF"] = {}
         return replace(self.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
-
-
-#: What a keyword may hold, in the order in which it is tried.
-_BOXES = (("cell", "cell"), ("box", "columns", "rows"))
 
 
 def _named(found: Operation | None) -> str:
