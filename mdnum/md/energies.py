@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from mdnum.errors import InputError
 from mdnum.md import jaxmd
@@ -77,7 +77,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Its energy in its own units, for positions as it takes them; all that it returns, if `returns` is empty.
+        """Its energy in its own units, of positions as it takes them; with empty `returns` all that it returns.
 
         Args:
             given: the keywords of the convention, and for mdnum's own "cell".
@@ -119,7 +119,7 @@ class Call:
         x, cell = x / self.length, cell / self.length
         given = {"cell": cell, "box": cell if how.box == "rows" else cell.T}
         if how.images:
-            neighbor = with_images(neighbor, x, cell, given["box"])
+            neighbor = jaxmd.multi_image(neighbor, x, cell, given["box"])
         if how.strain:
             given["perturbation"] = jnp.asarray(strain).T
         if how.fractional:
@@ -136,17 +136,6 @@ def _real_slope(x: Array, inverse: Array) -> Array:
 @_real_slope.defjvp
 def _real_slope_jvp(primals, tangents):
     return _real_slope(*primals), tangents[0]
-
-
-def with_images(
-    neighbor: Any, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
-) -> Any:
-    """A list with the integer shifts of nearest images, as `jax_md.custom_partition` makes it."""
-    n, dense = x.shape[0], neighbor.format.name == "Dense"
-    here, other = (jnp.arange(n)[:, None], neighbor.idx) if dense else neighbor.idx
-    d = x[jnp.where(other < n, other, 0)] - x[jnp.where(here < n, here, 0)]
-    shifts = -jnp.round(lax.stop_gradient(d @ jnp.linalg.inv(cell)))
-    return jaxmd.multi_image(neighbor, shifts, box)
 
 
 class EnergyFunction(ManyBody):
@@ -198,7 +187,7 @@ def energy_function(
     *,
     parameters: Any = None,
     format: jaxmd.Format | None = None,
-    units: tuple[str, str] | str = "",
+    units: tuple[str, str] | None = None,
     species: tuple[str, ...] = (),
     name: str = "",
     compare: str = "r <",
@@ -254,10 +243,9 @@ def energy_function(
     length, energy = _scales(units, name)
     tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
     made = Call(function, how, length, energy, name)
-    unit = (units,) if isinstance(units, str) and units else tuple(units)
     return EnergyFunction(
         tree, made, float(r_cut) * length, format=format or "any", name=name, species=tuple(species),
-        start=start, lists=lists, unit=unit, compare=compare,
+        start=start, lists=lists, unit=tuple(units or ()), compare=compare,
     )  # fmt: skip
 
 
@@ -292,7 +280,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
 
 
 def _scales(units: Any, name: str) -> tuple[float, float]:
-    if not units or units == "metal" or units == "lj":
+    if units is None:
         return 1.0, 1.0
     try:
         length, energy = units

@@ -204,14 +204,20 @@ def listed(
     )
 
 
-def multi_image(neighbor: NeighborList, shifts: Float[Array, "... 3"], box: Float[Array, "3 3"]) -> Any:
-    """The list with an integer shift for each entry, as jax_md.custom_partition makes them.
+def multi_image(
+    neighbor: NeighborList, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
+) -> Any:
+    """The list with the integer shifts of nearest images, as jax_md.custom_partition makes it.
 
     Args:
-        shifts: lattice vectors to add to the second atom. box: lattice vectors as columns, length.
+        x: positions, length. cell: lattice vectors as rows, length. box: as the energy function takes it.
     """
     kind: Any = upstream().custom_partition.NeighborListMultiImage
-    idx = neighbor.idx if neighbor.format is upstream().partition.Dense else tuple(neighbor.idx)
+    n, dense = x.shape[0], neighbor.format is upstream().partition.Dense
+    idx = neighbor.idx if dense else tuple(neighbor.idx)
+    here, other = (jnp.arange(n)[:, None], idx) if dense else idx
+    d = x[jnp.where(other < n, other, 0)] - x[jnp.where(here < n, here, 0)]
+    shifts = -jnp.round(jax.lax.stop_gradient(d @ jnp.linalg.inv(cell)))
     return kind(
         idx=idx, shifts=shifts, reference_position=neighbor.reference_position, reference_box=box, box=box,
         search_shifts=jnp.zeros((1, 3)), format=neighbor.format, max_occupancy=neighbor.max_occupancy,

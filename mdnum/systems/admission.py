@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from mdnum.errors import InputError, in_a_line
 from mdnum.md import jaxmd
 from mdnum.md.cell import complete, displacement, wrap_positions
-from mdnum.md.energies import Call, EnergyFunction, with_images
+from mdnum.md.energies import Call, EnergyFunction
 from mdnum.md.manybody import Smoothness
 from mdnum.numerics.jaxprs import Operation, first_not_finite, narrows, single_numbers
 from mdnum.plain import beside
@@ -32,6 +32,8 @@ _TEXTS = beside(__file__)
 FORMATS: tuple[jaxmd.Format, ...] = ("dense", "sparse", "ordered-sparse")
 #: Relative difference of energies that are the same, by whether all arithmetic is in double precision.
 _SAME = {True: 1e-9, False: 1e-5}
+#: Atoms of a larger structure that are tried.
+_ENOUGH = 500
 #: Of the box that tells rows from columns: how far it is sheared, not the same way along any two axes.
 _SHEAR = 1e-3 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.7, 0.4, 0.0]])
 
@@ -52,12 +54,28 @@ def admitted(simulation: Simulation) -> Simulation:
         AdmissionError: what it does cannot be right, in one of the ways of admission.toml.
     """
     with jaxmd.standard_promotion():
-        trial = Trial(simulation)
-        trial.resolve()
-        trial.check()
-        model = trial.at_the_cutoff()
+        trial = _of_a_part(simulation)
+        if trial is None:
+            trial = Trial(simulation, simulation.atoms)
+            trial.examine()
     notes = tuple((code, json.dumps(_short(values))) for code, values in trial.notes.items())
-    return simulation.with_model(replace(model, notes=notes))
+    return simulation.with_model(replace(trial.model, notes=notes))
+
+
+def _of_a_part(simulation: Simulation) -> Trial | None:
+    """A few atoms of a large structure examined, and the numbers of all; None where that is not enough."""
+    if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
+        return None
+    try:
+        trial = Trial(simulation, _ENOUGH)
+        trial.examine()
+        whole = Trial(simulation.with_model(replace(trial.model, lists=None)), simulation.atoms)
+        whole.keep(trial.call.how.box)
+    except AdmissionError:
+        # what is wrong with a part and its surface may be right in the structure
+        return None
+    # atoms that are known by their places are others in a part
+    return None if trial.model.labeled else trial
 
 
 def _short(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,12 +86,15 @@ def _short(values: Mapping[str, Any]) -> dict[str, Any]:
 class Trial:
     """An energy function at one configuration, in the order of the structure.
 
+    Args:
+        atoms: number of atoms that are tried, those closest to the first one, in the box of all.
+
     Attributes:
         model: the function as far as it is known.
         notes: what should be known about it, values by code.
     """
 
-    def __init__(self, simulation: Simulation):
+    def __init__(self, simulation: Simulation, atoms: int):
         self.model: EnergyFunction = simulation.model
         self.notes: dict[str, dict[str, Any]] = {}
         self.symbols, self.seed = simulation.symbols, simulation.draw.seed
@@ -90,6 +111,12 @@ class Trial:
         names = np.append(table.order, len(self.x)).astype(np.int32)
         self.idx = np.full((len(self.x), table.slots), len(self.x), np.int32)
         self.idx[table.order] = names[table.index].T
+        if atoms < len(self.x):
+            d = displacement(self.box, self.x, self.x[:1])
+            kept = np.sort(np.argsort(sum(c * c for c in d))[:atoms])
+            place = np.full(len(self.x) + 1, atoms, np.int32)
+            place[kept] = np.arange(atoms)
+            self.x, self.idx = self.x[kept], place[self.idx[kept]]
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
         # those whose nearest image stays the same in a box that is sheared
         self.near = self.within(self.inside, self.x, 0.45 * width)
@@ -106,6 +133,12 @@ class Trial:
 
     def _with(self, **found: Any) -> None:
         self.model = replace(self.model, function=replace(self.call, how=replace(self.call.how, **found)))
+
+    def examine(self) -> None:
+        """Find out all of it; raise an AdmissionError where what it does cannot be right."""
+        self.resolve()
+        self.check()
+        self.at_the_cutoff()
 
     # --- calling it -----------------------------------------------------------------------------------
 
@@ -139,7 +172,7 @@ class Trial:
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
-            neighbor = with_images(neighbor, real, cell, box)
+            neighbor = jaxmd.multi_image(neighbor, real, cell, box)
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def _arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
@@ -229,7 +262,7 @@ class Trial:
         paired, periodic = ((self.inside < len(self.x)).any(), self.pbc.any())
         if not periodic or not paired:
             self.notes |= {} if paired else {"UNTRIED": {}}
-            self._known("cell" if "cell" in words else "columns" if periodic and "box" in words else "")
+            self.keep("cell" if "cell" in words else "columns" if periodic and "box" in words else "")
             return
         boxes = ("cell",) * ("cell" in words) + ("columns", "rows") * ("box" in words)
         kept = None
@@ -241,14 +274,14 @@ class Trial:
                     kept = fractional, box
                     break
         self._with(fractional=kept is not None and kept[0])
-        self._known(kept[1] if kept else "")
+        self.keep(kept[1] if kept else "")
         if kept is None:
             here, there = (self.there(x)[0] for x in self._moves(self.cell)[-2:])
             raise self._error("ANOTHER_BOX", here=there, there=here)
         if not self.call.how.strain and not self.call.how.box:
             raise self._error("CELL_IGNORED" if how.native else "NO_STRAIN")
 
-    def _known(self, box: str) -> None:
+    def keep(self, box: str) -> None:
         """Keep how the box is followed, and the keywords that this takes; energies must be finite then."""
         how = self.call.how
         self._with(box=box)
@@ -385,8 +418,8 @@ class Trial:
         if abs((found := slope(at)) - stress) > allowed * self.scale + 10 * noise * self.model.r_cut:
             raise self._error("STRESS_WRONG", found=found, stress=stress)
 
-    def at_the_cutoff(self) -> EnergyFunction:
-        """The function with what a crossing of its cutoff does, of the pairs that are nearest to it."""
+    def at_the_cutoff(self) -> None:
+        """Find what a crossing of its cutoff does, of the pairs that are nearest to it."""
         n, r_cut, size = len(self.x), self.model.r_cut, self.scale
         r = np.where(self.idx < n, self.distances(self.idx, self.x), np.inf)
         found, acts = [], []
@@ -414,7 +447,7 @@ class Trial:
             found.append([near[k] * real[k] for k in (0, 1)])
             acts += [abs(beyond[k] - near[k]) <= 0.1 * abs(near[k]) for k in (0, 1) if real[k]][:1]
         if not found:
-            return self.model
+            return
         jumps, pushes = zip(*found, strict=True)
         jump, push = max(jumps, key=abs), max(pushes)
         order = -1.0 if jump else 0.0 if push else 1.0
@@ -427,7 +460,7 @@ class Trial:
         if acts and not trusts:
             self.notes.pop("TRUSTS_LIST", None)
             self.notes["DECIDES_ITSELF"] = {}
-        return replace(self.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
+        self.model = replace(self.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
 
 
 def _named(found: Operation | None) -> str:
@@ -440,7 +473,7 @@ def second_derivative(simulation: Simulation) -> str:
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():
-        trial = Trial(simulation)
+        trial = Trial(simulation, simulation.atoms)
         arguments = trial._arguments()
 
         def along(parameters, x, *rest):

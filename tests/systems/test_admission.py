@@ -396,6 +396,46 @@ def test_numbers_that_belong_to_atoms_stay_with_them_when_atoms_are_sorted():
     compared(one, atoms, np.outer(charges, charges))
 
 
+LARGE = argon(tilted=False) * 3
+
+
+def plain(R, neighbor, cell):
+    return jnp.sum(over(own_displacement(cell), R, neighbor))
+
+
+def far_away(R, neighbor, cell):
+    """Not finite for one atom in the middle of the box, far from the first one."""
+    far = jnp.asarray(LARGE.positions[np.argmin(np.linalg.norm(LARGE.positions - 15.8, axis=1))])
+    return plain(R, neighbor, cell) + jnp.sum(jnp.where(jnp.sum((R - far) ** 2, axis=1) < 0.1, jnp.inf, 0.0))
+
+
+def for_each_atom(R, neighbor, cell):
+    return plain(R, neighbor, cell) + jnp.sum(0 * R * jnp.ones((len(LARGE), 1)))
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("function", some((plain, far_away, for_each_atom), (plain, for_each_atom)))
+def test_a_part_of_a_large_structure_is_enough_where_it_is_like_the_whole(function):
+    sizes = []
+
+    def energy(parameters, R, neighbor, cell):
+        sizes.append(len(R))
+        return function(R, neighbor, cell)
+
+    def made():
+        return simulation(energy, LARGE, format="dense")
+
+    if function is far_away:
+        with pytest.raises(AdmissionError) as caught:
+            made()
+        assert caught.value.code == "NOT_FINITE"
+        return
+    assert made().model.call.how.box == "cell"
+    assert set(sizes) == {500, len(LARGE)}
+    # the one program for energies and derivatives is all that the rest of the atoms need
+    assert function is not plain or sizes.count(500) == sizes.count(len(LARGE)) + 1
+
+
 @pytest.mark.nightly
 @pytest.mark.jax_md
 def test_units_are_those_that_the_function_is_written_in():
