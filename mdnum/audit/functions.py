@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.audit.curve import SMOOTH, Curve, Jump, bisect, find_jumps
-from mdnum.md.potentials import LennardJones, Morse, PairPotential, SoftSphere
+from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import nearest_distance
 
@@ -66,8 +66,9 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         walk, ends = _walked(shared), _ends(term.cutoff, shared)
         for kind, pair in enumerate(combinations_with_replacement(simulation.symbols, 2)):
             single = jax.tree.map(lambda leaf, kind=kind: leaf[kind], own)
-            r_cut, r_onset = float(term.r_cut[kind]), float(term.r_onset[kind])
-            order = min(order, _order(ends(single, r_cut, r_onset, np.linspace(0.5, 1, 101) * r_cut)))
+            r_cut = float(term.r_cut[kind])
+            last = ends(single, term.r_cut[kind], term.r_onset[kind], np.linspace(0.5, 1, 101) * r_cut)
+            order = min(order, _order(np.asarray(last)))
             at = {"term": name, "pair": "-".join(pair)}
             places += [at | row for row in _breaks(partial(walk, single), low, r_cut)]
     return {"from": low, "to": simulation.r_cut, "smoothness": order, "places": places}
@@ -87,9 +88,8 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
     return lambda own, r: tuple(float(value) for value in evaluate(own, np.float64(r)))  # type: ignore[return-value]
 
 
-def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., np.ndarray]:
+def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
     """The cut energy and its first derivatives at distances, the last of which is pulled inside a little."""
-    from mdnum.md.potentials import CutPotential
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -102,12 +102,9 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., np.ndarray]:
         made = [energy]
         for _ in range(SMOOTH):
             made.append(lambda r, f=made[-1]: jax.jvp(f, (r,), (jnp.ones_like(r),))[1])
-        return jnp.stack([f(r) for f in made])
+        return jnp.stack([f(r * (1 - 2.0**-44)) for f in made])
 
-    def ends(own, r_cut, r_onset, r):
-        return np.asarray(evaluate(own, np.float64(r_cut), np.float64(r_onset), r * (1 - 2.0**-44)))
-
-    return ends
+    return evaluate
 
 
 def _order(derivatives: np.ndarray) -> int:

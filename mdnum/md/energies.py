@@ -77,7 +77,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Its energy in its own units, of positions as it takes them; with empty `returns` all that it returns.
+        """Its energy in its own units, of positions as it takes them; all that it returns with no `returns`.
 
         Args:
             given: the keywords of the convention, and for mdnum's own "cell".

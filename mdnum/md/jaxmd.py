@@ -214,7 +214,7 @@ def multi_image(
     """
     kind: Any = upstream().custom_partition.NeighborListMultiImage
     n, dense = x.shape[0], neighbor.format is upstream().partition.Dense
-    idx = neighbor.idx if dense else tuple(neighbor.idx)
+    idx: Any = neighbor.idx if dense else tuple(neighbor.idx)
     here, other = (jnp.arange(n)[:, None], idx) if dense else idx
     d = x[jnp.where(other < n, other, 0)] - x[jnp.where(here < n, here, 0)]
     shifts = -jnp.round(jax.lax.stop_gradient(d @ jnp.linalg.inv(cell)))

@@ -71,6 +71,8 @@ def _of_a_part(simulation: Simulation) -> Trial | None:
         trial.examine()
         whole = Trial(simulation.with_model(replace(trial.model, lists=None)), simulation.atoms)
         whole.keep(trial.call.how.box)
+        if "TRUSTS_LIST" in trial.notes:
+            trial.notes["TRUSTS_LIST"] = whole.over_both_lists()
     except AdmissionError:
         # what is wrong with a part and its surface may be right in the structure
         return None
@@ -97,8 +99,8 @@ class Trial:
     def __init__(self, simulation: Simulation, atoms: int):
         self.model: EnergyFunction = simulation.model
         self.notes: dict[str, dict[str, Any]] = {}
-        self.symbols, self.seed = simulation.symbols, simulation.draw.seed
-        unknown, known = set(self.symbols) - set(self.model.species), ", ".join(self.model.species)
+        self.simulation = simulation
+        unknown, known = set(simulation.symbols) - set(self.model.species), ", ".join(self.model.species)
         if known and unknown:
             raise self._error("UNKNOWN_SPECIES", unknown=", ".join(sorted(unknown)), known=known)
         self.pbc = np.array(simulation.pbc)
@@ -161,7 +163,7 @@ class Trial:
             model = replace(model, format=form, self_edges=itself and not self.call.how.images)
         self.model = model
         if model.start is not None and not jax.tree.leaves(model.parameters):
-            key, x = jax.random.PRNGKey(self.seed), jnp.asarray(self.x / self.call.length)
+            key, x = jax.random.PRNGKey(self.simulation.draw.seed), jnp.asarray(self.x / self.call.length)
             if own is None:
                 form = FORMATS[0] if model.format == "any" else model.format
                 own = jaxmd.as_neighbor_list(self.idx, x, form)
@@ -216,15 +218,15 @@ class Trial:
 
     def _returned(self) -> str:
         """What it returns, as `Convention.returns`."""
-        out = jax.eval_shape(self.bare, *self._arguments())
-        shape = {key: one.shape for key, one in out.items()} if isinstance(out, Mapping) else jnp.shape(out)
-        kinds = {(): "number", (1,): "number", (len(self.x),): "atoms"}
+        shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self._arguments()))
+        one = ((), (1,))
         if isinstance(shape, Mapping):
-            kinds = {shape[key]: key for key in ("energy", "total") if shape.get(key) in ((), (1,))}
-            shape = next(reversed(kinds), shape)
-        if isinstance(shape, tuple) and shape in kinds:
-            return kinds[shape]
-        raise self._error("NO_ENERGY", seen=f"{shape!r}")
+            kind = next((key for key in ("total", "energy") if shape.get(key) in one), "")
+        else:
+            kind = "number" if shape in one else "atoms" if shape == (len(self.x),) else ""
+        if not kind:
+            raise self._error("NO_ENERGY", seen=f"{shape!r}")
+        return kind
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
         """Energy and forces in the simulation's units; arguments as for `_arguments`."""
@@ -361,9 +363,9 @@ class Trial:
         place = np.append(np.argsort(order), n).astype(np.int32)
         other = self.there(self.x[order], place[self.inside[order]])[0]
         self.model = replace(self.model, labeled=not self.same(energy, other))
-        if not self.same(energy, skin := self.there(idx=self.idx)[0]):
+        if not self.same(*(both := self.over_both_lists()).values()):
             self.model = replace(self.model, trusts_list=True)
-            self.notes["TRUSTS_LIST"] = {"inside": energy, "skin": skin}
+            self.notes["TRUSTS_LIST"] = both
         none = np.full_like(self.inside, n)
         if not all(np.isfinite(one).all() for one in self.there(idx=none)):
             self.notes["NO_EDGES_NAN"] = {"operation": self._culprit(none)}
@@ -375,6 +377,10 @@ class Trial:
         self.notes |= {code: {} for code, is_so in found.items() if is_so}
         if self.double and (rounded := single_numbers(self.trace)):
             self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
+
+    def over_both_lists(self) -> dict[str, float]:
+        """Energies over the pairs inside the cutoff, and with those of the skin."""
+        return {"inside": self.there()[0], "skin": self.there(idx=self.idx)[0]}
 
     def _derivatives(self, rng: np.random.Generator) -> None:
         """Forces, and stress where the box counts, against differences of energies."""
@@ -454,7 +460,7 @@ class Trial:
         if order == -1:
             self.notes["ENERGY_JUMPS"] = {"jump": jump, "push": push}
             # the jump of every crossing where all are alike; of others it is not known before
-            if len(self.symbols) > 1 or any(abs(one - jump) > 1e-6 * abs(jump) for one in jumps):
+            if len(self.simulation.symbols) > 1 or any(abs(one - jump) > 1e-6 * abs(jump) for one in jumps):
                 jump = push = float("nan")
         trusts = all(acts) if acts else self.model.trusts_list
         if acts and not trusts:

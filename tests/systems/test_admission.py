@@ -107,7 +107,7 @@ def dictionary(atoms: Atoms):
     space = general(atoms, False)
 
     def energy(R, nlist, **kw):
-        return {"bond": jnp.zeros(()), "total": jnp.sum(over(space, R, nlist, **kw))}
+        return {"terms": {"bond": jnp.zeros(())}, "total": jnp.sum(over(space, R, nlist, **kw))}
 
     return energy, SimpleNamespace(allocate=lambda R: jaxmd.as_neighbor_list(np.zeros((len(R), 1)), R)), space
 
@@ -293,6 +293,10 @@ def vectors(atoms: Atoms):
     return lambda R, neighbor, **kw: jnp.ones(3) * jnp.sum(over(space, R, neighbor, **kw))
 
 
+def with_another(atoms: Atoms):
+    return lambda R, neighbor, **kw: (jnp.sum(R), {"charges": R[:, 0]})
+
+
 def raises(R, neighbor, **kw):
     raise KeyError("weights")
 
@@ -310,6 +314,7 @@ DEFECTS = {
     "NO_STRAIN": brought(deaf, format="dense"),
     "STRESS_WRONG": brought(strained_twice, format="dense"),
     "NO_ENERGY": brought(vectors, format="dense"),
+    "NO_ENERGY, with another": brought(with_another, format="dense"),
     "NOT_CALLABLE": brought(lambda atoms: raises),
     "UNKNOWN_SPECIES": brought(classical, species=("Si", "O")),
 }
