@@ -19,7 +19,6 @@ _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpo
           "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
 #: Candidates that are tried before giving up.
 _MOST = 12
-
 #: Digits that a person writes: numbers in single precision with more are weights, or were computed.
 _DIGITS = 6
 
@@ -58,11 +57,10 @@ def single_numbers(closed: Any) -> list[str]:
                 continue
             with np.errstate(over="ignore"):
                 single = one.ravel().astype(np.float32)
-            for number in single[(single == one.ravel()) & np.isfinite(single)]:
-                # halves and whole numbers lose nothing, and what has all digits was computed
-                word = str(number)
-                if len(word.strip("-0.").replace(".", "")) <= _DIGITS and float(word) != float(number):
-                    numbers[word] = None
+            single = single[(single == one.ravel()) & np.isfinite(single)]
+            # an array with one that has all digits was computed; halves and whole numbers lose nothing
+            if all(len(str(number).strip("-0.").replace(".", "")) <= _DIGITS for number in single):
+                numbers |= {str(number): None for number in single if float(str(number)) != float(number)}
     return list(numbers)
 
 

@@ -21,7 +21,7 @@ from mdnum.forks import choices, fork
 from mdnum.gradients.losses import FinalProjection
 from mdnum.md import jaxmd
 from mdnum.md.jaxmd import displacement as own_displacement
-from mdnum.numerics.jaxprs import first_not_finite
+from mdnum.numerics.jaxprs import first_not_finite, single_numbers
 from mdnum.systems.admission import AdmissionError
 from mdnum.systems.evaluate import Evaluator
 
@@ -383,6 +383,16 @@ def test_what_should_be_known_is_noted_and_is_a_finding_of_the_run(code: str):
         # of two ends
         assert one.model.smoothness.energy_jump == pytest.approx(0.2 * DEPTH, rel=1e-5)
         assert one.program["potential"]["notes"] == notes
+
+
+def test_weights_of_a_network_in_single_precision_are_not_numbers_that_were_rounded():
+    weights = np.random.default_rng(0).normal(size=50).astype(np.float32)
+    # some are short by chance
+    assert any(len(str(weight)) < 9 for weight in weights)
+    held = jnp.asarray(weights, float)
+    sigma = jnp.asarray([0.3, 3.405], jnp.float32)
+    program = jax.make_jaxpr(lambda x: jnp.sum(held * x) * sigma)(1.0)
+    assert single_numbers(program) == ["0.3", "3.405"]
 
 
 @pytest.mark.jax_md
