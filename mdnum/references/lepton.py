@@ -124,12 +124,12 @@ def expressions(simulation: Simulation) -> list[str]:
     for kind in range(model.pair_types):
         potential = own.potential.of(jnp.asarray(kind))
         end = AtCutoff(*(np.float64(leaf[kind]) for leaf in at))
-        made.append(expression(lambda r, u=potential, end=end: _cut(model, u, r * r, end)))
+
+        def energy(r, potential=potential, end=end):
+            return model.cutoff.cut(r * r, potential.energy(r * r), jnp.zeros_like(r), end)[0]
+
+        made.append(expression(energy))
     return made
-
-
-def _cut(model: CutPotential, potential: Any, r2: Any, end: AtCutoff) -> Any:
-    return model.cutoff.cut(r2, potential.energy(r2), jnp.zeros_like(r2), end)[0]
 
 
 class Lepton(ClassicalCalculator):

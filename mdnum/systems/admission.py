@@ -122,6 +122,8 @@ class Trial:
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
         # those whose nearest image stays the same in a box that is sheared
         self.near = self.within(self.inside, self.x, 0.45 * width)
+        # the atom that has most neighbors
+        self.central = int(np.argmax((self.inside < len(self.x)).sum(axis=1)))
         self._lists()
         self._compile()
 
@@ -196,25 +198,20 @@ class Trial:
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on
         sets = [tuple(w for w in words if w != left) for left in ("", "box", "cell", "perturbation")]
-        for form in formats:
-            for keywords in dict.fromkeys([*sets, ()]):
-                self.model = replace(self.model, format=form)
-                self._with(keywords=keywords, returns="")
-                try:
-                    self._with(returns=self._returned())
-                    every = jax.jit(jax.value_and_grad(self.bare, argnums=(1, 4, 5, 6)))
-                    self.program = self._quick(every.trace(*self._arguments()))
-                    return
-                except AdmissionError:
-                    raise
-                except Exception as error:
-                    failed = failed or in_a_line(error)
+        for form, keywords in product(formats, dict.fromkeys([*sets, ()])):
+            self.model = replace(self.model, format=form)
+            self._with(keywords=keywords, returns="")
+            try:
+                self._with(returns=self._returned())
+                every = jax.jit(jax.value_and_grad(self.bare, argnums=(1, 4, 5, 6)))
+                traced = every.trace(*self._arguments())
+                self.double, self.program = not narrows(traced.jaxpr), _quick(traced)
+                return
+            except AdmissionError:
+                raise
+            except Exception as error:
+                failed = failed or in_a_line(error)
         raise self._error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
-
-    def _quick(self, traced: Any) -> Any:
-        """A program compiled for a few calls."""
-        self.trace = traced.jaxpr
-        return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
 
     def _returned(self) -> str:
         """What it returns, as `Convention.returns`."""
@@ -259,7 +256,7 @@ class Trial:
             AdmissionError: numbers that are not finite; another box than the simulation's, or one that it
                 ignores; no way to strain what it sees.
         """
-        self.double, how = not narrows(self.trace), self.call.how
+        how = self.call.how
         words = ("cell",) if how.native else how.keywords
         paired, periodic = ((self.inside < len(self.x)).any(), self.pbc.any())
         if not periodic or not paired:
@@ -307,7 +304,7 @@ class Trial:
 
     def _moves(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
         """Positions with one atom, that has neighbors, moved by each of some vectors; last those unmoved."""
-        moved = np.arange(len(self.x)) == self._central
+        moved = np.arange(len(self.x)) == self.central
         return [*(self.x + np.outer(moved, vector) for vector in vectors[self.pbc]), self.x]
 
     def _takes_images(self) -> bool:
@@ -317,15 +314,10 @@ class Trial:
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
         return self.call.how.fractional or not self._unmoved(np.eye(3) * self.call.length)
 
-    @property
-    def _central(self) -> int:
-        """The atom that has most neighbors."""
-        return int(np.argmax((self.inside < len(self.x)).sum(axis=1)))
-
     def _unmoved(self, vectors, cell=None) -> bool:
         """Whether moving an atom by any of some vectors leaves the energy of its pairs as it is."""
         n, rows = len(self.x), np.arange(len(self.x))[:, None]
-        own = (self.near == self._central) | (rows == self._central)
+        own = (self.near == self.central) | (rows == self.central)
         idx = np.where(own, self.near, n).astype(np.int32)
         none = np.nan_to_num(self.there(idx=np.full_like(idx, n))[0])
         *moved, here = (self.there(x, idx, cell) for x in self._moves(vectors))
@@ -356,8 +348,8 @@ class Trial:
         wide = np.concatenate([self.inside, np.full((n, 8), n, np.int32)], axis=1)
         # its own padding between the neighbors was among what was shuffled
         arguments = self._arguments(wide)
-        alone = self._quick(jax.jit(self.bare).trace(*arguments))
-        if not self.same(energy, other := float(alone(*arguments)) * self.call.unit):
+        alone = jax.jit(self.bare).trace(*arguments)
+        if not self.same(energy, other := float(_quick(alone)(*arguments)) * self.call.unit):
             raise self._error("DEPENDS_ON_CAPACITY", here=energy, there=other)
         order = rng.permutation(n)
         place = np.append(np.argsort(order), n).astype(np.int32)
@@ -375,7 +367,7 @@ class Trial:
             "SINGLE_INSIDE": not self.double,
         }
         self.notes |= {code: {} for code, is_so in found.items() if is_so}
-        if self.double and (rounded := single_numbers(self.trace)):
+        if self.double and (rounded := single_numbers(alone.jaxpr)):
             self.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
 
     def over_both_lists(self) -> dict[str, float]:
@@ -467,6 +459,11 @@ class Trial:
             self.notes.pop("TRUSTS_LIST", None)
             self.notes["DECIDES_ITSELF"] = {}
         self.model = replace(self.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
+
+
+def _quick(traced: Any) -> Any:
+    """A program compiled for a few calls."""
+    return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
 
 
 def _named(found: Operation | None) -> str:
