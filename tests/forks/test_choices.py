@@ -114,7 +114,6 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, message: s
         (CRYSTAL, "precision.accumulate=bfloat16", "small ones are lost"),
         ("silicon/tersoff-512", "reduction=exact", "one order"),
         ("silicon/tersoff-512", "order@exact", "one order"),
-        ("silicon/tersoff-512", "precision", "float64 only"),
         (CRYSTAL, "precision=float64", "float64 already"),
         (CRYSTAL, "reduction=sequential", "already"),
         ("silicon/tersoff-512", "format", "a format of its own"),

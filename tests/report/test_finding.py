@@ -118,7 +118,9 @@ def test_every_sentence_can_be_filled(path):
         known = {name.split(".")[0] for name, form in parts if "." in name or re.match(r"[+]?\d*m|=", form)}
         known -= {"units"}
         fields |= dict.fromkeys(known, Measured(2.0, "energy", 1.0, 1.0))
-        assert "{" not in fill(text, {"units": METAL, **fields})
+        # errors below the report have formats of Python's
+        filled = text.format(**fields) if path.stem == "admission" else fill(text, {"units": METAL, **fields})
+        assert "{" not in filled
 
 
 def test_sentences_are_found_with_their_fields():

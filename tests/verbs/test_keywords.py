@@ -20,7 +20,7 @@ from mdnum.verbs.frame import Keep, content
 # other names of the package take no options of a verb
 _NO_VERBS = {
     "systems", "load", "build", "simulation", "diagnose", "check", "allow_code", "MdnumCalculator", "method",
-    "value_and_grad", "changed", "parameters", "read",
+    "value_and_grad", "changed", "parameters", "read", "energy_function",
 }  # fmt: skip
 VERBS = sorted(
     name for name in mdnum.__all__ if name not in _NO_VERBS and inspect.isfunction(getattr(mdnum, name))

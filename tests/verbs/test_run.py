@@ -202,8 +202,16 @@ def test_every_planted_defect_is_found(good):
         "FORCE_JUMP": changed(good, {"cutoff": {"kind": "shifted", "energy_jump": 0.0, "force_jump": 1e-4}}),
         "OTHER_TEMPERATURE": changed(good, system={**good.system, "dynamics": {"temperature": 1e4}}),
         "HARD_CUTOFF": good,
+        "NOT_COMPILED": changed(good, {"not_compiled": "scan"}),
     }
-    assert set(planted) | {"CHATTER"} == {code for code in TEXTS.entries if code.isupper()}
+    for code, values in {"FIXED_BOX": {}, "UNTRIED": {}, "LIST_FAILED": {"error": "no list"}}.items():
+        planted[code] = changed(good, system={**good.system, "potential": {"notes": {code: values}}})
+    # of a person's own functions: tests/audit/test_functions.py and tests/systems/test_admission.py plant these
+    own = {
+        "FUNCTION_SLOPE", "FUNCTION_NOT_FINITE", "FUNCTION_BREAKS", "PARAMETERS_FLOAT32", "SINGLE_INSIDE",
+        "TRUSTS_LIST", "DECIDES_ITSELF", "ENERGY_JUMPS", "NO_EDGES_NAN", "NAN_ON_OVERFLOW",
+    }  # fmt: skip
+    assert set(planted) | own | {"CHATTER"} == {code for code in TEXTS.entries if code.isupper()}
     for code, view in planted.items():
         assert set(found(view)) == ({code} if code == "FORCE_JUMP" else {code, "HARD_CUTOFF"}), code
         assert page(view, judge(view)).sections, code
