@@ -122,7 +122,7 @@ def expressions(simulation: Simulation) -> list[str]:
     own, at = model.typed, model.at_cutoff()
     made = []
     for kind in range(model.pair_types):
-        potential = own.potential.of(jnp.asarray(kind))
+        potential: Any = own.potential.of(jnp.asarray(kind))
         end = AtCutoff(*(np.float64(leaf[kind]) for leaf in at))
 
         def energy(r, potential=potential, end=end):

@@ -350,7 +350,9 @@ def test_check_prints_every_record_and_exits_by_agreement(
 
     asked = []
     for ok in (True, False):
-        monkeypatch.setattr(checks, "check_energy", lambda system, ok=ok, **how: asked.append(system) or Report(ok))
+        monkeypatch.setattr(
+            checks, "check_energy", lambda system, ok=ok, **how: asked.append(system) or Report(ok)
+        )
         expected = 0 if ok else 1
         assert call("check", "energy", crystal, "--set", "cutoff.kind=shifted") == expected
         out = capsys.readouterr().out

@@ -206,7 +206,7 @@ def test_every_planted_defect_is_found(good):
     }
     for code, values in {"FIXED_BOX": {}, "UNTRIED": {}, "LIST_FAILED": {"error": "no list"}}.items():
         planted[code] = changed(good, system={**good.system, "potential": {"notes": {code: values}}})
-    # of a person's own functions: tests/audit/test_functions.py and tests/systems/test_admission.py plant these
+    # of own functions: planted in tests/audit/test_functions.py and tests/systems/test_admission.py
     own = {
         "FUNCTION_SLOPE", "FUNCTION_NOT_FINITE", "FUNCTION_BREAKS", "PARAMETERS_FLOAT32", "SINGLE_INSIDE",
         "TRUSTS_LIST", "DECIDES_ITSELF", "ENERGY_JUMPS", "NO_EDGES_NAN", "NAN_ON_OVERFLOW",
