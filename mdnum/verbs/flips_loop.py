@@ -29,20 +29,25 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
     frames, flagged = (np.flatnonzero(loop[name]) for name in ("lost", "overflow"))
     if not known.any():
         return None
+    # a pair that is missing several times has as many rows
+    of = np.unique(np.array([lost[name] for name in ("i", "j", "rank")]), axis=1, return_inverse=True)[
+        1
+    ].ravel()
     told: dict[str, Any] = {
-        "lists": int(loop["new_list"].sum()), "frames": int(known.sum()), "lost": len(lost["i"]),
+        "lists": int(loop["new_list"].sum()), "frames": int(known.sum()), "lost": len(np.unique(of)),
+        "times": len(of), "pair_frames": int(loop["lost"].sum()),
         "listed": float(loop["listed"][known].mean()), "lost_frames": len(frames),
         "first": int(loop["number"][frames[0]]) if len(frames) else None, "worst": None, "overflow": None,
     }  # fmt: skip
-    if len(lost["i"]):
-        worst = {name: column[np.argmax(lost["deepest"])] for name, column in lost.items()}
-        told["worst"] = {**worst, "frames": worst["end"] - worst["begin"]}
+    if len(of):
+        worst = {name: column[at := np.argmax(lost["deepest"])] for name, column in lost.items()}
+        told["worst"] = {**worst, "frames": (lost["end"] - lost["begin"])[of == of[at]].sum()}
     if len(flagged):
         before = np.concatenate([[0], np.cumsum(loop["overflow"])])
         first, last = loop["number"][flagged[[0, -1]]].tolist()
         told["overflow"] = {
             "frames": len(flagged), "first": first, "last": last,
-            "lost": int(np.count_nonzero(before[lost["end"]] > before[lost["begin"]])),
+            "lost": len(np.unique(of[before[lost["end"]] > before[lost["begin"]]])),
             "deepest": float(loop["deepest"][flagged].max()),
         }  # fmt: skip
     return told
@@ -80,7 +85,8 @@ def findings(
     """On lost pairs, overflow and the energy."""
     if lists and (worst := lists["worst"]) is not None:
         values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
-        yield TEXTS.finding("LOST_PAIRS", **{**lists, **values, "deepest": view.length(worst["deepest"])})
+        again, deepest = ["again"] * (lists["times"] > lists["lost"]), view.length(worst["deepest"])
+        yield TEXTS.finding("LOST_PAIRS", *again, **{**lists, **values, "deepest": deepest})
     if lists and (overflow := lists["overflow"]) is not None:
         values = {**overflow, "deepest": view.length(overflow["deepest"])}
         yield TEXTS.finding("OVERFLOW", *["harmless"] * (not overflow["lost"]), **values)

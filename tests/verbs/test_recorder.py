@@ -282,6 +282,26 @@ def test_a_skin_that_is_used_up_loses_what_brute_force_finds(tmp_path, skin):
     assert loop["new_list"] == [True] + 11 * [False]
 
 
+def test_a_pair_that_is_missing_again_is_one_pair(tmp_path):
+    rng, cell = np.random.default_rng(7), np.diag([6.0] * 3)
+    frames = rng.uniform(0, 6, (24, 3)) + np.cumsum(rng.normal(0, 0.15, (30, 24, 3)), axis=0)
+    i, j, _ = (part[: len(part) // 2] for part in listed(frames[0], cell, 2.6))
+    with mdnum.Recorder(2.5, cell=cell, out=tmp_path / "r", report=False) as one:
+        one.see(0, frames[0], neighbors=(i, j))
+        for step, x in enumerate(frames[1:], 1):
+            one.see(step, x)
+    known = set(zip(i.tolist(), j.tolist(), strict=True))
+    lost = [{key[:2] for key in images(x, cell, 2.5)} - known for x in frames]
+    told, apart = one.outcome.summary["lists"], set().union(*lost)
+    assert (told["lost"], told["pair_frames"]) == (len(apart), sum(map(len, lost)))
+    starts = sum(len(now - before) for before, now in pairwise([set(), *lost]))
+    assert told["times"] == starts > told["lost"] > 10
+    found = next(each for each in one.outcome.findings if each.code == "LOST_PAIRS")
+    assert str(len(apart)) in found.title and str(starts) in found.text
+    worst = told["worst"]["i"], told["worst"]["j"]
+    assert told["worst"]["frames"] == sum(worst in now for now in lost)
+
+
 def test_images_that_a_list_lacks_and_stale_shifts_are_found(tmp_path):
     x, cell = gas(5, 1, 8, 3.4)[0], 0.6 * TILTED.T
     i, j, s = listed(x, cell, 2.9)
