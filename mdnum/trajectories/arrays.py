@@ -37,9 +37,9 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
     found = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
     if found.dtype.kind not in kinds or (found.dtype.kind == "f" and found.dtype.itemsize < 4):
         expected = "float32 or float64" if "f" in kinds else "integers"
-        raise InputError(
-            f"{name} of dtype {found.dtype}; expected {expected}", remedy="Convert them", where=name
-        )
+        held = next((one for one in ("position", "positions") if hasattr(values, one)), None)
+        remedy = f"Give state.{held}" if held else "Convert them"
+        raise InputError(f"{name} of dtype {found.dtype}; expected {expected}", remedy=remedy, where=name)
     return found
 
 
@@ -103,7 +103,7 @@ class ArrayFrames(Trajectory):
     def put(self, frame: Frame) -> None:
         """Adds the next frame."""
         self._waiting.append(frame)
-        if len(self._first) < SAMPLE:
+        if len(self._first) < SAMPLE and len(frame.positions) == self.atoms:
             self._first.append(frame)
 
     def _box_of(self, cell: Any, box: Any, pbc: Any) -> Box:

@@ -43,7 +43,7 @@ _PART_ROWS, _PARTS_HELD = 1_500_000, 10
 _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
 _BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
-_Pairs = str | Mapping[tuple[str, str], float]
+_Pairs = str | Mapping[tuple[str, str], float] | Mapping[str, float]
 # and files that say what the atoms are and hold one frame, if any
 _STRUCTURES = frozenset({"psf", "prmtop", "parm7", "top", "tpr", "itp", "data", "mol2"})
 _PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
@@ -81,7 +81,7 @@ def flips(
         topology: what the atoms are, where the trajectory does not say.
         cutoffs: a length in the file's unit, or several, a rule each; default the cutoff of the mdnum run
             that the file belongs to. One rule needs no sequence here, nor in `pairs` and `nearest`.
-        pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5".
+        pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5" or {"O-H": 2.5, "O-O": 3.5}.
         nearest: numbers of neighbors, a rule each: the k nearest of every atom.
         most: neighbors an atom can have inside a cutoff; the nearest are kept.
         between: two selections in MDAnalysis's language; only pairs with an atom in each are examined.
@@ -223,7 +223,7 @@ def rules(
     if wrong := [one for one in (*radii, *counts) if not isinstance(one, Real)]:
         raise InputError(f"{wrong[0]!r} is no number", remedy="Write cutoffs=5.0 or cutoffs=[4.0, 5.0]")
     found: list[Rule] = [CutoffRule(r) if most is None else Capped(r, most) for r in map(float, radii)]
-    found += [SpeciesCutoffs(one if isinstance(one, Mapping) else _species_cutoffs(one)) for one in species]
+    found += [SpeciesCutoffs(_species_cutoffs(one)) for one in species]
     found += [Nearest(k) for k in counts]
     names = [one.name for one in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -236,8 +236,12 @@ def _listed(given: Any) -> tuple[Any, ...]:
     return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
-def _species_cutoffs(words: str) -> dict[tuple[str, str], float]:
-    """Lengths by pair of species of "O-H=2.5,O-O=3.5"."""
+def _species_cutoffs(words: _Pairs) -> Mapping[tuple[str, str], float]:
+    """Lengths by pair of species of "O-H=2.5,O-O=3.5", or {"O-H": 2.5} as systems have it."""
+    if isinstance(words, Mapping):
+        if all(isinstance(pair, tuple) and len(pair) == 2 for pair in words):
+            return words
+        words = ",".join(f"{pair}={radius}" for pair, radius in words.items())
     found: dict[tuple[str, str], float] = {}
     for part in words.split(","):
         pair, equals, value = part.partition("=")

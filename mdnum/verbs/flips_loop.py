@@ -30,9 +30,8 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
     if not known.any():
         return None
     # a pair that is missing several times has as many rows
-    of = np.unique(np.array([lost[name] for name in ("i", "j", "rank")]), axis=1, return_inverse=True)[
-        1
-    ].ravel()
+    keys = np.array([lost[name] for name in ("i", "j", "rank")])
+    of = np.unique(keys, axis=1, return_inverse=True)[1].ravel()
     told: dict[str, Any] = {
         "lists": int(loop["new_list"].sum()), "frames": int(known.sum()), "lost": len(np.unique(of)),
         "times": len(of), "pair_frames": int(loop["lost"].sum()),

@@ -119,6 +119,9 @@ class Recorder:
         if self._outcome is not None or self._failed is not None:
             raise self._failed or InputError("the recorder is closed", remedy="Make another one")
         frame = self._source.read(step, positions, cell, box, pbc, velocities)
+        if len(frame.positions) != self._source.atoms:
+            message = f"{len(frame.positions)} atoms at step {step}, and {self._source.atoms} before"
+            raise InputError(message, remedy="Record each set of atoms by itself", where="positions")
         if neighbors is not None:
             self._list = self._check.given(neighbors, self._source.species)
         overflow = bool(np.any(np.asarray(getattr(neighbors, "did_buffer_overflow", False))))

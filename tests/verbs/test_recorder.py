@@ -213,6 +213,38 @@ def test_what_cannot_be_meant_is_an_error(tmp_path):
     assert "READING" in codes(upper) and upper.summary["frames"] == 1
 
 
+@pytest.mark.parametrize("at", [1, 12])
+def test_another_number_of_atoms_keeps_what_came_before(tmp_path, at):
+    frames = gas()
+    with pytest.raises(InputError, match="18"), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r") as one:
+        for step in range(at):
+            one.see(step, frames[step])
+        one.see(at, frames[at][:18])
+    assert one.outcome.summary["frames"] == at and one.outcome.summary["status"] == "stopped"
+    atoms = [ase.Atoms("H24", x, cell=[6.0] * 3, pbc=True) for x in frames]
+    del atoms[at][18:]
+    told = mdnum.flips(atoms, cutoffs=2.5, out=tmp_path / "f", report=False)
+    assert told.summary["frames"] == at and "STOPPED" in codes(told)
+
+
+def test_pairs_and_states_are_taken_as_programs_have_them(tmp_path):
+    class State:
+        """What jax-md's states have."""
+
+        position = gas(frames=1)[0]
+
+    made = [
+        recorded(tmp_path / str(k), gas(frames=4), (), pairs=pairs, cell=6.0, species=list("OH" * 12))
+        for k, pairs in enumerate(("O-H=2.5,O-O=2", {"O-H": 2.5, "O-O": 2.0}))
+    ]
+    assert same(made[0], made[1]) and made[0].table("flips").num_rows > 20
+    for pairs in ({"OH": 2.5}, {("O",): 2.5}, {"O-H": None}):
+        with pytest.raises(InputError, match="A-B"):
+            mdnum.Recorder(pairs=pairs)
+    with pytest.raises(InputError, match=r"state\.position"):
+        mdnum.Recorder(2.5).see(0, State())
+
+
 def test_an_atom_that_is_wrapped_changes_no_image(tmp_path):
     frames, cell = gas(2, 10, 9, 3.4), 0.6 * TILTED.T
     frames = frames[:1] + 0.2 * (frames - frames[:1])
