@@ -21,8 +21,9 @@ from mdnum.trajectories.trajectory import SAMPLE, Trajectory
 
 # shapes of a box of all frames
 _SINGLE = ((), (1,), (3,), (6,), (3, 3))
-# atoms from which on coordinates that all lie between 0 and 1 are fractions; spread at which none are
-_MANY, _SPREAD = 64, 10.0
+# atoms from which on coordinates that all lie between 0 and 1 are fractions; fewer where a cutoff is longer
+_MANY, _FEW = 64, 8
+_BARE = "There is no box, and all coordinates lie between 0 and 1: fractions need box and fractional=True."
 _UPPER = (
     "The cell is upper triangular, as boxes are in jax-md, and its rows were taken for the lattice vectors."
 )
@@ -52,6 +53,7 @@ class ArrayFrames(Trajectory):
     """
 
     reader, remembered = "mdnum", 10_000  # a loop may have any number of frames
+    reach = 0.0  # of the rules, length, where it is known
 
     def __init__(
         self, name: str, *, species: Any = None, cell: Any = None, box: Any = None, pbc: Any = None,
@@ -129,11 +131,13 @@ class ArrayFrames(Trajectory):
     def _begin(self, x: np.ndarray, box: Box, bits: int) -> None:
         """Checks what holds for all frames by the first."""
         fractional, remedy = self._fractional, "Say fractional=True, or fractional=False for lengths"
-        if fractional is None and len(x) >= _MANY and box.shortest > 2 and x.min() >= 0 and x.max() <= 1:
+        unit = len(x) >= (_FEW if self.reach > 1 else _MANY) and x.min() >= 0 and x.max() <= 1
+        if fractional is None and unit and box.shortest > 2:
             message = f"all coordinates lie between 0 and 1, in a box of {box.shortest:g} and more"
             raise InputError(message, remedy=remedy, where="positions")
-        if fractional and (not box.pbc.all() or np.ptp(x, axis=0).max(initial=0.0) > _SPREAD):
+        if fractional and (not box.pbc.all() or (x.size and (x.min() < -1 or x.max() > 2))):
             message = f"fractional coordinates from {x.min():.3g} to {x.max():.3g}, box {box.matrix.tolist()}"
+            remedy = "Say fractional=False for lengths; wrap fractions (x % 1), and give them a box"
             raise InputError(message, remedy=remedy, where="positions")
         words = (
             ["X"] * len(x) if self.named is None else [str(one) for one in np.asarray(self.named).tolist()]
@@ -144,6 +148,8 @@ class ArrayFrames(Trajectory):
         self.format = f"{'fractional coordinates' if fractional else 'positions'} in float{bits}"
         if self._box[1] is None and np.triu(box.matrix, 1).any() and not np.tril(box.matrix, -1).any():
             self.notes = (_UPPER,)
+        if fractional is None and unit and not box.pbc.any():
+            self.notes = (_BARE,)
 
     @classmethod
     def of(cls, frames: Any, cell: Any = None) -> ArrayFrames:

@@ -236,7 +236,7 @@ def _listed(given: Any) -> tuple[Any, ...]:
     return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
-def _species_cutoffs(words: _Pairs) -> Mapping[tuple[str, str], float]:
+def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
     """Lengths by pair of species of "O-H=2.5,O-O=3.5", or {"O-H": 2.5} as systems have it."""
     if isinstance(words, Mapping):
         if all(isinstance(pair, tuple) and len(pair) == 2 for pair in words):

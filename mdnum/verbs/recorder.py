@@ -81,6 +81,7 @@ class Recorder:
         if not self._rules:
             raise InputError("no rule says which pairs count", remedy="Give r_cut, pairs or nearest")
         self._source, self._atoms = ArrayFrames(name, **arrays), atoms
+        self._source.reach = max(one.reach for one in self._rules)
         self._how = {"between": between, "window": window, "out": out, "report": report, "live": True}
         rule, self._jump = self._rules[0], np.nan
         if pair_energy is not None:

@@ -245,6 +245,24 @@ def test_pairs_and_states_are_taken_as_programs_have_them(tmp_path):
         mdnum.Recorder(2.5).see(0, State())
 
 
+def test_fractions_and_lengths_are_not_taken_for_one_another(tmp_path):
+    few = np.random.default_rng(0).uniform(0, 1, (8, 3))
+    with pytest.raises(InputError, match="fractional"):
+        mdnum.Recorder(1.5, cell=6.0).see(0, few)
+    # as a small molecule in nm
+    for k, (r_cut, x) in enumerate(((0.9, few), (1.5, few[:7]))):
+        assert recorded(tmp_path / str(k), [x], r_cut, cell=6.0).summary["frames"] == 1
+    assert recorded(tmp_path / "said", [few], 1.5, cell=6.0, fractional=False).summary["frames"] == 1
+    for x in (3.5 * few, 3.5 * few - 2.5):
+        with pytest.raises(InputError, match="fractional"):
+            mdnum.Recorder(1.0, cell=4.0, fractional=True).see(0, x)
+    assert recorded(tmp_path / "f", [3 * few - 1], 1.0, cell=4.0, fractional=True).summary["frames"] == 1
+    notes = [
+        recorded(tmp_path / name, [size * few], 1.5).summary["notes"] for name, size in (("a", 1), ("b", 3))
+    ]
+    assert "fractional=True" in notes[0][0] and notes[1] == []
+
+
 def test_an_atom_that_is_wrapped_changes_no_image(tmp_path):
     frames, cell = gas(2, 10, 9, 3.4), 0.6 * TILTED.T
     frames = frames[:1] + 0.2 * (frames - frames[:1])
