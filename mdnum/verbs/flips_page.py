@@ -43,6 +43,10 @@ def judge(view: FlipsView) -> Verdict:
         return flips_loop.unfinished(view)
     told = (view.summary.get(name) for name in ("lists", "energy"))
     found = [*_ended(view), *flips_loop.findings(view, *told), *_of_rules(view), *_others(view)]
+    if "lists" in view.summary:
+        # options of the command are none of a loop's
+        named = [one.remedy * ("@" not in one.remedy and "--" not in one.remedy) for one in found]
+        found = [replace(one, remedy=remedy) for one, remedy in zip(found, named, strict=True)]
     quiet = all(one.severity == "info" for one in found)
     return conclude(found, _evidence(view), headline=_headline(view), best="good" if quiet else "info")
 

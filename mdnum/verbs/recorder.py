@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import InputError, MdnumError
+from mdnum.reading import FrameError
 from mdnum.trajectories.arrays import ArrayFrames, one_by_one
 from mdnum.trajectories.listed import ListCheck, PairList
 from mdnum.trajectories.trajectory import SAMPLE
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 # seconds between writes, and how many times what a write takes
 _EVERY, _TIMES = 2.0, 50.0
+_LOOK = "Look at what the loop did up to that step: what came before is kept"
 _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "entered")}
 
 
@@ -247,7 +249,12 @@ class Recorder:
                 self._after(one, rows.held.get("flips", [])[before:])
         except MdnumError as error:
             self._failed = error
-            raise
+            if isinstance(error, FrameError):
+                # its remedy is about a file
+                self._failed = InputError(error.message, remedy=_LOOK, where=error.where)
+            if self._one is not None:
+                self._one.found.stopped = self._failed
+            raise self._failed from None
         now = perf_counter()
         due = now - self._written > max(_EVERY, _TIMES * self._cost)
         if due or rows.full:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -587,6 +588,24 @@ def test_a_loop_that_is_killed_leaves_what_was_seen(tmp_path):
     assert same(kept, whole, ("members", "flips", "frames")) and kept.table("loop").num_rows == 40
     with pytest.raises(mdnum.FolderError):
         mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "k").see_many(frames)
+
+
+@pytest.mark.parametrize("at", [0, 15])
+def test_a_loop_is_told_nothing_about_files_and_commands(tmp_path, at):
+    frames = gas()
+    frames[at, 3] = np.nan
+    with (
+        pytest.raises(InputError) as raised,
+        mdnum.Recorder(2.5, nearest=4, out=tmp_path / "n", report=False) as one,
+    ):
+        one.see_many(frames, first=100, velocities=40 * np.ones_like(frames))
+    told = str(raised.value)
+    if at:
+        found, evidence = one.outcome.findings, one.outcome.verdict.evidence
+        assert {"STOPPED", "CENSORED", "READING"} <= codes(one.outcome)
+        told += " ".join([*evidence, *(text for x in found for text in (x.title, x.text, x.remedy))])
+    assert f"frame {100 + at}" in told
+    assert not re.search(r"\bfile|@|--", told)
 
 
 def test_an_error_in_the_loop_keeps_what_came_before(tmp_path):
