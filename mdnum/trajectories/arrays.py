@@ -67,14 +67,9 @@ class ArrayFrames(Trajectory):
         self._gone, self._first = 0, list[Frame]()
 
     def read(
-        self,
-        step: int,
-        positions: Any,
-        cell: Any = None,
-        box: Any = None,
-        pbc: Any = None,
+        self, step: int, positions: Any, cell: Any = None, box: Any = None, pbc: Any = None,
         velocities: Any = None,
-    ) -> Frame:
+    ) -> Frame:  # fmt: skip
         """The next frame, of what `mdnum.Recorder.see` takes.
 
         Raises:
@@ -90,11 +85,8 @@ class ArrayFrames(Trajectory):
         if bits != self.bits:
             message = f"positions were float{self.bits} and are float{bits} at step {step}"
             raise InputError(message, remedy="Give all frames in one dtype", where="positions")
-        v = (
-            None
-            if velocities is None or self.time == "step"
-            else np.array(host(velocities, "velocities"), float)
-        )
+        v = None if self.time == "step" else velocities
+        v = None if v is None else np.array(host(v, "velocities"), float)
         if v is not None and v.shape != x.shape:
             raise InputError(
                 f"velocities of shape {v.shape}, positions of {x.shape}", remedy="Give those of all"
@@ -139,9 +131,7 @@ class ArrayFrames(Trajectory):
             message = f"fractional coordinates from {x.min():.3g} to {x.max():.3g}, box {box.matrix.tolist()}"
             remedy = "Say fractional=False for lengths; wrap fractions (x % 1), and give them a box"
             raise InputError(message, remedy=remedy, where="positions")
-        words = (
-            ["X"] * len(x) if self.named is None else [str(one) for one in np.asarray(self.named).tolist()]
-        )
+        words = ["X"] * len(x) if self.named is None else list(map(str, np.asarray(self.named).tolist()))
         if len(words) != len(x):
             raise InputError(f"{len(words)} species for {len(x)} atoms", remedy="Give one for each atom")
         self.table, self.bits = AtomTable.plain(words, self.named is not None), bits

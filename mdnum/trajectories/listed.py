@@ -146,26 +146,14 @@ class ListCheck:
         pairs, missing = pairs[missing > 0], missing[missing > 0]
         margins = self._radii[self._kinds[pairs.i], self._kinds[pairs.j]] - pairs.distance
         known, self._open = self._open, {}
-        for i, j, rank, lacks, margin in zip(
-            pairs.i.tolist(),
-            pairs.j.tolist(),
-            pairs.rank.tolist(),
-            missing.tolist(),
-            margins.tolist(),
-            strict=True,
-        ):
+        columns = (pairs.i, pairs.j, pairs.rank, missing, margins)
+        for i, j, rank, lacks, margin in zip(*(one.tolist() for one in columns), strict=True):
             _, begin, number, deepest = known.get((i, j, rank), (lacks, at, frame.index, margin))
             self._open[i, j, rank] = lacks, begin, number, max(margin, deepest)
         certain = margins[margins > tracker.bound]
-        row = {
-            "listed": now.entries,
-            "new_list": new,
-            "lost": len(certain),
-            "deepest": certain.max(initial=0.0),
-        }
-        return row, self.ended(
-            at, tracker.bound, {key: known[key] for key in known.keys() - self._open.keys()}
-        )
+        deepest, gone = certain.max(initial=0.0), known.keys() - self._open.keys()
+        row = {"listed": now.entries, "new_list": new, "lost": len(certain), "deepest": deepest}
+        return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
         """Rows of pairs that were missing up to a frame; of those that still are, where none are named."""

@@ -247,14 +247,15 @@ class Recorder:
                 if one.found.frames == self._done and next(one.passes, None) is None and one.found.stopped:
                     raise one.found.stopped
                 self._after(one, rows.held.get("flips", [])[before:])
+        except FrameError as error:
+            # its remedy is about a file
+            self._failed = failed = InputError(error.message, remedy=_LOOK, where=error.where)
+            if self._one is not None:
+                self._one.found.stopped = failed
+            raise failed from None
         except MdnumError as error:
             self._failed = error
-            if isinstance(error, FrameError):
-                # its remedy is about a file
-                self._failed = InputError(error.message, remedy=_LOOK, where=error.where)
-            if self._one is not None:
-                self._one.found.stopped = self._failed
-            raise self._failed from None
+            raise
         now = perf_counter()
         due = now - self._written > max(_EVERY, _TIMES * self._cost)
         if due or rows.full:

@@ -608,6 +608,18 @@ def test_a_loop_is_told_nothing_about_files_and_commands(tmp_path, at):
     assert not re.search(r"\bfile|@|--", told)
 
 
+def test_a_loop_that_raises_early_is_kept_where_it_is_closed(tmp_path):
+    frames = gas()
+    with pytest.raises(ZeroDivisionError), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "w") as one:
+        one.see_many(frames[:3])
+        _ = 1 / 0
+    plain = mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "p", report=False)
+    plain.see_many(frames[:3])
+    assert not (tmp_path / "p").exists() and one.outcome.summary["frames"] == 3
+    plain.close(ZeroDivisionError())
+    assert plain.outcome.summary["status"] == "stopped" and "INTERRUPTED" in codes(plain.outcome)
+
+
 def test_an_error_in_the_loop_keeps_what_came_before(tmp_path):
     frames = gas()
     with pytest.raises(ZeroDivisionError), mdnum.Recorder(2.5, cell=6.0, out=tmp_path / "r") as one:
