@@ -596,15 +596,16 @@ def test_a_loop_is_told_nothing_about_files_and_commands(tmp_path, at):
     frames[at, 3] = np.nan
     with (
         pytest.raises(InputError) as raised,
-        mdnum.Recorder(2.5, nearest=4, out=tmp_path / "n", report=False) as one,
+        mdnum.Recorder(2.5, nearest=4, timestep=0.1, out=tmp_path / "n", report=False) as one,
     ):
-        one.see_many(frames, first=100, velocities=40 * np.ones_like(frames))
+        for step, x in enumerate(frames, 100):
+            one.see(step - 50 * (step < 104), x)
     told = str(raised.value)
     if at:
         found, evidence = one.outcome.findings, one.outcome.verdict.evidence
-        assert {"STOPPED", "CENSORED", "READING"} <= codes(one.outcome)
+        assert {"STOPPED", "CENSORED", "READING", "UNEVEN_FRAMES"} <= codes(one.outcome)
         told += " ".join([*evidence, *(text for x in found for text in (x.title, x.text, x.remedy))])
-    assert f"frame {100 + at}" in told
+    assert f"frame {115 if at else 50}" in told
     assert not re.search(r"\bfile|@|--", told)
 
 
