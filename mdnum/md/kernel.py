@@ -58,8 +58,8 @@ _WIDE = 8
 _AHEAD = 128
 # a loop is made once, whichever thread asks
 _ONE = Lock()
-# by the name of a potential, the operation that kept it out of the loop
-_LEFT_OUT: dict[str, str] = {}
+# by the structure of a potential, which has its function, the operation that kept it out of the loop
+_LEFT_OUT: dict[Any, str] = {}
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -84,7 +84,7 @@ def over_pairs(
     flags: Sequence[UInt8[Array, "words atoms"]] = (),
     margins: str | None = None,
     inverses: bool = False,
-    name: str = "",
+    potential: Any = None,
 ) -> PairSums | None:
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
@@ -99,7 +99,7 @@ def over_pairs(
         margins: ">" or ">=": how the margin of a pair that is decided to be inside compares with 0.
         inverses: whether several quotients by powers of one number become products with its inverse, since a
             processor divides slowly.
-        name: of the potential, for the message about an operation that is not known (`left_out`).
+        potential: whose operation is named if it is not known (`left_out`).
 
     Returns:
         None where the function has an operation that does not become one of vectors.
@@ -111,10 +111,10 @@ def over_pairs(
     try:
         written = _written(pair, columns.shape[0], len(flags), margins, tables.types is not None, inverses)
     except _NotKnown as unknown:
-        if name and _LEFT_OUT.get(name) != str(unknown):
+        if potential is not None and left_out(potential) != str(unknown):
             text = "%s goes through XLA's loop, in twice the time: the compiled one has no counterpart of %s"
-            _LOGGER.warning(text, name, unknown)
-            _LEFT_OUT[name] = str(unknown)
+            _LOGGER.warning(text, potential.name, unknown)
+            _LEFT_OUT[jax.tree.structure(potential)] = str(unknown)
         return None
     shapes = [
         jax.ShapeDtypeStruct((written.terms, atoms), np.float64),
@@ -131,9 +131,9 @@ def over_pairs(
     return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
 
 
-def left_out(name: str) -> str | None:
+def left_out(potential: Any) -> str | None:
     """jax's name of the operation that kept a potential out of the loop in this process; None for none."""
-    return _LEFT_OUT.get(name)
+    return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
 # --- the function of a pair, written down ----------------------------------------------------------------

@@ -332,7 +332,7 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
     if rows := force.weights(tables):
         columns = jnp.concatenate([columns, jnp.stack(rows)])
     made = kernel.over_pairs(
-        pair, columns, tables, flags=flags, margins=margins, inverses=True, name=force.model.potential.name
+        pair, columns, tables, flags=flags, margins=margins, inverses=True, potential=force.model.potential
     )
     return None if made is None else _forces(tuple(made.sums), made.decisions)
 

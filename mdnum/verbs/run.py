@@ -141,7 +141,7 @@ def run(
                 _keep(view, *energies)
                 _beside_float64(view, result)
             view.summary["time_step"] = view.time_step
-            if operation := left_out(result.simulation.potential.name):
+            if operation := left_out(result.simulation.potential):
                 view.summary["not_compiled"] = operation
     return finish(folder, report=report, result=result, progress=progress, view=view)
 

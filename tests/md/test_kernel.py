@@ -293,6 +293,14 @@ def test_what_has_no_vectors_is_left_to_xla_and_named(caplog, tmp_path):
         run = mdnum.run(simulation, steps=2, check=False, report=False, out=tmp_path / str(k))
         assert run.summary["not_compiled"] == "sinh"
         assert "NOT_COMPILED" in [finding.code for finding in run.verdict.findings]
+    # another function of the same name
+    def mine(r, strength):  # noqa: F811
+        return strength / r
+
+    cut = mdnum.Cut("shifted", 2.3)
+    own = mdnum.PairFunction(mine, strength=1e-3)
+    other = mdnum.simulation(crystal(), own, cut, timestep=0.002, skin=0.2)
+    assert kernel.left_out(other.potential) is None and kernel.left_out(simulation.potential) == "sinh"
     named = [one for one in caplog.records if one.name == "mdnum.md.kernel"]
     assert len(named) == 1 and "sinh" in named[0].getMessage() and "mine" in named[0].getMessage()
 
