@@ -18,6 +18,7 @@ import numpy as np
 
 from mdnum.audit.curve import SMOOTH, Curve, Jump, bisect, find_jumps
 from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere
+from mdnum.numerics.jaxprs import narrows
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import nearest_distance
 
@@ -33,6 +34,8 @@ _NOTHING = (1e-12, 1e-9)
 _PEAKS, _ZOOMS, _SHARP, _LARGE = 8, 8, 3.0, 1e3
 #: A force differs from the slope of its energy by this share at half of all distances.
 _WRONG = 1e-4
+#: More wrong intervals than these may be a table's; narrower ones; the change of a constant force, its share.
+_FEW, _NARROW, _STRAIGHT = 3, 1e-3, 1e-9
 _ORDERS = ("energy", "force", "curvature", "third derivative")
 
 
@@ -45,7 +48,9 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
         energy that jumps, `what` that is (the energy is 0, the force 1) and its `jump`, beyond minus before.
         Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
-        minus the derivative of the energy, as with a wrong `custom_jvp`.
+        minus the derivative of the energy, as with a wrong `custom_jvp`. Where the energy is piecewise linear
+        a row, of the largest, is for all `kinks` `between` two distances, those within a 1920th of the range
+        as one. `single`: whether a function rounds to float32 on the way.
 
     Error:
         a step of the force by 1e-6 of its scale is found, one of a curvature by 1e-4, where no other break is
@@ -71,7 +76,8 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
             order = min(order, _order(np.asarray(last)))
             at = {"term": name, "pair": "-".join(pair)}
             places += [at | row for row in _breaks(partial(walk, single), low, r_cut)]
-    return {"from": low, "to": simulation.r_cut, "smoothness": order, "places": places}
+    single = any(narrows(jax.make_jaxpr(one.potential.typed.evaluate)(one.r_cut)) for one in terms.values())
+    return {"from": low, "to": simulation.r_cut, "smoothness": order, "places": places, "single": single}
 
 
 def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
@@ -129,28 +135,46 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
         rows.append({"distance": float(ends[int(good[k])]), **nothing, "what": "not finite"})
     poles = [{"distance": one, **nothing} for one in _poles(curve, grid, np.abs(values[1]))]
     rows += [one for one in poles if all(abs(one["distance"] - row["distance"]) > step for row in rows)]
+    inside, straight = values[:, grid <= r_cut], False
+    share = _share(np.lib.stride_tricks.sliding_window_view(inside, 4, axis=1), step), grid[1:]
+    if np.sum(share[0] > _WRONG) > _FEW:
+        # few of narrow intervals have a kink of a table
+        close, width = np.linspace(low, r_cut, 8 * _INTERVALS + 1), _NARROW * step
+        four = curve.many((close[:, None] + width * np.arange(-1, 3)).ravel()).reshape(2, -1, 4)
+        share = min(share, (_share(four, width), close), key=lambda one: np.nanmedian(one[0]))
+        force = four[1, :, 1]
+        straight = np.mean(np.ptp(four[1], axis=1) < _STRAIGHT * np.abs(force)) > 0.5
     # between two of them, or one and an end
     ends = [low - 4 * step, *sorted(row["distance"] for row in rows), high + 4 * step]
     for left, right in pairwise(ends):
         start, end = left + 4 * step, right - 4 * step
         if end - start > 20 * step and np.isfinite(curve(0.5 * (start + end))).all():
-            found, _ = find_jumps(curve, start, end, step)
+            found, _ = find_jumps(curve, start, end, step, _FEW if straight else 24)
             rows += [_row(jump) for jump in found]
-    u, f = values[:, grid <= r_cut]
-    with np.errstate(invalid="ignore"):
-        # that of the force over each interval, by the cubic through four points
-        change, work = (
-            np.diff(u)[1:-1],
-            (13 * (f[1:-2] + f[2:-1]) - f[:-3] - f[3:]) * (grid[1] - grid[0]) / 24,
-        )
-        share = np.abs(change + work) / (np.abs(change) + np.abs(work) + 1e-300)
-    if np.nanmedian(share) > _WRONG:
-        worst = float(grid[1 + int(np.nanargmax(share))])
+    if straight:
+        jumps = np.diff(force)
+        kinks = np.flatnonzero(np.abs(jumps) > _STRAIGHT * np.abs(force[1:]))
+        rows = [row for row in rows if row["order"] < 1]
+        for k in kinks[np.argsort(-np.abs(jumps[kinks]))][:1]:
+            half = 0.5 * (force[k] + force[k + 1])
+            at, _ = bisect(lambda r, half=half: curve(r)[1] > half, *close[k : k + 2])
+            rows.append({"distance": float(at), "order": 1, "what": _ORDERS[1], "jump": float(jumps[k])})
+            rows[-1] |= {"kinks": len(kinks), "between": close[kinks[[0, -1]] + [0, 1]].tolist()}
+    if np.nanmedian(share[0]) > _WRONG:
+        worst = float(share[1][np.nanargmax(share[0])])
         rows.append({"distance": worst, "order": -2, "what": "force", "jump": None})
     # beyond its cutoff a function may do as it likes
     return sorted(
         (row for row in rows if row["distance"] <= r_cut * (1 + 1e-12)), key=lambda row: row["distance"]
     )
+
+
+def _share(four: np.ndarray, width: float) -> np.ndarray:
+    """How far the change of the energy is from the work of the force by the cubic through four points."""
+    u, f = np.moveaxis(four, -1, 1)
+    with np.errstate(invalid="ignore"):
+        change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
+        return np.abs(change + work) / (np.abs(change) + np.abs(work) + 1e-300)
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:

@@ -15,6 +15,7 @@ from mdnum.numerics import unit_roundoff
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
+from mdnum.systems.schema import pair_names
 from mdnum.systems.simulation import Simulation
 
 
@@ -116,7 +117,9 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
     """The content of summary.json, without the references' and the report's part."""
     tally, health, budget = done.tally, done.health, done.budget
-    energy_jump, force_jump = simulation.jumps()
+    jumps = energy_jump, force_jump = simulation.jumps()
+    pairs = pair_names(simulation.symbols)
+    alike = all(np.allclose(np.abs(one), np.abs(one[0]), rtol=1e-9, atol=0) for one in jumps)
     timestep = simulation.timestep
     cutoff = simulation.cutoff
     slope, without = tally.conserved.slope, tally.without_jumps.slope
@@ -161,6 +164,8 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
             "compare": simulation.decider.compare,
             "energy_jump": float(energy_jump[np.argmax(np.abs(energy_jump))]),
             "force_jump": float(force_jump[np.argmax(np.abs(force_jump))]),
+            # where they differ, pair types with the largest
+            **({} if alike else {"largest": [pairs[np.argmax(np.abs(one)) % len(pairs)] for one in jumps]}),
             "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness.order,
             "bound": max(tally.bound, *simulation.decider.bounds),
         },

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum import units as unit_systems
-from mdnum.errors import InputError
+from mdnum.errors import InputError, in_a_line
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
@@ -236,10 +236,10 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """That a person's function goes on beyond its cutoff, and is the same for both orders of a pair.
+    """That a person's function can be called, goes on beyond its cutoff, and is the same in both orders.
 
     Raises:
-        InputError: it is not; with the pair, a distance and both energies.
+        InputError: it is not; with what it raised, or the pair, a distance and both energies.
     """
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
@@ -247,7 +247,14 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
         jax.tree.map(lambda leaf: leaf[::-1] if is_pair(leaf) else leaf, dict(here.leaves), is_leaf=is_pair)
     )
     r = r_cut * np.append(np.linspace(0.3, 1, 15), 1 - _INSIDE)[:, None]
-    u, swapped = np.asarray(jax.jit(lambda r2: [one.evaluate(r2)[0] for one in (here, other)])(r * r))
+    try:
+        u, swapped = np.asarray(jax.jit(lambda r2: [one.evaluate(r2)[0] for one in (here, other)])(r * r))
+        wrong = "" if u.shape == r.shape else f"it returns shape {u.shape} for distances of shape {r.shape}"
+    except (TypeError, ValueError) as error:
+        wrong = f"it takes no array of distances: {in_a_line(error)}"
+    if wrong:
+        remedy = "Use jax.numpy, not numpy or math, jnp.where, not if; return one energy for each distance"
+        raise InputError(wrong, where=potential.name, remedy=remedy)
     scale = np.max(np.abs(u), initial=0, where=np.isfinite(u))
     pairs_of = pair_names(symbols)
     if not (ends := np.abs(u[-1] - u[-2]) <= _STEEP * _INSIDE * np.max(np.abs(u[-4:]), axis=0)).all():

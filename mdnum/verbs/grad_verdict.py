@@ -167,7 +167,6 @@ def _of_flips(view: View) -> Iterator[Finding]:
     for name, total in totals.items():
         added = table.get(f"contribution.{name}", np.zeros(0))
         heavy = np.argsort(-np.abs(added))[:_SINGLE]
-        # no number where a derivative is none
         heavy = heavy[np.abs(added[heavy]) > _HEAVY * magnitude(total, math.nan)]
         if total and len(heavy):
             k = heavy[0]

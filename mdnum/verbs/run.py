@@ -406,14 +406,16 @@ def _cutoff(run: RunView) -> Iterator[Finding]:
     kind, force = run.cutoff.get("kind"), abs(float(run.cutoff.get("force_jump") or 0.0))
     jump, length = abs(run.jump), float(run.cutoff.get("radius") or 1.0)
     values = {"kind": kind, "force": force, "energy": run.units.energy, "length": run.units.length}
-    own = run.own_end
+    own, pairs = run.own_end, run.cutoff.get("largest") or [""] * 2
+    own += ["types"] * bool(pairs[0])
     # rounding where a potential ends is no jump
     if kind and jump > NO_JUMP * run.thermal:
         share = jump / run.thermal if run.thermal > 0 else None
         own += ["share"] * bool(share)
-        yield TEXTS.finding("HARD_CUTOFF", *own, jump=run.jump, share=share, **values)
+        yield TEXTS.finding("HARD_CUTOFF", *own, pair=pairs[0], jump=run.jump, share=share, **values)
     elif kind and force * length > NO_JUMP * run.thermal:
-        yield TEXTS.finding("FORCE_JUMP", *own, *["shifted"] * (kind == "shifted"), "gradient", **values)
+        yield TEXTS.finding("FORCE_JUMP", *own, *["shifted"] * (kind == "shifted"), "gradient", pair=pairs[1],
+                            **values)  # fmt: skip
 
 
 def _loop(run: RunView) -> Iterator[Finding]:
@@ -423,8 +425,10 @@ def _loop(run: RunView) -> Iterator[Finding]:
 
 def _function(run: RunView) -> Iterator[Finding]:
     """Where a person's pair function is no number, and where it breaks, by the derivative that jumps."""
-    places = (run.cutoff.get("function") or {}).get("places", ())
-    energy, length = run.units.energy, run.units.length
+    function = run.cutoff.get("function") or {}
+    if function.get("single"):
+        yield TEXTS.finding("SINGLE_INSIDE", "pair")
+    places, energy, length = function.get("places", ()), run.units.energy, run.units.length
     codes = {"FUNCTION_SLOPE": (-2,), "FUNCTION_NOT_FINITE": (-1,), "FUNCTION_BREAKS": (0, 1, 2, 3)}
     for code, orders in codes.items():
         found = sorted((row for row in places if row["order"] in orders), key=lambda row: row["order"])
@@ -432,9 +436,9 @@ def _function(run: RunView) -> Iterator[Finding]:
             worst, *rest = found
             order = worst["order"]
             yield TEXTS.finding(
-                code, *["others"] * bool(rest), *["smooth"] * (order > 1), **worst, length=length,
+                code, *["others"] * bool(rest), *["smooth"] * (order > 1), *["linear"] * ("kinks" in worst),
                 unit=energy + ("", f"/{length}", f"/{length}²", f"/{length}³")[max(order, 0)],
-                places=len(found),
+                places=len(found), **worst, length=length,
                 others=", ".join(f"{row['pair']} {number(row['distance'], 6)} {length}" for row in rest),
             )  # fmt: skip
 

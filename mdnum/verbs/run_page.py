@@ -229,7 +229,8 @@ def _what(run: RunView) -> list[tuple[str, str]]:
         "atoms": run.summary.get("atoms") or None, "span": float(time[-1] - time[0]),
         "mean": float(np.mean(run.series["temperature"])),
         **{name: run.cutoff.get(name) for name in ("energy_jump", "force_jump")},
-        **{key: function.get(key) for key in ("from", "to")}, "breaks": len(function.get("places", ())),
+        **{key: function.get(key) for key in ("from", "to")},
+        "breaks": sum(row.get("kinks", 1) for row in function.get("places", ())),
         "first": TEXTS(f"jumps_{run.cutoff['smoothness']}") if function else None,
         "dynamics": in_words(made, vars(units) | {"timestep": units.time}) if made else None,
     })  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,6 +115,52 @@ def test_an_end_of_its_own_where_the_cutoff_is_is_refused():
 def test_a_force_that_is_not_the_slope_of_the_energy_is_found():
     seen = found(lambda r: wall(r) + 0.1 * wall(jax.lax.stop_gradient(r)), "shifted")
     assert seen is not None and [row["order"] for row in seen["places"]] == [-2]
+
+
+def interpolated(r, table):
+    return jnp.interp(r, jnp.asarray(PLACES), table)
+
+
+PLACES = np.linspace(0.9, 2.8, 80)
+
+
+def test_the_kinks_of_a_table_are_counted_and_its_force_is_the_slope():
+    seen = found(interpolated, "shifted", table=wall(PLACES))
+    assert seen is not None and [row["order"] for row in seen["places"]] == [1]
+    (row,) = seen["places"]
+    inside = PLACES[(seen["from"] < PLACES) & (RADIUS > PLACES)]
+    assert row["kinks"] == len(inside)
+    slopes = np.diff(wall(PLACES)) / np.diff(PLACES)
+    first = np.flatnonzero(inside[0] == PLACES)[0]
+    assert row["jump"] == pytest.approx(slopes[first - 1] - slopes[first], rel=1e-6)
+    assert row["distance"] == pytest.approx(inside[0], abs=1e-9)
+    np.testing.assert_allclose(row["between"], [inside[0], inside[-1]], atol=2e-3)
+
+
+def branched(r):
+    return wall(r) if r < 2 else 0 * r
+
+
+@pytest.mark.parametrize(
+    ("function", "word"),
+    [
+        (lambda r: np.exp(-r), r"jax\.numpy"),
+        (lambda r: math.exp(-r), r"jax\.numpy"),
+        (branched, r"truth value.*jnp\.where"),
+        (lambda r: jnp.sum(wall(r)), r"shape \(\).*each distance"),
+    ],
+)
+def test_what_is_no_function_of_arrays_is_refused_in_a_line(function, word):
+    with pytest.raises(InputError, match=word) as caught:
+        found(function)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_a_function_in_single_precision_is_named(single):
+    narrow = jnp.float32 if single else jnp.float64
+    seen = found(lambda r: wall(r.astype(narrow)).astype(r.dtype), "shifted")
+    assert seen is not None and seen["single"] == single
 
 
 def test_potentials_of_mdnum_are_not_examined():

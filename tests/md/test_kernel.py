@@ -293,8 +293,9 @@ def test_what_has_no_vectors_is_left_to_xla_and_named(caplog, tmp_path):
         run = mdnum.run(simulation, steps=2, check=False, report=False, out=tmp_path / str(k))
         assert run.summary["not_compiled"] == "sinh"
         assert "NOT_COMPILED" in [finding.code for finding in run.verdict.findings]
+
     # another function of the same name
-    def mine(r, strength):  # noqa: F811
+    def mine(r, strength):
         return strength / r
 
     cut = mdnum.Cut("shifted", 2.3)

@@ -289,6 +289,15 @@ def test_remedies_name_what_the_system_has(good):
     assert kick.values["share"] == pytest.approx(abs(JUMP) / good.thermal)
 
 
+def test_of_pair_types_that_differ_the_one_with_the_largest_kick_is_named(good):
+    hard = {**good.cutoff, "largest": ["Ni-P", "P-P"]}
+    shifted = {**hard, "kind": "shifted", "energy_jump": 0.0, "force_jump": 1e-4}
+    for code, cutoff, pair in (("HARD_CUTOFF", hard, "Ni-P"), ("FORCE_JUMP", shifted, "P-P")):
+        told = found(changed(good, {"cutoff": cutoff}))[code]
+        assert pair in told.title and pair in told.text and "up to" in told.title
+        assert "up to" not in found(changed(good, {"cutoff": {**cutoff, "largest": None}}))[code].title
+
+
 def test_chatter_is_a_matter_of_the_cutoff(good):
     flips = {name: values[:40] for name, values in good.folder.read("flips").items()}
     flips |= {"step": np.arange(1, 41), "i": np.full(40, 3), "j": np.full(40, 8)}
