@@ -156,9 +156,9 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
         kinks = np.flatnonzero(np.abs(jumps) > _STRAIGHT * np.abs(force[1:]))
         rows = [row for row in rows if row["order"] < 1]
         for k in kinks[np.argsort(-np.abs(jumps[kinks]))][:1]:
-            half = 0.5 * (force[k] + force[k + 1])
-            at, _ = bisect(lambda r, half=half: curve(r)[1] > half, *close[k : k + 2])
-            rows.append({"distance": float(at), "order": 1, "what": _ORDERS[1], "jump": float(jumps[k])})
+            half = float(force[k] + force[k + 1]) / 2
+            place, _ = bisect(lambda r, half=half: bool(curve(r)[1] > half), *close[k : k + 2].tolist())
+            rows.append({"distance": place, "order": 1, "what": _ORDERS[1], "jump": float(jumps[k])})
             rows[-1] |= {"kinks": len(kinks), "between": close[kinks[[0, -1]] + [0, 1]].tolist()}
     if np.nanmedian(share[0]) > _WRONG:
         worst = float(share[1][np.nanargmax(share[0])])
