@@ -234,6 +234,7 @@ def _brief(part: Any) -> Any:
 
 def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -> dict[str, Any]:
     from mdnum.gradients import parameters
+    from mdnum.gradients.diagnose.trust import NOT_FINITE, UNDECIDED
 
     agreement, simulation, loss = found.agreement, problem.simulation, problem.loss
     assert agreement is not None
@@ -241,6 +242,12 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
     trust = _brief(found.trust)
     if found.trust is not None:
         half, turns = found.trust.half, found.trust.turns
+        reference = agreement.gradient(agreement.reference)
+        gradient = {} if reference is None else reference.gradient
+        broken = [name for name, one in gradient.items() if not np.isfinite(one).all()]
+        # trust is of tangents, which may be finite where the reverse pass is not
+        for one in [*([trust] if broken else []), *(trust["by"][name] for name in broken)]:
+            one |= {"verdict": UNDECIDED, "unknown": [*one["unknown"], NOT_FINITE]}
         trust["half"] = {name: brief(one[0] if len(one) == 1 else one) for name, one in half.items()}
         trust["near"] = None if turns is None else {
             "turns": len(turns), "within": int(turns.within.sum()),

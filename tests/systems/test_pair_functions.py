@@ -234,3 +234,21 @@ def test_runs_forks_maps_and_gradients_are_those_of_the_potential_that_is_here(k
     assert len(places[0]) > 0 and places[0] == pytest.approx(places[1], rel=1e-9)
     for name, value in gradients[1].items():
         assert gradients[0][name] == pytest.approx(value, rel=1e-7), name
+
+
+@pytest.mark.nightly
+def test_a_gradient_that_is_not_finite_is_trusted_by_nobody(tmp_path):
+    atoms = Atoms("Ar2", [[0, 0, 0], [4.6, 0, 0]], pbc=False)
+
+    def rooted(r, e):
+        return jnp.where(r < 4.5, e * jnp.sqrt(4.5 - r), 0.0)
+
+    made = mdnum.simulation(
+        atoms, mdnum.PairFunction(rooted, e=0.01), mdnum.Cut("hard", 5.0), timestep=0.002, temperature=0
+    )
+    answer = mdnum.grad(made, "potential", ["e"], steps=5, out=tmp_path / "grad", report=False)
+    trust = answer.summary["trust"]
+    assert (answer.verdict.tone, trust["verdict"], trust["by"]["potential.e"]["verdict"]) == (
+        "error", "undecided", "undecided",
+    )  # fmt: skip
+    assert "trusted" not in answer.verdict.headline

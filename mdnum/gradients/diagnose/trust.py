@@ -50,7 +50,7 @@ ROUNDING, SCATTER, AMBIGUOUS = "rounding", "standard error", "ambiguous decision
 STEP, NEAR, FLIPS = "time step", "near miss", "flips left out"
 #: What is not known beside limits that were not examined: whether other starts agree, of a gradient that grew
 #: chaotically; the derivative by parameters of too many entries.
-STARTS, SKIPPED = "other starts", "parameters of many entries"
+STARTS, SKIPPED, NOT_FINITE = "other starts", "parameters of many entries", "finite derivatives"
 #: A gradient that grew this many times more than in proportion to the steps is one of a start among many, and
 #: whether others agree must be examined.
 GROWN = 10.0
