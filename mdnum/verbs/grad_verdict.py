@@ -167,7 +167,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
     for name, total in totals.items():
         added = table.get(f"contribution.{name}", np.zeros(0))
         heavy = np.argsort(-np.abs(added))[:_SINGLE]
-        heavy = heavy[np.abs(added[heavy]) > _HEAVY * magnitude(total, math.nan)]
+        heavy = heavy[np.abs(added[heavy]) > _HEAVY * abs(math.nan if total is None else total)]
         if total and len(heavy):
             k = heavy[0]
             none = ["none"] * (digits_of(view.summary, name.partition("[")[0]) == 0)

@@ -435,10 +435,11 @@ def _function(run: RunView) -> Iterator[Finding]:
         if found:
             worst, *rest = found
             order = worst["order"]
+            ends = zip(("first", "last"), worst.get("between", ()), strict=False)
             yield TEXTS.finding(
                 code, *["others"] * bool(rest), *["smooth"] * (order > 1), *["linear"] * ("kinks" in worst),
                 unit=energy + ("", f"/{length}", f"/{length}²", f"/{length}³")[max(order, 0)],
-                places=len(found), **worst, length=length,
+                places=len(found), **worst, **dict(ends), length=length,
                 others=", ".join(f"{row['pair']} {number(row['distance'], 6)} {length}" for row in rest),
             )  # fmt: skip
 
