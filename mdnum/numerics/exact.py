@@ -81,7 +81,9 @@ def root(x: jax.Array) -> jax.Array:
 
 # what a function that is jitted by itself, as jnp.where is, looks like inside another
 _CALLS = ("jit", "pjit")
-_CUSTOM = ("custom_jvp_call", "custom_vjp_call")
+#: Operations that call a program once, by other means than compiling it.
+_CALLED = ("closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
+           "custom_vjp_call_jaxpr")  # fmt: skip
 Rule = Callable[[Any, list[Any]], Sequence[Any]]
 
 
@@ -138,8 +140,9 @@ def interpreted(
 
 
 def inlined(equation: Any) -> Any:
-    """The program of a function with derivatives of its own, as jax.nn.relu, where they are not needed."""
-    return equation.params.get("call_jaxpr") if equation.primitive.name in _CUSTOM else None
+    """The program that an operation calls once, such as a function with derivatives of its own, or None."""
+    programs = (equation.params.get(key) for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
+    return next(filter(None, programs), None) if equation.primitive.name in _CALLED else None
 
 
 def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:

@@ -10,13 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from mdnum.numerics.exact import interpreted
+from mdnum.numerics.exact import inlined, interpreted
 
-#: Operations that are looked into: what is in their parameters is a program, called once.
-_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
-          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
 #: Candidates that are tried before giving up.
 _MOST = 12
 #: Digits that a person writes: numbers in single precision with more are weights, or were computed.
@@ -113,6 +109,7 @@ def count_bad(tree: Any) -> int:
 
 
 def is_inexact(leaf: Any) -> bool:
+    """Whether a leaf is an array of floats; ml_dtypes' narrow ones are."""
     return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
 
 
@@ -138,8 +135,7 @@ class _Interpreter:
         if name == "cond":
             chosen = int(np.clip(int(inputs[0]), 0, len(params["branches"]) - 1))
             return self.closed(params["branches"][chosen], inputs[1:])
-        inner = next((params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params), None)
-        if name in _CALLS and isinstance(inner, Jaxpr | ClosedJaxpr):
+        if (inner := inlined(equation)) is not None:
             return self.closed(inner, inputs)
         made = equation.primitive.bind(*inputs, **params)
         results = list(made) if equation.primitive.multiple_results else [made]

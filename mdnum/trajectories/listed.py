@@ -35,7 +35,7 @@ _KNOWN = (
 
 
 @dataclass(frozen=True)
-class PairList:
+class GivenList:
     """A neighbor list as a program has it."""
 
     entries: int
@@ -45,7 +45,7 @@ class PairList:
     atoms: int
 
     @classmethod
-    def of(cls, parts: list[np.ndarray], atoms: int) -> PairList:
+    def of(cls, parts: list[np.ndarray], atoms: int) -> GivenList:
         """A list of the arrays that `arrays_of` gives, whose padding is left out."""
         i, j, *shifts = parts
         shift = shifts[0] if shifts else np.zeros((len(i), 0), int)
@@ -97,13 +97,13 @@ class ListCheck:
         self._rule = rule
         self._parts: list[np.ndarray] = []
         # given last, and examined last
-        self._newest: PairList | None = None
-        self._list: PairList | None = None
+        self._newest: GivenList | None = None
+        self._list: GivenList | None = None
         self._before: Frame | None = None
         # (missing, first frame, its number, deepest margin) of pairs (i, j, rank) that are missing
         self._open: dict[tuple[int, int, int], tuple[int, int, int, float]] = {}
 
-    def given(self, neighbors: Any, species: np.ndarray) -> PairList:
+    def given(self, neighbors: Any, species: np.ndarray) -> GivenList:
         """A list; the same object where it did not change."""
         if self._newest is None:
             if self._rule.directed:
@@ -115,11 +115,11 @@ class ListCheck:
         if self._newest is None or not same:
             # copies: programs write into their arrays again
             self._parts = [np.array(one) for one in parts]
-            self._newest = PairList.of(self._parts, len(self._kinds))
+            self._newest = GivenList.of(self._parts, len(self._kinds))
         return self._newest
 
     def step(
-        self, frame: Frame, at: int, tracker: Tracker, flips: Mapping[str, np.ndarray], now: PairList
+        self, frame: Frame, at: int, tracker: Tracker, flips: Mapping[str, np.ndarray], now: GivenList
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """(what is known of the list at a frame, rows of pairs that were missing up to the one before).
 

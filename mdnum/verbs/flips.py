@@ -125,7 +125,7 @@ def flips(
 
 
 @dataclass
-class Examination:
+class FrameExamination:
     """Frames on their way into a folder: a file's are pulled, those of a `Recorder` are pushed."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
@@ -139,7 +139,7 @@ class Examination:
 def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, **keep: Unpack[Keep],
-) -> Iterator[Examination]:  # fmt: skip
+) -> Iterator[FrameExamination]:  # fmt: skip
     """A new folder whose tables are filled inside, with what follows from them; arguments as of `flips`.
 
     Args:
@@ -162,7 +162,7 @@ def examining(
         folder.in_parts, atoms = live, opened.table.columns
         for end in "ij":
             folder.look_up("flips", end, {f"{name}_{end}": values for name, values in atoms.items()})
-        yield (one := Examination(answer, rows, passes, found))
+        yield (one := FrameExamination(answer, rows, passes, found))
         read = time.perf_counter()
         frames = folder.read("frames")
         steps = _steps(frames, opened)

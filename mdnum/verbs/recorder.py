@@ -14,9 +14,9 @@ import numpy as np
 from mdnum.errors import InputError, MdnumError
 from mdnum.reading import FrameError
 from mdnum.trajectories.arrays import ArrayFrames, one_by_one
-from mdnum.trajectories.listed import ListCheck, PairList
+from mdnum.trajectories.listed import GivenList, ListCheck
 from mdnum.trajectories.trajectory import SAMPLE
-from mdnum.verbs.flips import WINDOW, Examination, examining, rules
+from mdnum.verbs.flips import WINDOW, FrameExamination, examining, rules
 from mdnum.verbs.flips_loop import loop_told
 from mdnum.verbs.flips_shared import about
 from mdnum.verbs.frame import Outcome
@@ -93,9 +93,9 @@ class Recorder:
             self._jump = float(pair_energy(radius))
         self._check = ListCheck(rule)
         # the list in use; energy, list and its flag of each frame that waits
-        self._list: PairList | None = None
-        self._told: deque[tuple[float, PairList | None, bool]] = deque()
-        self._one: Examination | None = None
+        self._list: GivenList | None = None
+        self._told: deque[tuple[float, GivenList | None, bool]] = deque()
+        self._one: FrameExamination | None = None
         self._stack, self._failed = ExitStack(), None
         self._outcome: Outcome | None = None
         self._hooked = self._loop = False
@@ -265,7 +265,7 @@ class Recorder:
             self._written = perf_counter()
             self._cost = self._written - now
 
-    def _after(self, one: Examination, new: Sequence[dict[str, Any]]) -> None:
+    def _after(self, one: FrameExamination, new: Sequence[dict[str, Any]]) -> None:
         """What the program itself said of a frame that was examined, beside its flips."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
