@@ -20,21 +20,21 @@ class NoseHoover(mdnum.Integrator):
     def pull(self, v, masses):
         return (2 * self.kinetic(v, masses) / (3 * (v.shape[1] - 1) * self.kT) - 1) / self.tau**2
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
+    def begin(self, x, v, extra, at):
         half = 0.5 * self.timestep
         friction, integral = extra
-        friction = friction + half * self.pull(v, masses)
-        v = v * jnp.exp(-half * friction) + half * acceleration
+        friction = friction + half * self.pull(v, at.masses)
+        v = v * jnp.exp(-half * friction) + half * at.acceleration
         return x + self.timestep * v, v, jnp.stack([friction, integral + half * friction]), jnp.zeros(())
 
-    def finish(self, v, extra, acceleration, masses, time):
+    def finish(self, v, extra, at, time):
         friction, integral = extra
-        v = (v + time * acceleration) * jnp.exp(-time * friction)
-        return v, jnp.stack([friction + time * self.pull(v, masses), integral + time * friction])
+        v = (v + time * at.acceleration) * jnp.exp(-time * friction)
+        return v, jnp.stack([friction + time * self.pull(v, at.masses), integral + time * friction])
 
-    def conserved(self, extra, masses):
-        friction, integral = extra
-        return 3 * (len(masses) - 1) * self.kT * (0.5 * (self.tau * friction) ** 2 + integral)
+    def exchanged(self, extra, at):
+        friction, integral = extra  # heat, and work, which a box would do
+        return -3 * (len(at.masses) - 1) * self.kT * (0.5 * (self.tau * friction) ** 2 + integral), 0.0
 
 
 atoms = ase.build.bulk("Ar", "fcc", a=5.4, cubic=True).repeat(4)

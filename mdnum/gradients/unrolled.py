@@ -147,8 +147,8 @@ def chunk(
 
     def act(carry, see):
         step, x, v, images, extra, total, _, finite, rows = carry
-        made = force(x, tables, decisions=True)
-        end = one_step(integrator, force.cell, masses, order, step, x, v, extra, made.force, made.virial)
+        made = force(x, tables, decisions=True, tensor=integrator.anisotropic)
+        end = one_step(integrator, force.cell, masses, order, step, x, v, extra, made)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
         total = lax.cond(
             see, observe, lambda total, _: total, total, (step, x, end.v, images, potential, made.virial)

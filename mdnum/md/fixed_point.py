@@ -32,13 +32,12 @@ from mdnum.md.decide import (
     Decisions,
     PairDecider,
     SlotJudge,
-    Tables,
     displacements,
     halves_of,
     packed,
 )
 from mdnum.md.integrators import ByAtom, Integrator, Langevin, VelocityVerlet
-from mdnum.md.pairforce import Forces, Guarded, PairForce, imposed
+from mdnum.md.pairforce import VOIGT, Forces, Guarded, PairForce, imposed, symmetric
 from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
 from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_norm, zero_bits
@@ -247,12 +246,12 @@ class FixedPointStep(Integrator):
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
-    def finish(self, v, extra, acceleration, masses, time):
-        return self.kick(v, time, acceleration, masses), extra
+    def finish(self, v, extra, at, time):
+        return self.kick(v, time, at.acceleration, at.masses), extra
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
-        v = self.kick(v, 0.5 * self.timestep, acceleration, masses)
-        return self.drift(x, v, extra, masses, step, order)
+    def begin(self, x, v, extra, at):
+        v = self.kick(v, 0.5 * self.timestep, at.acceleration, at.masses)
+        return self.drift(x, v, extra, at.masses, at.step, at.order)
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
@@ -502,7 +501,7 @@ class FixedPointForce(PairForce):
         """As `PairForce`, of integer distances."""
         return self.judge(positions).decide(tables)
 
-    def __call__(self, positions, tables, *, decisions, given=None, where=None):
+    def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):
         """As `PairForce`: forces that are whole multiples of the unit of force.
 
         Where a pair is so close that its force would leave the range of exact sums, the energy is NaN.
@@ -531,7 +530,9 @@ class FixedPointForce(PairForce):
             pull = slope + slope
             # worked out once: each component's loop would work it out again
             force, d = lax.optimization_barrier((pull * steps, d))
-            terms = (*(force * c for c in d), energy * (1 / units.energy), pull * r2 * (1 / units.energy))
+            scale = 1 / units.energy
+            terms = [*(force * c for c in d), energy * scale, pull * r2 * scale]
+            terms += [pull * unit * scale * d[a] * d[b] for a, b in VOIGT] if tensor else []
             added = []
             for total, term in zip(totals, terms, strict=True):
                 whole = counted(term, zero)
@@ -543,27 +544,24 @@ class FixedPointForce(PairForce):
             return (tuple(added), nearest, close), bits
 
         atoms = judge.atoms
-        start = ((jnp.zeros(atoms, jnp.int64),) * 5, judge.start(), jnp.full(atoms, far))
+        start = ((jnp.zeros(atoms, jnp.int64),) * (11 if tensor else 5), judge.start(), jnp.full(atoms, far))
         told, pinned = (None if bits is None else halves_of(bits) for bits in (given, where))
         (totals, nearest, close), halves = lax.scan(block, start, (tables.groups(), told, pinned))
         slots = tables.index.shape[0] * tables.index.shape[1]
         # of 64-bit integers the sum wraps round, and this takes off what wrapped
         excess = jnp.asarray((slots * _ROUND_BITS + 2**63) % 2**64 - 2**63, jnp.int64)
-        *summed, virial = (total - excess for total in totals)
-        fx, fy, fz, energy = (total.astype(jnp.float64) for total in summed)
+        fx, fy, fz, energy, *virial = (total - excess for total in totals)
+        fx, fy, fz, energy = (total.astype(jnp.float64) for total in (fx, fy, fz, energy))
+        # both ends of a pair count, and a pressure may be large: summed as integers to the end
+        virial = [jnp.sum(one).astype(jnp.float64) * (-0.5 * units.energy) for one in virial]
         exact = jnp.min(close) > self.closest
         return Forces(
             jnp.stack([fx, fy, fz]) * units.force,
             jnp.where(exact, energy, jnp.nan) * (0.5 * units.energy),
-            # both ends of a pair count, and a pressure may be large: summed as integers to the end
-            jnp.sum(virial).astype(jnp.float64) * (-0.5 * units.energy),
+            virial[0],
             judge.finish(nearest, halves) if decisions else None,
+            symmetric(virial[1:]) if tensor else None,
         )
-
-    def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
-        """As `PairForce`, at the nearest whole multiples of the spacing: the stress of one configuration."""
-        spacing = self.units.spacing
-        return super().virial_tensor(jnp.round(positions.astype(jnp.float64) / spacing) * spacing, tables)
 
 
 def _closest(model: CutPotential, units: FixedPointUnits) -> float:

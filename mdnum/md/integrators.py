@@ -58,6 +58,7 @@ _INSIDE = {
     "time": (mul, truediv, "time_factor"),
     "rate": (truediv, mul, "time_factor"),
     "temperature": (mul, truediv, "k_B"),
+    "pressure": (truediv, mul, "pressure_factor"),
 }
 
 
@@ -69,10 +70,23 @@ def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False
     return ways[back](value, getattr(units, factor))
 
 
-def quantity(unit: Literal["time", "rate", "temperature", "seed"], **options: Any) -> Any:
+def quantity(unit: Literal["time", "rate", "temperature", "pressure", "seed"], **options: Any) -> Any:
     """A field of an integrator that a system file has in another unit: a time, one over a time, a temperature
-    (by the key `temperature`; an energy inside mdnum) or a random key (by `seed`)."""
+    (by the key `temperature`; an energy inside mdnum), a pressure or a random key (by `seed`)."""
     return eqx.field(metadata={"unit": unit}, **options)
+
+
+class AtStep(NamedTuple):
+    """What an integrator may know of the step whose forces have just been evaluated; atoms sorted."""
+
+    acceleration: Vector  # force/mass, in the dtype of the state
+    virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
+    # sum over pairs of r_ij ⊗ F_ij, shape (3, 3), for an integrator that is `anisotropic`; else None
+    tensor: Float[Array, "3 3"] | None
+    cell: Cell  # the box, float64
+    masses: Masses  # float64
+    step: Step
+    order: Order  # sorted atom k is atom order[k]; noise belongs to the atom, not to its place
 
 
 class Integrator(eqx.Module):
@@ -145,49 +159,31 @@ class Integrator(eqx.Module):
         return ()
 
     @abstractmethod
-    def finish(
-        self, v: Vector, extra: Any, acceleration: Vector, masses: Masses, time: Number
-    ) -> tuple[Vector, Any]:
+    def finish(self, v: Vector, extra: Any, at: AtStep, time: Number) -> tuple[Vector, Any]:
         """Full-step velocities and the extra state then.
 
         Args:
-            v: sorted velocities, as `begin` left them. acceleration: at the positions that it led to.
-            masses: sorted masses, float64.
+            v, extra: sorted velocities and the extra state, as `begin` and `deform` left them.
+            at: the step that they led to.
             time: half a time step, in the dtype of v; 0 at step 0, which starts from full-step velocities.
         """
 
     @abstractmethod
-    def begin(
-        self,
-        x: Vector,
-        v: Vector,
-        extra: Any,
-        acceleration: Vector,
-        masses: Masses,
-        step: Step,
-        order: Order,
-    ) -> tuple[Vector, Vector, Any, Number]:
+    def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
         """Positions, velocities and extra state before the next force evaluation, and the heat taken up.
 
         Args:
             x, v: sorted positions and full-step velocities.
-            step: the step that has just been evaluated.
-            order: sorted atom k is atom order[k]; noise belongs to the atom, not to its place.
         """
 
-    def deform(
-        self, cell: Cell, v: Vector, extra: Any, masses: Masses, virial: Number, step: Step
-    ) -> tuple[Float[Array, "3 3"], Vector, Any]:
+    def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
         """How the box deforms on the way to the next force evaluation, after `begin`; by default not at all.
 
         Lattice vectors and positions, as rows, are multiplied by what it returns: an integrator that has
         positions move relative to the box adds that in `begin`.
 
         Args:
-            cell: the box of the step, float64.
             v, extra: sorted velocities and the extra state, as `begin` left them.
-            virial: sum over pairs of r_ij · F_ij at the step, energy.
-            step: the step that has just been evaluated.
 
         Returns:
             the deformation, shape (3, 3), float64; velocities and extra state.
@@ -204,9 +200,17 @@ class Integrator(eqx.Module):
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
         return 0.5 * jnp.sum(masses * speed2)
 
-    def conserved(self, extra: Any, masses: Masses) -> Number | float:
-        """What the extra state adds to potential and kinetic energy for the quantity that is conserved."""
-        return 0.0
+    @property
+    def anisotropic(self) -> bool:
+        """Whether it needs the virial as a tensor, which costs a sixth of a pair's work."""
+        return False
+
+    def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
+        """Energy that the atoms owe to the extra state so far: heat of its thermostat, and work of its box.
+
+        Potential and kinetic energy less both, and less the heat that `begin` returns, is conserved.
+        """
+        return 0.0, 0.0
 
 
 class StepEnd(NamedTuple):
@@ -222,6 +226,7 @@ class StepEnd(NamedTuple):
     images: Vector  # lattice vectors that wrapping has just taken off
     heat: Number  # energy taken up on the way
     cell: Cell  # box of the next step
+    at: AtStep  # the step itself
 
 
 def one_step(
@@ -233,27 +238,27 @@ def one_step(
     x: Vector,
     v: Vector,
     extra: Any,
-    force: Vector,
-    virial: Number,
+    made: Any,
 ) -> StepEnd:
     """One step of molecular dynamics, from its forces to the positions of the next.
 
     Args:
-        cell: the box, float64. masses: float64. force, virial: at x.
+        cell: the box, float64. masses: float64. made: the `Forces` at x.
         x, v, extra: wrapped positions, and what `begin` left; at step 0 the start.
     """
     dtype = x.dtype
-    acceleration = force.astype(dtype) / masses.astype(dtype)
+    acceleration = made.force.astype(dtype) / masses.astype(dtype)
+    at = AtStep(acceleration, made.virial, made.tensor, cell, masses, step, order)
     half = (0.5 * integrator.timestep).astype(dtype)
     # the first step of all starts from full-step velocities
     second_half = jnp.where(step == 0, jnp.zeros((), dtype), half)
-    v, extra = integrator.finish(v, extra, acceleration, masses, second_half)
-    after, kicked, ahead, heat = integrator.begin(x, v, extra, acceleration, masses, step, order)
+    v, extra = integrator.finish(v, extra, at, second_half)
+    after, kicked, ahead, heat = integrator.begin(x, v, extra, at)
     if integrator.moves_cell:
-        by, kicked, ahead = integrator.deform(cell, kicked, ahead, masses, virial, step)
+        by, kicked, ahead = integrator.deform(kicked, ahead, at)
         cell, after = cell.deformed(by), transformed(after, by)
     wrapped, n = cell.astype(dtype).wrap(*after)
-    return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat, cell)
+    return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat, cell, at)
 
 
 class KickDrift(Integrator):
@@ -277,12 +282,12 @@ class KickDrift(Integrator):
         """Velocities after an acceleration has acted for a time."""
         return v + time * acceleration
 
-    def finish(self, v, extra, acceleration, masses, time):
-        return self.kick(v, time, acceleration), extra
+    def finish(self, v, extra, at, time):
+        return self.kick(v, time, at.acceleration), extra
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
-        v = self.kick(v, (0.5 * self.timestep).astype(v.dtype), acceleration)
-        x, v, heat = self.drift(x, v, masses, step, order)
+    def begin(self, x, v, extra, at):
+        v = self.kick(v, (0.5 * self.timestep).astype(v.dtype), at.acceleration)
+        x, v, heat = self.drift(x, v, at.masses, at.step, at.order)
         return x, v, extra, heat
 
     @abstractmethod

@@ -54,6 +54,9 @@ class Forces(NamedTuple):
     energy: Float[Array, "atoms"]
     virial: Float[Array, ""]  # sum over pairs of r_ij · F_ij, energy
     decisions: Decisions | None  # None where they were not asked for
+    # sum over pairs of r_ij ⊗ F_ij, shape (3, 3): minus the derivative of the energy by strain; None where it
+    # was not asked for
+    tensor: Float[Array, "3 3"] | None = None
 
 
 class PairForce(eqx.Module):
@@ -132,6 +135,7 @@ class PairForce(eqx.Module):
         tables: Tables,
         *,
         decisions: bool,
+        tensor: bool = False,
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
@@ -140,16 +144,16 @@ class PairForce(eqx.Module):
         Args:
             positions: shape (3, atoms), length, in the order of the tables.
             tables: the list.
-            decisions: whether to return them too; forces have the same bits either way.
+            decisions, tensor: whether to return these too; forces have the same bits either way.
             given: decisions to act on instead of the list's own (packed as those returned). The ones returned
                 are its own all the same, so that the two can be compared.
             where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
         if self.in_one_loop(tables):
-            made = _in_one_loop(self, positions, tables, given, where, decisions=decisions)
+            made = _in_one_loop(self, positions, tables, given, where, decisions=decisions, tensor=tensor)
             if made is not None:
                 return made
-        return self.in_blocks(positions, tables, given, where, decisions=decisions)
+        return self.in_blocks(positions, tables, given, where, decisions=decisions, tensor=tensor)
 
     def in_one_loop(self, tables: Tables) -> bool:
         """Whether `kernel.over_pairs` may sum over the list: double precision, few types of pairs, a CPU."""
@@ -158,8 +162,12 @@ class PairForce(eqx.Module):
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES
         return wide and few and self.reduction == Sequential() and foreign.known()
 
-    def _terms(self) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """What a pair adds to force, energy and virial, from its displacement, square and decision."""
+    def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
+        """What a pair adds to force, energy and virial, from its displacement, square and decision.
+
+        Args:
+            tensor: whether the virial has six components, in Voigt's order.
+        """
         law, exactly = self.law, self._in_force_dtype
         at = law.at_cutoff()
 
@@ -169,7 +177,9 @@ class PairForce(eqx.Module):
             energy, slope = law.evaluate(r2, types, at, *weights)
             energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
             pull = slope + slope
-            return tuple(map(exactly, (*(pull * exactly(c) for c in d), energy, pull * r2)))
+            forces = [exactly(pull * exactly(c)) for c in d]
+            virial = [forces[a] * exactly(d[b]) for a, b in VOIGT] if tensor else [pull * r2]
+            return *forces, exactly(energy), *map(exactly, virial)
 
         return terms
 
@@ -185,9 +195,10 @@ class PairForce(eqx.Module):
         where: UInt8[Array, "words atoms"] | None = None,
         *,
         decisions: bool,
+        tensor: bool = False,
     ) -> Forces:
         """As a call, in any precision, order and on any device."""
-        judge, terms_of = self.judge(positions), self._terms()
+        judge, terms_of = self.judge(positions), self._terms(tensor)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
         cell = self.cell.astype(geometry)
@@ -215,33 +226,11 @@ class PairForce(eqx.Module):
             totals = tuple(total for total, _ in summed)
             return (totals, nearest), (bits, tuple(later for _, later in summed))
 
-        start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
+        start = ((jnp.zeros(judge.atoms, accumulate),) * (10 if tensor else 5), judge.start())
         told, pinned = (None if bits is None else halves_of(bits) for bits in (given, where))
         (totals, nearest), (halves, later) = lax.scan(block, start, (tables.groups(), told, pinned))
         sums = [self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)]
         return _forces(sums, judge.finish(nearest, halves) if decisions else None)
-
-    def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
-        """Sum over pairs of r_ij ⊗ F_ij, energy; minus the derivative of the energy by strain."""
-        judge = self.judge(positions)
-        geometry, law = self.policy.geometry, self.law
-        cell = self.cell.astype(geometry)
-        components, weights = tuple(positions.astype(geometry)), self.weights(tables)
-        at = law.at_cutoff()
-
-        def block(totals, listed):
-            j, types = listed
-            _, _, inside, _ = judge.group(j, types)
-            d = displacements(components, cell, j)
-            r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), geometry))
-            others = factors(self.model, (w * w.at[j].get(mode="promise_in_bounds") for w in weights))
-            slope = law.evaluate(self._in_force_dtype(r2), types, at, *others)[1]
-            slope = jnp.where(inside, slope, 0).astype(geometry)
-            sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in VOIGT]
-            return tuple(total + q for total, q in zip(totals, sums, strict=True)), None
-
-        totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
-        return symmetric(-jnp.sum(total, dtype=jnp.float64) for total in totals)
 
 
 class ChannelForce(PairForce):
@@ -270,16 +259,15 @@ class ChannelForce(PairForce):
     def decide(self, positions, tables):
         return _joined([part.decide(positions, tables) for part in self.parts])
 
-    def __call__(self, positions, tables, *, decisions, given=None, where=None):
+    def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):
         made = [
-            part(positions, tables, decisions=decisions, given=told, where=pinned)
+            part(positions, tables, decisions=decisions, tensor=tensor, given=told, where=pinned)
             for part, told, pinned in zip(self.parts, self.split(given), self.split(where), strict=True)
         ]
-        force, energy, virial = (reduce(add, rows) for rows in zip(*(one[:3] for one in made), strict=True))
-        return Forces(force, energy, virial, _joined([one.decisions for one in made]) if decisions else None)
-
-    def virial_tensor(self, positions, tables):
-        return reduce(add, (part.virial_tensor(positions, tables) for part in self.parts))
+        parts = [(*one[:3], one.tensor) if tensor else one[:3] for one in made]
+        force, energy, virial, *rest = (reduce(add, rows) for rows in zip(*parts, strict=True))
+        joined = _joined([one.decisions for one in made]) if decisions else None
+        return Forces(force, energy, virial, joined, *rest)
 
     def judge(self, positions):
         raise InputError(
@@ -305,26 +293,27 @@ def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...
 
 def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
     """Forces from the sums of `PairForce._terms`, which count every pair at both its ends."""
-    fx, fy, fz, energy, virial = sums
+    fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
-    return Forces(
-        jnp.stack([fx, fy, fz]), half * energy, -jnp.sum(half * virial, dtype=jnp.float64), decisions
-    )
+    summed = [-jnp.sum(half * one, dtype=jnp.float64) for one in virial]
+    tensor = symmetric(summed) if len(summed) > 1 else None
+    return Forces(jnp.stack([fx, fy, fz]), half * energy, reduce(add, summed[:3]), decisions, tensor)
 
 
 @eqx.filter_custom_jvp
-def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool):
+def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
     """As `PairForce.in_blocks` in one compiled loop; None where that is not known."""
-    terms_of = force._terms()
+    terms_of = force._terms(tensor)
 
     def pair(own, other, types, *bits):
         d, r2, inside, margin = force._geometry(own[:3], other[:3], types)
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
         others = factors(force.model, map(mul, own[3:], other[3:]))
-        *force_terms, energy, virial = terms_of(d, r2, inside, types, *others)
+        fx, fy, fz, energy, *virial = terms_of(d, r2, inside, types, *others)
         # a slot of padding is nowhere, and no number times nothing is no number
-        terms = (*(jnp.where(inside, term, 0) for term in force_terms), energy, virial)
+        located = [jnp.where(inside, term, 0) for term in (fx, fy, fz, *(virial if tensor else ()))]
+        terms = (*located[:3], energy, *(located[3:] if tensor else virial))
         return (*terms, margin) if decisions else terms
 
     flags = [one for one in (given, where) if one is not None]
@@ -338,12 +327,13 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 @_in_one_loop.def_jvp
-def _in_one_loop_jvp(primals, tangents, *, decisions: bool):
+def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
     # values as everywhere; their derivative by the loop that jax can differentiate
-    made = _in_one_loop(*primals, decisions=decisions)
+    made = _in_one_loop(*primals, decisions=decisions, tensor=tensor)
     if made is None:
         return None, None
-    _, moved = eqx.filter_jvp(partial(PairForce.in_blocks, decisions=decisions), primals, tangents)
+    blocks = partial(PairForce.in_blocks, decisions=decisions, tensor=tensor)
+    _, moved = eqx.filter_jvp(blocks, primals, tangents)
     return made, moved
 
 
@@ -421,6 +411,7 @@ class ManyBodyForce(eqx.Module):
         tables: Tables,
         *,
         decisions: bool,
+        tensor: bool = False,
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
@@ -435,12 +426,8 @@ class ManyBodyForce(eqx.Module):
             jnp.zeros(positions.shape[1], jnp.float64).at[0].set(total),
             -jnp.trace(strain).astype(jnp.float64),
             made if decisions else None,
+            -0.5 * (strain + strain.T).astype(jnp.float64) if tensor else None,
         )
-
-    def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
-        """Minus the derivative of the energy by strain."""
-        _, _, strain = self._differentiate(positions, tables, self.decide(positions, tables).bits)
-        return -0.5 * (strain + strain.T).astype(jnp.float64)
 
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
@@ -547,5 +534,5 @@ class PairDynamics(eqx.Module):
         """One step, with the forces of the pairs that are decided to be inside."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
-        end = one_step(self.integrator, cell, self.masses, order, *state, made.force, made.virial)
+        end = one_step(self.integrator, cell, self.masses, order, *state, made)
         return MdState(state.step + 1, end.x, end.kicked, end.ahead)

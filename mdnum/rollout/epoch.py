@@ -123,11 +123,12 @@ class EpochRecord(NamedTuple):
     v: Float[Array, "rows 3 atoms"]
     images: Int[Array, "rows 3 atoms"]  # shape (rows, 3, atoms), int32, or none
     bits: UInt8[Array, "rows words atoms"]  # decisions, shape (rows, words, atoms), or none
-    # potential, kinetic, virial, heat: energies, shape (rows,)
+    # potential, kinetic, virial, heat: energies, shape (rows,); heat taken up so far
     potential: Float[Array, "rows"]
     kinetic: Float[Array, "rows"]
     virial: Float[Array, "rows"]
     heat: Float[Array, "rows"]
+    work: Float[Array, "rows"]  # energy that the box has given so far
     # nearest: smallest |margin|; moved: `Cell.spent` since the list was built; of shape (rows,)
     nearest: Float[Array, "rows"]
     moved: Float[Array, "rows"]
@@ -142,7 +143,7 @@ class EpochRecord(NamedTuple):
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
 
 
-_NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved", "inside")
+_NUMBERS = ("potential", "kinetic", "virial", "heat", "work", "nearest", "moved", "inside")
 
 
 class EpochOutcome(NamedTuple):
@@ -293,15 +294,19 @@ def run_epoch(
         given = {} if told is None else {"given": told[row]}
         if pinned is not None:
             given["where"] = pinned[row]
-        made: Forces = force_in(cell=cell)(x, tables, decisions=program.record, **given)
-        end = one_step(integrator, cell, masses, order, step, x, v, extra, made.force, made.virial)
+        made: Forces = force_in(cell=cell)(
+            x, tables, decisions=program.record, tensor=integrator.anisotropic, **given
+        )
+        end = one_step(integrator, cell, masses, order, step, x, v, extra, made)
+        given_heat, given_work = integrator.exchanged(end.extra, end.at)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
         kinetic = integrator.kinetic(end.v, masses)
         values = {
             "potential": potential,
             "kinetic": kinetic,
             "virial": made.virial,
-            "heat": heat - integrator.conserved(end.extra, masses),
+            "heat": heat + given_heat,
+            "work": given_work,
             "moved": largest,
         }
         if moves:

@@ -236,12 +236,12 @@ class Rollout:
         atoms.info["step"] = step
         atoms.info["time"] = step * simulation.timestep
         # the loop records no forces: they are worked out again, with its list and hence its decisions
-        made, _, virial = evaluate_listed(simulation.force, segment.rows_of("x")[row], tables, True)
+        made = evaluate_listed(simulation.force, segment.rows_of("x")[row], tables, True)
         forces = np.empty((len(atoms), 3))
         forces[segment.table.order] = np.asarray(made.force).T
         known = {"energy": float(segment.rows_of("potential")[row]), "forces": forces}
         if atoms.cell.rank == 3 and atoms.pbc.any():
-            known["stress"] = full_3x3_to_voigt_6_stress(-np.asarray(virial) / simulation.cell.volume)
+            known["stress"] = full_3x3_to_voigt_6_stress(-np.asarray(made.tensor) / simulation.cell.volume)
         atoms.calc = SinglePointCalculator(atoms, **known)
         return atoms
 

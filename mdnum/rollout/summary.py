@@ -242,7 +242,7 @@ def series_columns(
         "energy_jump": np.bincount(row, weights=ledger.energy_jump, minlength=count),
         "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
-        "conserved": total - segment.rows_of("heat"),
+        "conserved": total - segment.rows_of("heat") - segment.rows_of("work"),
         **({"volume": volume} if segment.cells else {}),
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -89,7 +89,7 @@ class Evaluator:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
         here, wrapped, table, tables, x = self._sorted(positions, cell)
-        result, bits, virial = evaluate_listed(here.force, x, tables, stress)
+        result = evaluate_listed(here.force, x, tables, stress)
         forces = np.empty((here.atoms, 3))
         forces[table.order] = np.asarray(result.force, np.float64).T
         energies = np.full(here.atoms, np.nan)
@@ -98,9 +98,9 @@ class Evaluator:
         return Evaluation(
             float(jnp.sum(result.energy, dtype=jnp.float64)),
             forces,
-            np.full((3, 3), np.nan) if virial is None else -np.asarray(virial) / here.cell.volume,
+            -np.asarray(result.tensor) / here.cell.volume if stress else np.full((3, 3), np.nan),
             energies,
-            lambda: here.inside(wrapped, table, np.asarray(bits)),
+            lambda: here.inside(wrapped, table, np.asarray(result.decisions.bits)),
         )
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
@@ -140,11 +140,9 @@ class Evaluator:
 
 
 @eqx.filter_jit
-def evaluate_listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool):
-    """Forces, decisions, and the virial tensor sum r_ij ⊗ F_ij where the stress is needed."""
-    result = force(x, tables, decisions=True)
-    assert result.decisions is not None
-    return result, result.decisions.bits, force.virial_tensor(x, tables) if stress else None
+def evaluate_listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
+    """Forces and decisions, with the virial as a tensor where the stress is needed."""
+    return force(x, tables, decisions=True, tensor=stress)
 
 
 @eqx.filter_jit

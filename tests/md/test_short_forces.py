@@ -65,7 +65,8 @@ def pair_terms(r2: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 @eqx.filter_jit
 def _evaluated(force, x, tables):
-    return force(x, tables, decisions=True), force.virial_tensor(x, tables)
+    made = force(x, tables, decisions=True, tensor=True)
+    return made, made.tensor
 
 
 def evaluated(sim: Simulation):

@@ -16,11 +16,11 @@ class Drifting(Integrator):
 
     name = "drifting"
 
-    def finish(self, v, extra, acceleration, masses, time):
-        return v + time * acceleration, extra
+    def finish(self, v, extra, at, time):
+        return v + time * at.acceleration, extra
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
-        v = v + (0.5 * self.timestep).astype(v.dtype) * acceleration
+    def begin(self, x, v, extra, at):
+        v = v + (0.5 * self.timestep).astype(v.dtype) * at.acceleration
         return x + self.timestep.astype(x.dtype) * v, v, extra, jnp.zeros(())
 
 
@@ -31,10 +31,10 @@ class Strained(Drifting):
     stretch: Float[Array, ""] = quantity("rate")  # of every lattice vector along itself
     shear: Float[Array, ""] = quantity("rate")  # of x into y, and half as much of y into -z, of z into x
 
-    def deform(self, cell, v, extra, masses, virial, step):
+    def deform(self, v, extra, at):
         turned = jnp.zeros((3, 3)).at[0, 1].set(1.0).at[1, 2].set(-0.5).at[2, 0].set(0.5)
         # all of it turns round after 50 steps
-        way = jnp.where(step % 100 < 50, 1.0, -1.0) * self.timestep
+        way = jnp.where(at.step % 100 < 50, 1.0, -1.0) * self.timestep
         return jnp.eye(3) + way * (self.stretch * jnp.eye(3) + self.shear * turned), v, extra
 
 
@@ -51,7 +51,7 @@ class Flat(Drifting):
     stretch: Float[Array, ""] = quantity("rate")
     shear: Float[Array, ""] = quantity("rate")
 
-    def deform(self, cell, v, extra, masses, virial, step):
+    def deform(self, v, extra, at):
         plane = jnp.diag(jnp.array([1.0, 1.0, 0.0])) * self.stretch
         return jnp.eye(3) + self.timestep * plane.at[0, 1].set(self.shear), v, extra
 
@@ -66,8 +66,8 @@ class Pressed(Drifting):
     def init(self, x, v, masses):
         return jnp.zeros(())
 
-    def deform(self, cell, v, extra, masses, virial, step):
-        volume = jnp.abs(jnp.linalg.det(cell.matrix))
-        pressure = (2 * self.kinetic(v, masses) + virial) / (3 * volume)
+    def deform(self, v, extra, at):
+        volume = jnp.abs(jnp.linalg.det(at.cell.matrix))
+        pressure = (2 * self.kinetic(v, at.masses) + at.virial) / (3 * volume)
         growth = self.timestep * self.stiffness * (pressure - self.pressure)
         return (1 + growth) * jnp.eye(3), v / (1 + growth).astype(v.dtype), extra + growth

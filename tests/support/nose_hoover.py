@@ -48,18 +48,18 @@ class NoseHoover(Integrator):
         excess = 2 * self.kinetic(v, masses) - self.freedom(masses) * self.kT
         return excess / self.inertia(masses)
 
-    def finish(self, v, extra, acceleration, masses, time):
-        return self.rub(v + time * acceleration, extra, masses, time)
+    def finish(self, v, extra, at, time):
+        return self.rub(v + time * at.acceleration, extra, at.masses, time)
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
+    def begin(self, x, v, extra, at):
         half = (0.5 * self.timestep).astype(v.dtype)
-        v, link = self.rub(v, extra, masses, half)
-        v = v + half * acceleration
+        v, link = self.rub(v, extra, at.masses, half)
+        v = v + half * at.acceleration
         return x + self.timestep.astype(x.dtype) * v, v, link, jnp.zeros(())
 
-    def conserved(self, extra, masses):
-        inertia, freedom = self.inertia(masses), self.freedom(masses)
-        return 0.5 * inertia * extra.velocity**2 + freedom * self.kT * extra.position
+    def exchanged(self, extra, at):
+        inertia, freedom = self.inertia(at.masses), self.freedom(at.masses)
+        return -(0.5 * inertia * extra.velocity**2 + freedom * self.kT * extra.position), 0.0
 
 
 class Frictions(NamedTuple):
@@ -90,11 +90,11 @@ class PerAtom(Integrator):
         friction = friction + 0.5 * time * pull(v)
         return v, Frictions(ByAtom(friction), extra.calls + 1)
 
-    def finish(self, v, extra, acceleration, masses, time):
-        return self.rub(v + time * acceleration, extra, masses, time)
+    def finish(self, v, extra, at, time):
+        return self.rub(v + time * at.acceleration, extra, at.masses, time)
 
-    def begin(self, x, v, extra, acceleration, masses, step, order):
+    def begin(self, x, v, extra, at):
         half = 0.5 * self.timestep
-        v, extra = self.rub(v, extra, masses, half)
-        v = v + half * acceleration
+        v, extra = self.rub(v, extra, at.masses, half)
+        v = v + half * at.acceleration
         return x + self.timestep * v, v, extra, jnp.zeros(())
