@@ -10,7 +10,7 @@ from mdnum.md.integrators import quantity
 class NoseHoover(mdnum.Integrator):
     """A friction follows the kinetic energy, half a step before and half a step after the forces."""
 
-    name = "nose-hoover"
+    name = "one-link"
     kT: object = quantity("temperature")  # energy here; `temperature` to whoever makes one
     tau: object = quantity("time")  # in which the friction follows
 
@@ -40,7 +40,7 @@ class NoseHoover(mdnum.Integrator):
 atoms = ase.build.bulk("Ar", "fcc", a=5.4, cubic=True).repeat(4)
 simulation = mdnum.simulation(
     atoms, mdnum.LennardJones(3.405, 0.0103235), mdnum.Cut("switched", 8.5), timestep=0.004, temperature=60,
-    integrator=NoseHoover, dynamics={"tau": 0.2}, name="argon-nose-hoover",
+    integrator=NoseHoover, dynamics={"tau": 0.2}, name="argon-one-link",
 )  # fmt: skip
 run = mdnum.run(simulation, steps=500)
 print("conserved energy drifts by", run.summary["energy_drift"], "eV per ps and atom")

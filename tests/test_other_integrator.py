@@ -34,16 +34,14 @@ from mdnum.systems.build import build
 from mdnum.systems.simulation import Simulation
 
 QUINTIC = {"kind": "quintic", "radius": 2.0}
-CHAIN = {"dynamics.kind": "nose-hoover", "dynamics.temperature": 1.0, "dynamics.relaxation": 0.3}
+CHAIN = {"dynamics.kind": "one-link", "dynamics.temperature": 1.0, "dynamics.relaxation": 0.3}
 
 
 @pytest.fixture
 def site(tmp_path, monkeypatch):
     """A folder on the search path with the package in it."""
     source = Path(nose_hoover.__file__).read_text(encoding="utf-8")
-    points = {
-        "mdnum.integrators": {"nose-hoover": "strange_steps:NoseHoover", "broken": "strange_steps:Link"}
-    }
+    points = {"mdnum.integrators": {"one-link": "strange_steps:NoseHoover", "broken": "strange_steps:Link"}}
     folder = install(tmp_path / "site", "strange-steps", {"strange_steps": source}, points)
     monkeypatch.syspath_prepend(folder)
     yield folder
@@ -126,7 +124,7 @@ def test_from_a_file_it_is_that_from_objects(site):
     dynamics = {"timestep": 0.002, "temperature": 40.0, "seed": 3}
     made, plain = (
         build(make(atoms, argon, {"kind": "hard", "radius": 7.0}, "metal", dynamics={**dynamics, **kind}))
-        for kind in ({"kind": "nose-hoover", "relaxation": 0.2}, {"kind": "nve"})
+        for kind in ({"kind": "one-link", "relaxation": 0.2}, {"kind": "nve"})
     )
     units = made.units
     own = NoseHoover(
@@ -155,7 +153,7 @@ def test_from_a_file_it_is_that_from_objects(site):
     ],
 )
 def test_a_file_that_does_not_fit_it_is_refused(site, tmp_path, changes, message):
-    asked = {"kind": "nose-hoover", "timestep": 0.004, "temperature": 1.0, "relaxation": 0.3}
+    asked = {"kind": "one-link", "timestep": 0.004, "temperature": 1.0, "relaxation": 0.3}
     asked |= {key.partition(".")[2]: value for key, value in changes.items()}
     lines = [f"{key} = {value!r}" for key, value in asked.items() if value is not None]
     path = write_system(tmp_path / "system", liquid())
@@ -170,7 +168,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_state(site, tmp_path, monkeypat
     """To the bit; a state that is begun anew is another run."""
     system = load(write_system(tmp_path / "system", liquid()), CHAIN)
     whole = go(tmp_path / "whole", system, 120, save_every=10)
-    assert whole[0].summary["dynamics"] == "nose-hoover"
+    assert whole[0].summary["dynamics"] == "one-link"
     series = whole[1].read("series")
     conserved, total = (np.asarray(series[name]) for name in ("conserved", "total"))
     jumps = np.cumsum(np.asarray(series["energy_jump"]))
@@ -180,7 +178,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_state(site, tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_with_its_state(site, tmp_path):
-    path = write_system(tmp_path / "system", liquid(), dynamics={"kind": "nose-hoover", "relaxation": 0.3})
+    path = write_system(tmp_path / "system", liquid(), dynamics={"kind": "one-link", "relaxation": 0.3})
     whole = go(tmp_path / "whole", load(path), 120, save_every=10)
     code = CHILD.format(stop=60, path=str(path), out=str(tmp_path / "run"), steps=120)
     here = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{Path(__file__).with_name('support')}"}
@@ -194,7 +192,7 @@ def test_it_is_forked_with_a_counterfactual(site, tmp_path):
     system = load(write_system(tmp_path / "system", liquid()), CHAIN)
     made = mdnum.fork(system, "precision", steps=400, repeats=0, report=False, out=tmp_path / "fork")
     assert made.summary["first_bit"] is not None
-    assert "nose-hoover is another" in made.summary["lyapunov_reason"]
+    assert "one-link is another" in made.summary["lyapunov_reason"]
     from mdnum.rollout.program import MdProgram
 
     program = MdProgram(build(system))
@@ -226,7 +224,7 @@ def test_unrolled_differentiates_through_its_state(kind):
 def test_a_page_says_why_methods_are_missing(tmp_path):
     made = mdnum.grad(held(), "potential", "epsilon", steps=3, out=tmp_path / "grad")
     missing = {one["what"]: one["why"] for one in made.summary["left_out"] if not one["how"]}
-    assert all("nose-hoover" in missing[name] for name in ("symmetric", "event-aware", "trust", "flips"))
+    assert all("one-link" in missing[name] for name in ("symmetric", "event-aware", "trust", "flips"))
     text = " ".join((made.folder / "report.html").read_text().split())
     # of all that have the same reason in one line
     assert text.count(missing["symmetric"]) == 1 and "symmetric, forward, " in text
@@ -264,9 +262,9 @@ def test_every_other_method_refuses_it_by_name():
         with pytest.raises(InputError, match=f"{name} is another"):
             spectrum(other)
     whole: Any = {"precision": {"state": "lattice"}}
-    with pytest.raises(InputError, match=r"nve .*langevin, .*nose"):
+    with pytest.raises(InputError, match=r"nve .*langevin, .*one-link"):
         method("reversible")(Problem(held(**whole), everything(108), 10), names)
-    with pytest.raises(InputError, match="none of nose-hoover"):
+    with pytest.raises(InputError, match="none of one-link"):
         first_state(held(**whole))
     nve = build(make(crystal(), LENNARD_JONES, QUINTIC, **whole))
     with pytest.raises(InputError, match="none of slower"):

@@ -59,6 +59,7 @@ _INSIDE = {
     "rate": (truediv, mul, "time_factor"),
     "temperature": (mul, truediv, "k_B"),
     "pressure": (truediv, mul, "pressure_factor"),
+    "compressibility": (mul, truediv, "pressure_factor"),
 }
 
 
@@ -70,9 +71,12 @@ def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False
     return ways[back](value, getattr(units, factor))
 
 
-def quantity(unit: Literal["time", "rate", "temperature", "pressure", "seed"], **options: Any) -> Any:
+def quantity(
+    unit: Literal["time", "rate", "temperature", "pressure", "compressibility", "seed"], **options: Any
+) -> Any:
     """A field of an integrator that a system file has in another unit: a time, one over a time, a temperature
-    (by the key `temperature`; an energy inside mdnum), a pressure or a random key (by `seed`)."""
+    (by the key `temperature`; an energy inside mdnum), a pressure, one over a pressure or a random key (by
+    `seed`)."""
     return eqx.field(metadata={"unit": unit}, **options)
 
 
@@ -92,27 +96,29 @@ class AtStep(NamedTuple):
 class Integrator(eqx.Module):
     """How positions and velocities get from one force evaluation to the next.
 
-    A system file has its fields as keys; `quantity` says which are no pure numbers. A static field takes the
-    value in the file as it is.
+    A system file has its fields as keys, but not those that are keywords only; `quantity` says which are no
+    pure numbers. A static field takes the value in the file as it is.
 
     Example:
         >>> class NoseHoover(mdnum.Integrator): ...  # examples/thermostat.py is a whole one
 
     Attributes:
         timestep: internal time.
+        constraints: degrees of freedom that the start has taken out for good; a simulation sets it.
     """
 
     name: ClassVar[str]
-    #: Whether the center of mass moves on undisturbed.
+    #: Whether a total momentum of zero stays zero.
     keeps_momentum: ClassVar[bool] = True
     #: Steps after which the loop hands its state to the host, where the extra state needs that.
     pause: ClassVar[Any] = None
     timestep: Float[Array, ""] = quantity("time")
+    constraints: int = eqx.field(static=True, kw_only=True, default=0)
 
     @classmethod
     def keys(cls) -> dict[str, Field[Any]]:
         """Its fields, by the keys that a system file has for them."""
-        units = [(one.metadata.get("unit"), one) for one in fields(cls)]
+        units = [(one.metadata.get("unit"), one) for one in fields(cls) if not one.kw_only]
         return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
     @classmethod
@@ -195,6 +201,13 @@ class Integrator(eqx.Module):
         """Whether it has its own `deform`; if not, the box is a constant and no row records it."""
         return type(self).deform is not Integrator.deform
 
+    def check(self, cell: Cell) -> None:
+        """Refuse a box or a word that it cannot work with, with an `InputError`; called once, on the host."""
+
+    def freedom(self, masses: Masses) -> int:
+        """Degrees of freedom: three for each atom, less three where the total momentum was set to zero."""
+        return max(3 * masses.shape[0] - self.constraints, 1)
+
     def kinetic(self, v: Vector, masses: Masses) -> Number:
         """Kinetic energy."""
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
@@ -203,6 +216,11 @@ class Integrator(eqx.Module):
     @property
     def anisotropic(self) -> bool:
         """Whether it needs the virial as a tensor, which costs a sixth of a pair's work."""
+        return False
+
+    @property
+    def keeps_angles(self) -> bool:
+        """Whether `deform` returns a diagonal matrix, so that a box along x, y and z stays so."""
         return False
 
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
@@ -253,10 +271,13 @@ def one_step(
     # the first step of all starts from full-step velocities
     second_half = jnp.where(step == 0, jnp.zeros((), dtype), half)
     v, extra = integrator.finish(v, extra, at, second_half)
-    after, kicked, ahead, heat = integrator.begin(x, v, extra, at)
     if integrator.moves_cell:
+        # in float64, or a slow strain would be lost when positions are rounded a second time
+        after, kicked, ahead, heat = integrator.begin(x.astype(jnp.float64), v, extra, at)
         by, kicked, ahead = integrator.deform(kicked, ahead, at)
-        cell, after = cell.deformed(by), transformed(after, by)
+        cell, after = cell.deformed(by), transformed(after, by).astype(dtype)
+    else:
+        after, kicked, ahead, heat = integrator.begin(x, v, extra, at)
     wrapped, n = cell.astype(dtype).wrap(*after)
     return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat, cell, at)
 
@@ -381,3 +402,14 @@ class Langevin(KickDrift):
 INTEGRATORS: Registry[Integrator] = Registry("integrator", "mdnum.integrators", kind=Integrator)
 for _scheme in (VelocityVerlet, Langevin):
     INTEGRATORS.add(_scheme.name, _scheme)
+for _name, _place, _words in (
+    (
+        "nose-hoover",
+        "thermostats:NoseHooverChain",
+        "NVT. Nosé-Hoover chain (Martyna et al. 1992).",
+    ),
+    ("csvr", "thermostats:CSVR", "NVT. Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007)."),
+    ("mtk", "barostats:MTK", "NPT. Martyna, Tobias & Klein 1994; isotropic or full box."),
+    ("cell-rescaling", "barostats:CellRescaling", "NPT. Stochastic cell rescaling (Bernetti & Bussi 2020)."),
+):
+    INTEGRATORS.add(_name, f"mdnum.md.{_place}", description=_words)

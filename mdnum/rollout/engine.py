@@ -168,9 +168,9 @@ def first_state(simulation: Simulation) -> Start:
     # numpy's arrays: jnp would compile a program for each
     state = EpochState(*jax.device_put((np.int64(0), x, v, taken_off, x, np.float64(0))))
     extra = simulation.propagator.init(state.x, state.v, jax.device_put(simulation.masses))
-    moves, cell = simulation.integrator.moves_cell, simulation.force.cell
-    # one that moves need not stay along x, y and z
-    cells = (replace(cell, orthorhombic=False),) * 3 if moves else (cell,)
+    integrator, cell = simulation.integrator, simulation.force.cell
+    straight = cell.orthorhombic and integrator.keeps_angles
+    cells = (replace(cell, orthorhombic=straight),) * 3 if integrator.moves_cell else (cell,)
     state = state._replace(extra=jax.device_put(jax.tree.map(np.asarray, extra)), cells=cells)
     return Start(state, state.x)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,16 +18,17 @@ from mdnum.md.cutoffs import CUTOFFS
 from mdnum.md.decide import PairDecider
 from mdnum.md.energies import EnergyFunction
 from mdnum.md.fixed_point import FixedPointDecider, FixedPointUnits
-from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.integrators import INTEGRATORS, Integrator, Langevin, VelocityVerlet
 from mdnum.md.manybody import ManyBody, leaves_by_path
 from mdnum.md.neighbors import RebuildRule, check_radius
 from mdnum.md.potentials import Channels, CutPotential, PairFunction, PairPotential, each_term, pair_type
 from mdnum.numerics import PrecisionPolicy, check_not_forked
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import FIXED_POINT
-from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, pair_key, pair_names
+from mdnum.systems.schema import DEFAULT_SKIN, ONSET_FRACTION, DynamicsAlone, pair_key, pair_names
 from mdnum.systems.simulation import Origin, Simulation
 from mdnum.systems.structures import Draw, check, smallest_distance, species_of
+from mdnum.systems.toml import Source, checked
 from mdnum.units import Units
 
 if TYPE_CHECKING:
@@ -90,7 +92,8 @@ def simulation(
     units: str = "metal",
     temperature: float = 0.0,
     friction: float | None = None,
-    integrator: Integrator | type[Integrator] | None = None,
+    pressure: float | None = None,
+    integrator: Integrator | type[Integrator] | str | None = None,
     dynamics: Mapping[str, Any] | None = None,
     seed: int = 0,
     remove_drift: bool = True,
@@ -122,9 +125,10 @@ def simulation(
         units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
         temperature: of velocities that are drawn, and of a thermostat.
         friction: of Langevin dynamics, one over time; default constant energy.
-        integrator: another class of integrators, or one of them, whose numbers are internal (time is length *
-            sqrt(mass / energy)).
-        dynamics: further numbers of such a class, by the keys and in the units of a system file.
+        pressure: of a barostat, GPa or reduced.
+        integrator: another one by its name ("nose-hoover", "csvr", "mtk", "cell-rescaling") or class, or one
+            itself, whose numbers are internal (time is length * sqrt(mass / energy)).
+        dynamics: further numbers and words of it, by the keys and in the units of a system file.
         seed: of drawn velocities and of a thermostat's noise.
         remove_drift: whether the velocity of the center of mass is taken out at the start.
         drawn: whether velocities are drawn; default where the atoms have no momenta.
@@ -172,8 +176,10 @@ def simulation(
         if timestep is None:
             raise InputError("no time step", where=name, remedy="Add timestep=...")
         kind = integrator or (VelocityVerlet if friction is None else Langevin)
-        numbers = {"timestep": timestep, "friction": friction, "temperature": temperature, "seed": seed}
-        integrator = kind.of_file({**numbers, **(dynamics or {})}, system)
+        numbers = {"timestep": timestep, "temperature": temperature, "seed": seed}
+        optional = {"friction": friction, "pressure": pressure}
+        numbers |= {key: one for key, one in optional.items() if one is not None}
+        integrator = _integrator(kind, {**numbers, **(dynamics or {})}, system, name)
     drawn = not atoms.has("momenta") if drawn is None else drawn
     made = assembled(
         Origin(name, about), atoms, system, model, model.compare if cutoff is None else cutoff.compare,
@@ -185,6 +191,18 @@ def simulation(
 
         return admitted(made)
     return made
+
+
+def _integrator(
+    kind: str | type[Integrator], numbers: Mapping[str, Any], units: Units, where: str
+) -> Integrator:
+    """An integrator by its name or class; one that a system file can have from what one may say of it."""
+    made = INTEGRATORS[kind] if isinstance(kind, str) else kind
+    if made in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
+        table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
+        data = {"dynamics": {"kind": made.name, **table}}
+        numbers = checked(DynamicsAlone, data, Source(where, Path(), where)).dynamics.model_dump()
+    return made.of_file(numbers, units)
 
 
 def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:
@@ -411,6 +429,13 @@ def assembled(
     if builder == "auto":
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
         builder = "host" if jax.default_backend() == "cpu" else "device"
+    integrator.check(cell)
+    if integrator.moves_cell and not pairwise and getattr(model, "fixed_box", False):
+        message = f"{origin.name} has a potential with a box of its own, and {integrator.name} moves the box"
+        remedy = "Let it take box= (jax_md.space.periodic_general)"
+        raise InputError(message, where="dynamics.kind", remedy=remedy)
+    at_rest = draw.remove_drift and integrator.keeps_momentum and len(masses) > 1
+    integrator = replace(integrator, constraints=3 * at_rest)
     velocities = draw.velocities(masses, units, None if draw.drawn else atoms.get_velocities())
     made = Simulation(
         origin, atoms, units, symbols, cell, positions, velocities, masses, species, model, decider, rule,

@@ -182,4 +182,6 @@ def _code(function: Any) -> dict[str, Any]:
 
 def _dynamics(simulation: Simulation) -> dict[str, Any]:
     integrator, units = simulation.integrator, simulation.units
-    return {key: integrator.number(key, units) for key in integrator.numbers() if key != "timestep"}
+    numbers = {key: integrator.number(key, units) for key in integrator.numbers() if key != "timestep"}
+    words = (one.name for one in integrator.keys().values() if one.metadata.get("static"))
+    return numbers | {name: getattr(integrator, name) for name in words}

@@ -47,7 +47,7 @@ _UNITS = {
     "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}", "skin": "{length}",
     "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",
     "rate": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})", None: "",
-    "velocity": "{length}/{time}", "species": "",
+    "velocity": "{length}/{time}", "species": "", "pressure": "{pressure}", "compressibility": "1/{pressure}",
 }  # fmt: skip
 
 

@@ -406,13 +406,61 @@ class LangevinTable(_Dynamics):
     friction: float = Field(gt=0, description="friction coefficient (1/ps or 1/τ)")
 
 
+class _ThermostatTable(_Dynamics):
+    temperature: Positive = Field(description="of the thermostat, and of drawn velocities (K or ε/k)")
+    relaxation: Positive = Field(description="relaxation time of the temperature (ps or τ)")
+
+
+class _BarostatTable(_ThermostatTable):
+    pressure: float = Field(description="pressure (GPa or ε/σ³)")
+    pressure_relaxation: Positive = Field(description="relaxation time of the pressure (ps or τ)")
+    box: Literal["isotropic", "full"] = Field(
+        default="isotropic", description="isotropic: the volume alone; full: all lengths and angles"
+    )
+
+
+Links = Annotated[int, Field(ge=1, le=20, description="thermostats of a chain")]
+
+
+class NoseHooverTable(_ThermostatTable):
+    """Constant temperature: a Nosé-Hoover chain."""
+
+    kind: Literal["nose-hoover"]
+    chain: Links = 3
+
+
+class CSVRTable(_ThermostatTable):
+    """Constant temperature: stochastic velocity rescaling."""
+
+    kind: Literal["csvr"]
+
+
+class MTKTable(_BarostatTable):
+    """Constant pressure and temperature: Martyna, Tobias and Klein."""
+
+    kind: Literal["mtk"]
+    chain: Links = 3
+
+
+class CellRescalingTable(_BarostatTable):
+    """Constant pressure and temperature: stochastic cell rescaling."""
+
+    kind: Literal["cell-rescaling"]
+    compressibility: Positive = Field(
+        description="estimate of the isothermal compressibility (1/GPa or σ³/ε); it sets a rate, no average"
+    )
+
+
+_DYNAMICS = (NVETable, LangevinTable, NoseHooverTable, CSVRTable, MTKTable, CellRescalingTable)
+
+
 class OtherDynamics(_Dynamics):
     """An integrator that another package adds; its keys are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, bool | int | float | str]
 
-    kind: str = _other_than(NVETable, LangevinTable)
+    kind: str = _other_than(*_DYNAMICS)
     temperature: NonNegative = Field(
         default=0.0, description="of a thermostat, and of drawn velocities (K or ε/k)"
     )
@@ -428,7 +476,13 @@ class OtherDynamics(_Dynamics):
 
 
 _INTEGRATORS = "mdnum.md.integrators:INTEGRATORS"
-Dynamics = _or_other((NVETable, LangevinTable), OtherDynamics, _INTEGRATORS)
+Dynamics = _or_other(_DYNAMICS, OtherDynamics, _INTEGRATORS)
+
+
+class DynamicsAlone(TomlTable):
+    """Dynamics without a system, as objects have them."""
+
+    dynamics: Dynamics
 
 
 class PrecisionTable(TomlTable):

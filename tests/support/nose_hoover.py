@@ -20,7 +20,7 @@ class Link(NamedTuple):
 class NoseHoover(Integrator):
     """The canonical ensemble: a friction that follows the kinetic energy, on both sides of each half kick."""
 
-    name = "nose-hoover"
+    name = "one-link"
     kT: Float[Array, ""] = quantity("temperature")
     relaxation: Float[Array, ""] = quantity("time")
 

@@ -1,0 +1,331 @@
+"""Constant pressure and temperature: Martyna-Tobias-Klein's barostat and stochastic cell rescaling.
+
+Both deform the box by its volume alone (`box = "isotropic"`) or in all six ways that do not rotate it
+("full"): rates and strains are numbers times the unit matrix, or symmetric matrices. The pressure is
+(2 K + virial) / 3 V with the kinetic energy K of the moment, as a tensor Π / V, Π = Σ m v ⊗ v + Σ r ⊗ F. Both
+sample volumes as exp(-(U + p V) / k_B T) dV, shapes of the full box evenly (dh / det(h)², det(h) = V). Where
+the total momentum is zero the center of mass has no share in the pressure, and the ideal gas has the mean
+volume N k_B T / p; else (N + 1) k_B T / p.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mdnum.errors import InputError
+from mdnum.md.cell import Cell, transformed
+from mdnum.md.integrators import AtStep, Integrator, Number, Vector, quantity
+from mdnum.md.thermostats import Chain, rescaled
+
+Rate = Float[Array, "..."]  # a number, or a symmetric matrix (3, 3), float64
+#: Terms of the series below, whose error is less than a rounding up to an argument of 0.5.
+_TERMS = 14
+
+
+def growth(a: Rate) -> Rate:
+    """(exp(a) - 1) / a = Σ aᵏ / (k + 1)!, of a number or of a matrix (3, 3) of a norm up to 0.5.
+
+    Of a matrix by its characteristic polynomial, so that it is differentiable where eigenvalues agree.
+    """
+    if a.ndim == 0:
+        total = jnp.zeros(())
+        for k in reversed(range(_TERMS)):
+            total = total * a / (k + 2) + 1
+        return total
+    square = a @ a
+    first, second, third = invariants(a, square)
+    p, q, r = 0.0, 0.0, 0.0  # the matrix p + q a + r a²
+    for k in reversed(range(_TERMS)):
+        p, q, r = r * third / (k + 2) + 1, (p - r * second) / (k + 2), (q + r * first) / (k + 2)
+    return p * jnp.eye(3) + q * a + r * square
+
+
+def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Number, Number, Number]:
+    """Coefficients of a³ = first a² - second a + third, of a matrix and its square."""
+    first = jnp.trace(a)
+    second = 0.5 * (first**2 - jnp.trace(square))
+    return first, second, a[0] @ jnp.cross(a[1], a[2])
+
+
+def times(a: Rate, b: Rate) -> Rate:
+    """The product of two rates of one kind."""
+    return a @ b if a.ndim else a * b
+
+
+def exponential(a: Rate) -> Rate:
+    """exp(a), of a norm up to 0.5; exactly one where a is zero."""
+    return unit(a) + times(a, growth(a))
+
+
+def unit(a: Rate) -> Rate:
+    """One, of a kind."""
+    return jnp.eye(3) if a.ndim else jnp.ones(())
+
+
+def trace(a: Rate) -> Number:
+    """The trace of the matrix (3, 3) that a rate is."""
+    return jnp.trace(a) if a.ndim else 3 * a
+
+
+def matrix(a: Rate) -> Float[Array, "3 3"]:
+    """The matrix that a rate is."""
+    return a if a.ndim else a * jnp.eye(3)
+
+
+def acted(x: Vector, a: Rate) -> Vector:
+    """Vectors, as rows, times a rate, float64."""
+    return transformed(x.astype(jnp.float64), a) if a.ndim else x * a
+
+
+class Barostat(Integrator):
+    """What both barostats share; which words, numbers and boxes they have.
+
+    Attributes:
+        kT: energy. pressure: energy/length³. relaxation, pressure_relaxation: internal time.
+    """
+
+    kT: Float[Array, ""] = quantity("temperature")
+    pressure: Float[Array, ""] = quantity("pressure")
+    relaxation: Float[Array, ""] = quantity("time")
+    pressure_relaxation: Float[Array, ""] = quantity("time")
+    boxes: ClassVar[tuple[str, str]] = ("isotropic", "full")
+
+    @property
+    @abstractmethod
+    def box(self) -> str:
+        """One of `boxes`."""
+
+    @property
+    def anisotropic(self):
+        return self.box == "full"
+
+    @property
+    def keeps_angles(self):
+        return self.box != "full"
+
+    def check(self, cell):
+        if self.box not in self.boxes:
+            seen = f"box {self.box!r}; expected {' or '.join(map(repr, self.boxes))}"
+            raise InputError(seen, where="dynamics.box")
+        if not all(cell.pbc):
+            axis = "abc"[cell.pbc.index(False)]
+            message = f"{self.name} needs a box that is periodic along every axis, and {axis} is free"
+            raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
+
+    def excess(self, v: Vector, at: AtStep) -> Rate:
+        """Π - p V: twice the kinetic energy and the virial along each direction, less the pressure's."""
+        given = self.pressure * volume(at.cell)
+        if not self.anisotropic:
+            return (2 * self.kinetic(v, at.masses) + at.virial) / 3 - given
+        v = v.astype(jnp.float64)
+        assert at.tensor is not None
+        whole = (at.masses * v) @ v.T + at.tensor
+        return 0.5 * (whole + whole.T) - given * jnp.eye(3)
+
+
+def volume(cell: Cell) -> Number:
+    """Volume of a box, inside jit."""
+    a = cell.matrix
+    if cell.orthorhombic:
+        return jnp.abs(a[0, 0] * a[1, 1] * a[2, 2])
+    return jnp.abs(a[0] @ jnp.cross(a[1], a[2]))
+
+
+class Box(NamedTuple):
+    """The extra state of `MTK`."""
+
+    rate: Rate  # of the box, one over time
+    atoms: Chain  # thermostats of the atoms
+    chain: Chain  # and of the box
+    volume: Number  # of step 0
+
+
+class MTK(Barostat):
+    """The isothermal-isobaric ensemble, deterministic and time-reversible.
+
+    Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), in the splitting of Tuckerman et al., J. Phys. A
+    39, 5629 (2006), eq. 38 and following: chains of the box and of the atoms, a kick of the box by its excess
+    pressure, a kick of the atoms, the drift in the box that grows, and back. The box has the inertia
+    (N_f + 3) k_B T τ_p² (a third of it where it is full) and one or six degrees of freedom. All of the drift
+    is exact: x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+
+    Example:
+        >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
+        ...                  integrator="mtk", dynamics={"relaxation": 0.2, "pressure_relaxation": 2.0})
+
+    Attributes:
+        chain: links of each chain. box: "isotropic" or "full".
+    """
+
+    name = "mtk"
+    chain: int = eqx.field(static=True, default=3)
+    box: str = eqx.field(static=True, default="isotropic")
+
+    def init(self, x, v, masses):
+        still = jnp.zeros((3, 3) if self.anisotropic else ())
+        return Box(still, Chain.at_rest(self.chain), Chain.at_rest(self.chain), jnp.zeros(()))
+
+    def inertia(self, masses):
+        """Of the box, energy times time²."""
+        share = 3 if self.anisotropic else 1
+        return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
+
+    def _held(self, v, extra, masses, time):
+        """Both chains for a time; they do not know each other."""
+        freedom, kT = self.freedom(masses), self.kT
+        own, of_box = self._own(extra, masses)
+        scale, atoms = extra.atoms.act(self.kinetic(v, masses), freedom, kT, self.relaxation, time)
+        slowed, chain = extra.chain.act(own, of_box, kT, self.pressure_relaxation, time)
+        v = (v * scale).astype(v.dtype)
+        return v, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
+
+    def _own(self, extra, masses):
+        """Kinetic energy of the box, and its degrees of freedom."""
+        return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
+
+    def _pushed(self, v, extra, at, time):
+        """The rate of the box after its excess pressure and the atoms' kinetic energy have acted on it."""
+        heat = 2 * self.kinetic(v, at.masses) / self.freedom(at.masses)
+        push = self.excess(v, at) + heat * unit(extra.rate)
+        # of an isotropic box the three directions together
+        share = 1 if self.anisotropic else 3
+        return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
+
+    def _kicked(self, v, extra, at, time):
+        """Velocities after forces, and the friction of a growing box, have acted."""
+        rate = extra.rate
+        slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
+        kick = acted(at.acceleration, time * growth(slow))
+        return (acted(v, exponential(slow)) + kick).astype(v.dtype)
+
+    def finish(self, v, extra, at, time):
+        time = time.astype(jnp.float64)
+        first = jnp.where(at.step == 0, volume(at.cell), extra.volume)
+        extra = extra._replace(volume=first)
+        v = self._kicked(v, extra, at, time)
+        return self._held(v, self._pushed(v, extra, at, time), at.masses, time)
+
+    def begin(self, x, v, extra, at):
+        half = 0.5 * self.timestep
+        v, extra = self._held(v, extra, at.masses, half)
+        extra = self._pushed(v, extra, at, half)
+        v = self._kicked(v, extra, at, half)
+        # the box still has to grow, with all that is in it
+        way = self.timestep * growth(-self.timestep * extra.rate)
+        return x + acted(v, way), v, extra, jnp.zeros(())
+
+    def deform(self, v, extra, at):
+        return matrix(exponential(self.timestep * extra.rate)), v, extra
+
+    def exchanged(self, extra, at):
+        freedom, kT = self.freedom(at.masses), self.kT
+        own, of_box = self._own(extra, at.masses)
+        heat = extra.atoms.energy(freedom, kT, self.relaxation)
+        heat += extra.chain.energy(of_box, kT, self.pressure_relaxation)
+        return -heat, -own - self.pressure * (volume(at.cell) - extra.volume)
+
+
+class Move(NamedTuple):
+    """The extra state of `CellRescaling`: the last move of the box, and what it did."""
+
+    strain: Rate  # logarithm of the deformation
+    # root: of the volume before; step: of that root; force: on it, and excess: along the other directions,
+    # there
+    root: Number
+    step: Number
+    force: Number
+    excess: Rate
+    work: Number  # energy given to the atoms so far
+
+
+class CellRescaling(Barostat):
+    """The isothermal-isobaric ensemble by a box of first order in time: stochastic cell rescaling, with CSVR.
+
+    Bernetti, Bussi, J. Chem. Phys. 153, 114107 (2020): the square root of the volume, whose noise does not
+    depend on it, takes an Euler step by the forces at hand, in the middle of a drift whose velocities shrink
+    as the box grows (their sec. II C). Of a full box (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12,
+    1139, 2022) the traceless strain takes one too, with the noise of the geometric mean of both volumes. Each
+    move of the box has a reverse with a known probability, so that the total less heat and work is an
+    effective energy: it is conserved but for the error of the time step.
+
+    Example:
+        >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
+        ...                  integrator="cell-rescaling", dynamics={
+        ...                      "relaxation": 0.1, "pressure_relaxation": 1.0, "compressibility": 2.0})
+
+    Attributes:
+        compressibility: length³/energy; only its ratio to pressure_relaxation matters, which is a rate of the
+            box and not of the ensemble. key: random key. box: "isotropic" or "full".
+    """
+
+    name = "cell-rescaling"
+    compressibility: Float[Array, ""] = quantity("compressibility")
+    key: Array = quantity("seed")
+    box: str = eqx.field(static=True, default="isotropic")
+
+    def init(self, x, v, masses):
+        none, no = jnp.zeros(()), jnp.zeros((3, 3) if self.anisotropic else ())
+        return Move(no, jnp.ones(()), none, none, no, none)
+
+    @property
+    def _mobility(self):
+        """Of the root of the volume."""
+        return self.compressibility / (4 * self.pressure_relaxation)
+
+    def _forces(self, v, at):
+        """Root of the volume, the force on it, and the excess along traceless directions (see `Move`).
+
+        They are derivatives of k_B T ln of the density of that root, V^(1/2) exp(-(U + K + p V) / k_B T).
+        """
+        root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
+        part = trace(excess) / 3
+        return root, (2 * part + self.kT) / root, excess - part * unit(excess)
+
+    def _shear(self, root, after):
+        """Mobility of a traceless strain between two volumes, by their roots: the same on the way back."""
+        return 4 / 3 * self._mobility / (root * after)
+
+    def finish(self, v, extra, at, time):
+        (root, force, excess), step = self._forces(v, at), extra.step
+        # k_B T ln of the probability of the move over that of its reverse, and of the volumes
+        spent = self.pressure * (root**2 - extra.root**2) - self.kT * jnp.log(root / extra.root)
+        spent += 0.5 * step * (force + extra.force) + 0.5 * jnp.sum(extra.strain * (excess + extra.excess))
+        spent += self.timestep / 4 * self._mobility * (force**2 - extra.force**2)
+        squares = jnp.sum(jnp.square(excess)) - jnp.sum(jnp.square(extra.excess))
+        spent += self.timestep / 4 * self._shear(root, extra.root) * squares
+        work = extra.work - jnp.where(at.step == 0, 0.0, spent)
+        return v + time * at.acceleration, extra._replace(work=work)
+
+    def begin(self, x, v, extra, at):
+        kinetic, time = self.kinetic(v, at.masses), self.timestep
+        for_atoms, for_volume, for_shape = jax.random.split(jax.random.fold_in(self.key, at.step), 3)
+        scale = rescaled(for_atoms, kinetic, self.freedom(at.masses), self.kT, self.relaxation, time)
+        v = (v * scale).astype(v.dtype)
+        heat = self.kinetic(v, at.masses) - kinetic
+        v = v + (0.5 * time).astype(v.dtype) * at.acceleration
+        root, force, excess = self._forces(v, at)
+        spread = jnp.sqrt(2 * self._mobility * self.kT * time)
+        step = self._mobility * time * force + spread * jax.random.normal(for_volume, (), jnp.float64)
+        strain = 2 / 3 * jnp.log1p(step / root) * unit(excess)
+        if self.anisotropic:
+            mobility = self._shear(root, root + step)
+            noise = jax.random.normal(for_shape, (3, 3), jnp.float64)
+            noise = 0.5 * (noise + noise.T) - jnp.trace(noise) / 3 * jnp.eye(3)
+            strain += mobility * time * excess + jnp.sqrt(2 * mobility * self.kT * time) * noise
+        # half of the drift before the box grows, half after it, all before it as `deform` has it
+        slowed = exponential(-strain)
+        x = x + acted(v, 0.5 * time * (unit(strain) + times(slowed, slowed)))
+        v = acted(v, slowed).astype(v.dtype)
+        return x, v, Move(strain, root, step, force, excess, extra.work), heat
+
+    def deform(self, v, extra, at):
+        return matrix(exponential(extra.strain)), v, extra
+
+    def exchanged(self, extra, at):
+        return 0.0, extra.work

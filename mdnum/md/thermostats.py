@@ -1,0 +1,166 @@
+"""Constant temperature by scaling all velocities alike: Nosé-Hoover chains and stochastic velocity rescaling.
+
+A total momentum of zero stays zero, and how many degrees of freedom are left then decides the temperature
+(`Integrator.freedom`). Extra states are float64 whatever the dtype of positions and velocities. Velocities
+are scaled in float64, too: a factor near one that is rounded to float32 is wrong for all atoms alike.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mdnum.md.integrators import Integrator, Number, quantity
+
+#: Weights of three steps of second order that make one of fourth (Yoshida, Phys. Lett. A 150, 262, 1990).
+_FIRST = 1 / (2 - 2 ** (1 / 3))
+_WEIGHTS = (_FIRST, 1 - 2 * _FIRST, _FIRST)
+
+
+class Chain(NamedTuple):
+    """Thermostats, each of which holds the one before it."""
+
+    rate: Float[Array, "links"]  # p_ξ / Q, one over time
+    way: Float[Array, "links"]  # ξ
+
+    @classmethod
+    def at_rest(cls, links: int) -> Chain:
+        """Before the first step."""
+        return cls(jnp.zeros(links), jnp.zeros(links))
+
+    def act(
+        self, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
+    ) -> tuple[Number, Chain]:
+        """What velocities are multiplied by, and the chain, after it has acted for a time.
+
+        Each of three steps goes from the last link to the first, scales, and goes back (Tuckerman et al.,
+        J. Phys. A 39, 5629, 2006, the operator L_NHC); error O(time⁵).
+
+        Args:
+            kinetic: energy of what the chain holds, with its degrees of freedom; or of the box.
+            time: float64.
+        """
+        rate, way, scale = list(self.rate), list(self.way), jnp.ones(())
+        links, heavy = len(rate), freedom * kT * relaxation**2  # inertia of the first; the others: kT τ²
+
+        def kick(k: int, t: Number) -> None:
+            slowed = jnp.exp(-0.25 * t * rate[k + 1]) if k + 1 < links else 1.0
+            if k == 0:
+                pull = (2 * kinetic * scale**2 - freedom * kT) / heavy
+            else:
+                pull = (freedom if k == 1 else 1) * rate[k - 1] ** 2 - 1 / relaxation**2
+            rate[k] = (rate[k] * slowed + 0.5 * t * pull) * slowed
+
+        for weight in _WEIGHTS:
+            t = weight * time
+            for k in reversed(range(links)):
+                kick(k, t)
+            way = [one + t * each for one, each in zip(way, rate, strict=True)]
+            scale = scale * jnp.exp(-t * rate[0])
+            for k in range(links):
+                kick(k, t)
+        return scale, Chain(jnp.stack(rate), jnp.stack(way))
+
+    def energy(self, freedom: int, kT: Number, relaxation: Number) -> Number:
+        """Of all links (eq. 2.8 of the chains' paper, Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
+        shares = jnp.ones(len(self.rate)).at[0].set(freedom)
+        return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
+
+
+class NoseHooverChain(Integrator):
+    """The canonical ensemble, deterministic and time-reversible: velocity Verlet between two half chains.
+
+    Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated as in Tuckerman et al., J. Phys. A
+    39, 5629 (2006). A stiff system at low temperature may not be ergodic under it.
+
+    Example:
+        >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="nose-hoover",
+        ...                  dynamics={"relaxation": 0.2})
+
+    Attributes:
+        kT: energy. relaxation: internal time, the thermostat's period over 2π. chain: links.
+    """
+
+    name = "nose-hoover"
+    kT: Float[Array, ""] = quantity("temperature")
+    relaxation: Float[Array, ""] = quantity("time")
+    chain: int = eqx.field(static=True, default=3)
+
+    def init(self, x, v, masses):
+        return Chain.at_rest(self.chain)
+
+    def _scaled(self, v, extra, masses, time):
+        freedom = self.freedom(masses)
+        scale, extra = extra.act(self.kinetic(v, masses), freedom, self.kT, self.relaxation, time)
+        return (v * scale).astype(v.dtype), extra
+
+    def finish(self, v, extra, at, time):
+        v = v + time * at.acceleration
+        return self._scaled(v, extra, at.masses, time.astype(jnp.float64))
+
+    def begin(self, x, v, extra, at):
+        v, extra = self._scaled(v, extra, at.masses, 0.5 * self.timestep)
+        v = v + (0.5 * self.timestep).astype(v.dtype) * at.acceleration
+        return x + self.timestep.astype(x.dtype) * v, v, extra, jnp.zeros(())
+
+    def exchanged(self, extra, at):
+        return -extra.energy(self.freedom(at.masses), self.kT, self.relaxation), 0.0
+
+
+def rescaled(
+    key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
+) -> Number:
+    """What velocities are multiplied by when their kinetic energy takes an exact stochastic step.
+
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Velocities that are all
+    zero stay so.
+
+    Args:
+        key: of this step alone. time: how long the thermostat acts.
+    """
+    for_one, for_others = jax.random.split(key)
+    first = jax.random.normal(for_one, (), jnp.float64)
+    others = 2 * jax.random.gamma(for_others, 0.5 * (freedom - 1), (), jnp.float64) if freedom > 1 else 0.0
+    kept = jnp.exp(-time / relaxation)
+    moving = kinetic > 0
+    # what one degree of freedom takes up, over the energy that there is
+    share = -jnp.expm1(-time / relaxation) * 0.5 * kT / jnp.where(moving, kinetic, 1.0)
+    squared = kept + share * (first**2 + others) + 2 * first * jnp.sqrt(kept * share)
+    sign = jnp.where(first + jnp.sqrt(kept / share) < 0, -1.0, 1.0)
+    return jnp.where(moving, sign * jnp.sqrt(squared), 1.0)
+
+
+class CSVR(Integrator):
+    """The canonical ensemble by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
+
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). Noise comes from a counter-based key folded
+    with the step, so two runs can share it and a resumed run continues it. Conserved is the effective energy
+    (their eq. 15): the total less the heat.
+
+    Example:
+        >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",
+        ...                  dynamics={"relaxation": 0.1})
+
+    Attributes:
+        kT: energy. relaxation: internal time, of the kinetic energy. key: random key.
+    """
+
+    name = "csvr"
+    kT: Float[Array, ""] = quantity("temperature")
+    relaxation: Float[Array, ""] = quantity("time")
+    key: Array = quantity("seed")
+
+    def begin(self, x, v, extra, at):
+        kinetic, key = self.kinetic(v, at.masses), jax.random.fold_in(self.key, at.step)
+        scale = rescaled(key, kinetic, self.freedom(at.masses), self.kT, self.relaxation, self.timestep)
+        v = (v * scale).astype(v.dtype)
+        heat = self.kinetic(v, at.masses) - kinetic
+        v = v + (0.5 * self.timestep).astype(v.dtype) * at.acceleration
+        return x + self.timestep.astype(x.dtype) * v, v, extra, heat
+
+    def finish(self, v, extra, at, time):
+        return v + time * at.acceleration, extra
