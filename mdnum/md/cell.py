@@ -76,6 +76,10 @@ class Cell(eqx.Module):
             widths = 1.0 / np.linalg.norm(np.asarray(self.inverse), axis=0)
         return widths
 
+    def is_narrow(self, radius):
+        """Whether a radius exceeds half a perpendicular width, so that the minimum image misses pairs."""
+        return ((2 * radius) ** 2 * (self.inverse**2).sum(0) > 1).any()
+
     @property
     def volume(self) -> float:
         """Volume of the three lattice vectors, length cubed; NaN where one is missing (ASE's convention)."""

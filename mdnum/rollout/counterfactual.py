@@ -36,7 +36,7 @@ class Counterfactual:
             longer be a decision that rounding could have changed.
 
     Attributes:
-        failed: "blow-up" or "runaway" where it ended that way.
+        failed: one of `FAILURES` where it ended that way.
 
     Raises:
         InputError: many-body potentials decide inside their energy function.
@@ -118,9 +118,9 @@ class Counterfactual:
         numbers = jnp.asarray(built, jnp.int64), jnp.asarray(segment.last, jnp.int64), jnp.asarray(False)
         home = jnp.asarray(home, dtype)
         outcome, record = run_epoch(leaves, structure, tables, self.state, home, *numbers, held, imposed)
-        count, due, finite, runaway = np.asarray(outcome.flags).tolist()
+        count, due, _, _ = np.asarray(outcome.flags).tolist()
         self.state = outcome.state
-        self.failed = "" if finite and not runaway else "runaway" if finite else "blow-up"
+        self.failed = self._engine.failure(outcome)
         if due and not self._shares:
             self._own = None
         first = segment.first + row

@@ -42,7 +42,8 @@ _CHANGE_BYTES = 16 + 12 * 8
 
 
 # how a rollout ends that should not have
-FAILURES = ("blow-up", "runaway")
+NARROW = "narrow box"
+FAILURES = ("blow-up", "runaway", NARROW)
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Segment:
     built: int  # step at which the list was built
     opens: bool  # whether this is the first segment of its epoch
     # why the epoch ended with it: "displacement", "interval", "end", None, or what went wrong: "blow-up" (the
-    # last row is not finite), "runaway" (what follows it is wild)
+    # last row is not finite), "runaway" (what follows it is wild), "narrow box" (its list would lack pairs)
     closes: str | None
     due: bool  # the list must not be used for the step after the last row
     # largest displacement since the list was built (see `Cell.spent`), at that step, length
@@ -127,6 +128,12 @@ class Start:
     def reference(self) -> Float[np.ndarray, "atoms 3"]:
         """`home` on the host, an atom a row, in float64."""
         return np.asarray(self.home, np.float64).T
+
+    def check_box(self, simulation: Simulation, which: int = -1) -> None:
+        """Refuse one of the boxes, by default of the list's build, that is too narrow for a list, with an
+        `InputError`."""
+        cell = jax.tree.map(np.asarray, self.state.cells[which])
+        check_radius(cell, simulation.r_cut, simulation.rule.skin)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays for a checkpoint."""
@@ -216,10 +223,10 @@ class Engine:
         self.verlet: VerletList = simulation.verlet_list()
         self.verlet.slots = self.start.slots
         rule = simulation.rule
-        numbers = simulation.masses, np.float64(rule.skin / 2), np.float64(simulation.r_cut + rule.skin)
-        masses, half_skin, r_list = jax.device_put(numbers)
+        lengths = rule.skin / 2, simulation.r_cut + rule.skin, simulation.r_cut
+        masses, half_skin, r_list, r_cut = jax.device_put((simulation.masses, *map(np.float64, lengths)))
         self.program = EpochProgram(
-            simulation.force, simulation.propagator, masses, half_skin, r_list,
+            simulation.force, simulation.propagator, masses, half_skin, r_list, r_cut,
             rule.every, rule.delay, rule.check, record, self.rows,
         )  # fmt: skip
         self._moves = self.program.integrator.moves_cell
@@ -296,7 +303,7 @@ class Engine:
         cell = self._cell
         if self._moves:
             cell = jax.tree.map(np.asarray, start.state.cells[-1])
-            check_radius(cell, self.simulation.r_cut, self.simulation.rule.skin)
+            start.check_box(self.simulation)
         table = self.verlet.build(start.home.T, cell)
         return table, self.simulation.tables(table)
 
@@ -326,12 +333,12 @@ class Engine:
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
         """What the loop left behind, and the decisions at its last row; waits for it."""
         outcome, record = begun
-        rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+        rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
             # a step had more changes than there was room for
             self._room_for_changes(4 * self.program.most)
             outcome, record = self._advance(listed, start, held, turn)
-            rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+            rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         # before the next stretch is started, or a device would make that first
         changes = None if changes is None else changes.cut()
         first, table = int(start.state.step), listed[0]
@@ -340,7 +347,7 @@ class Engine:
             last = np.array(np.asarray(record.bits)[rows - 1]) if self.record and rows else None
         else:
             last = outcome.held
-        closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
+        closes = self._closes(outcome, rebuild)
         segment = Segment(
             first, rows, record, changes, before, table, start.epoch, start.built, first == start.built,
             closes, bool(rebuild), float(outcome.moved), outcome.state, start.home, self._cell,
@@ -365,13 +372,23 @@ class Engine:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
-    def _closes(self, next_step: int, *, rebuild: int, finite: int, runaway: int) -> str | None:
+    def failure(self, outcome: EpochOutcome) -> str:
+        """One of FAILURES, where a stretch of steps has ended in one; else empty."""
+        _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"
-        if next_step > self.last:
+        if self._moves and (rebuild or runaway):
+            cell, simulation = jax.tree.map(np.asarray, outcome.state.cells[0]), self.simulation
+            if cell.is_narrow(simulation.r_cut + rebuild * simulation.rule.skin):
+                return NARROW
+        return "runaway" if runaway else ""
+
+    def _closes(self, outcome: EpochOutcome, rebuild: int) -> str | None:
+        ended = self.failure(outcome)
+        if ended != "blow-up" and int(outcome.state.step) > self.last:
             return "end"
-        if runaway:
-            return "runaway"
+        if ended:
+            return ended
         if rebuild:
             return "displacement" if self.simulation.rule.check else "interval"
         return None

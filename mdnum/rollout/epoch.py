@@ -90,6 +90,7 @@ class EpochProgram(eqx.Module):
     masses: Float[Array, "atoms"]  # shape (atoms,), in the user's order
     half_skin: Float[Array, ""]  # half the skin, length
     r_list: Float[Array, ""]  # radius of the list, length
+    r_cut: Float[Array, ""]  # largest cutoff, length
     # every, delay: when the list may be rebuilt (RebuildRule)
     every: int = eqx.field(static=True)
     delay: int = eqx.field(static=True)
@@ -152,8 +153,8 @@ class EpochOutcome(NamedTuple):
     state: EpochState  # where to go on
     # four numbers that travel together: how many rows were recorded; whether the list must be rebuilt before
     # the next forces; whether every number so far was finite; and whether an atom has just moved by more than
-    # a lattice vector in one step, so that forces there would mean nothing and decisions would no longer be
-    # exact
+    # a lattice vector in one step, or the box has become narrower than twice the cutoff, so that forces there
+    # would mean nothing and decisions would no longer be exact
     flags: Int[Array, "4"]
     # largest displacement since the list was built (see `Cell.spent`), at the step that comes next, length
     moved: Float[Array, ""]
@@ -324,6 +325,8 @@ def run_epoch(
         record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
         runaway = jnp.max(jnp.abs(end.images)) > 1
+        if moves:
+            runaway |= end.cell.is_narrow(program.r_cut)
         images = images + end.images.astype(jnp.int32)
         step = step + 1
         largest = spent(end.cell, end.x, home_cell, home)

@@ -20,7 +20,7 @@ from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.md import foreign
 from mdnum.md.ledger import FlipTable
 from mdnum.plain import result
-from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
+from mdnum.rollout.engine import FAILURES, NARROW, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder
 from mdnum.rollout.summary import (
     EnergyBudget,
@@ -46,6 +46,7 @@ Shown = Callable[[Simulation, np.ndarray], None]
 _BUDGET_CHECKS, _LARGE, _STEPS_OF_A_LARGE = 20, 10_000, 100
 _LOG_LINES = 50
 _LOG_HEADER = "    step       time      potential        kinetic          total  temperature     pairs  flips"
+_SHORTER = "Use a shorter dynamics.timestep, relax the structure or lower the temperature"
 # about the life of two lists: where frames are nearer, steps would be made twice for them too often
 _FRAMES_APART = 25
 
@@ -293,25 +294,31 @@ class Rollout:
 
     def _fail(self, blown: Segment, summary: dict[str, Any]) -> dict[str, Any]:
         step, positions = blown.last, np.asarray(self.done.last, np.float64).T
+        point, remedy = resume_point(blown), _SHORTER
         if blown.closes == "runaway":
             kept, what = step, f"an atom moved by more than the box in the step after {step}"
+        elif blown.closes == NARROW:
+            kept, what = step, f"the box is too narrow at step {step + 1}"
+            try:
+                point.check_box(self.simulation, 0)
+            except InputError as error:
+                what, remedy = f"{what}: {error.message}", error.remedy
         else:
             kept, what = step - 1, f"the energy or a velocity stopped being a finite number at step {step}"
             last = blown.unsorted("x", blown.rows - 1).astype(np.float64)
             positions = last if np.all(np.isfinite(last)) else positions
         sound = np.all(np.isfinite(blown.rows_of("cell")))
         cell = blown.cell_of(blown.rows - 1) if sound else blown.start.cells[-1]
-        message = what + closest_pair(self.simulation.in_row(cell), positions)
-        self.folder.checkpoint(self._to_dict(resume_point(blown)), force=True)
+        if blown.closes != NARROW:
+            what += closest_pair(self.simulation.in_row(cell), positions)
+        self.folder.checkpoint(self._to_dict(point), force=True)
         self.folder.finalize()
-        summary["error"] = message
-        summary["verdict"] = f"Stopped: {message}."
+        summary |= {"error": what, "remedy": remedy, "reason": blown.closes, "verdict": f"Stopped: {what}."}
         self.folder.write_summary(summary)
         raise NumericalError(
-            message,
+            what,
             where=self.simulation.name,
-            remedy=f"Everything up to step {kept} is in {self.folder.path}. "
-            "Use a shorter dynamics.timestep, relax the structure or lower the temperature",
+            remedy=f"Everything up to step {kept} is in {self.folder.path}. {remedy}",
             folder=self.folder.path,
         )
 
@@ -415,9 +422,9 @@ def _resumed(
     folder = RunFolder.open(path)
     if folder.summary.get("status") == "failed":
         raise FolderError(
-            f"this run blew up: {folder.summary.get('error', 'see its report')}",
+            f"this run failed: {folder.summary.get('error', 'see its report')}",
             where=str(path),
-            remedy="Start a new run with a shorter dynamics.timestep",
+            remedy=f"Start a new run. {folder.summary.get('remedy', _SHORTER)}",
         )
     # a run that is refused stays as it is: resuming drops what was written after its checkpoint
     with folder.explained():
@@ -429,6 +436,8 @@ def _resumed(
         last = int(state["steps"]) if steps is None else steps
         rollout = Rollout(simulation, folder, last, int(state["save_every"]), progress, began)
         rollout.restore(state)
+        if simulation.integrator.moves_cell and rollout.start is not None:
+            rollout.start.check_box(simulation)
     try:
         folder.resume(layout)
     except BaseException:

@@ -268,7 +268,15 @@ def _status(run: RunView) -> Iterator[Finding]:
     of = f" of {planned:,}" if planned and planned > run.steps else ""
     if status == "failed":
         error = run.summary.get("error") or "It stopped at the first number that was not finite."
-        yield TEXTS.finding("RUN_FAILED", step=run.step(-1), of=of, error=str(error))
+        box = ["box"] * (run.summary.get("reason") == "narrow box")
+        yield TEXTS.finding(
+            "RUN_FAILED",
+            *box,
+            step=run.step(-1),
+            of=of,
+            error=str(error),
+            remedy=run.summary.get("remedy", ""),
+        )
     elif status != "complete":
         yield TEXTS.finding("NOT_FINISHED", steps=run.steps, of=of)
 

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from ase.stress import full_3x3_to_voigt_6_stress
 from gradient_problems import everything
-from moving_box import Drifting, Flat, Forgetful, Pressed, Strained
+from moving_box import Drifting, Flat, Forgetful, Pressed, Resting, Strained
 from rollout.harness import liquid, run
 from rollout.test_resume import assert_goes_on, assert_same
 from small_systems import LENNARD_JONES, crystal, make
 
 import mdnum
-from mdnum.errors import InputError
+from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.forks.exact.program import unsupported
 from mdnum.forks.linearized import tangents
 from mdnum.forks.processes import variants
@@ -31,7 +31,7 @@ from mdnum.gradients import Problem
 from mdnum.md import cell as cells
 from mdnum.md.cell import Cell
 from mdnum.numerics import PrecisionPolicy
-from mdnum.rollout.engine import Engine, Start, first_state, resume_point, unwrapped
+from mdnum.rollout.engine import NARROW, Engine, Start, first_state, resume_point, unwrapped
 from mdnum.rollout.flips import PairRecorder, decided_pairs, true_pairs
 from mdnum.rollout.program import MdProgram
 from mdnum.store import RunFolder
@@ -51,7 +51,7 @@ def moving(
         Flat: {"stretch": 0.1, "shear": 0.3},
         Pressed: {"pressure": 8.0, "stiffness": 0.02},
         Drifting: {},
-    }[integrator]
+    }.get(integrator, {})
     dynamics |= options.pop("dynamics", {})
     given = {"timestep": TIMESTEP, "temperature": 1.0, "skin": 0.3, "seed": 3, "save_every": 10} | options
     return mdnum.simulation(
@@ -395,10 +395,95 @@ def test_what_has_one_box_alone_refuses_another_by_name():
         first_state(replace(whole, integrator=simulation.integrator))
 
 
-def test_a_box_that_becomes_too_narrow_ends_the_run_in_a_line(tmp_path):
-    simulation = moving(dynamics={"stretch": -1.0, "shear": 0.0}, steps=49)
+def test_a_box_that_becomes_too_narrow_ends_the_run_with_everything_recorded(tmp_path):
+    shrinking = {"dynamics": {"stretch": -1.0, "shear": 0.0}, "steps": 49}
+    with pytest.raises(NumericalError, match="perpendicular"):
+        run(moving(**shrinking), out=tmp_path / "run")
+    folder = RunFolder.open(tmp_path / "run")
+    summary, series = folder.summary, folder.read("series")
+    assert (summary["status"], summary["reason"]) == ("failed", NARROW)
+    last, width = summary["steps"], float(moving().cell.widths.min())
+    # at the next rebuild the box is below twice the cutoff and skin, and its list had skin left until there
+    assert (1 - TIMESTEP) ** (last + 1) * width < 2 * (R_CUT + 0.3) < (1 - TIMESTEP) ** (last - 20) * width
+    assert summary["algebra_residual"] == summary["lost_pairs"] == 0 and summary["energy_budget_closes"]
+    assert len(series["step"]) == last + 1 and int(series["entered"].sum() + series["left"].sum()) == len(
+        folder.read("flips")["step"]
+    )
+    frames: Any = ase.io.read(tmp_path / "run" / "trajectory.traj", index=":")
+    assert [atoms.info["step"] for atoms in frames] == list(range(0, last + 1, 10))
+    assert folder.has_checkpoint() and folder.read("epochs")["reason"][-1] == NARROW
+    with pytest.raises(FolderError, match=r"perpendicular.*skin of at most"):
+        run(moving(**shrinking), resume=tmp_path / "run")
+
+
+@pytest.mark.nightly
+def test_a_list_that_is_rebuilt_blindly_serves_until_the_box_is_below_twice_the_cutoff():
+    blind = moving(rebuild=(1000, 0, False), dynamics={"stretch": -1.5, "shear": 0.0})
+    for segment in Engine(blind, 49).segments():
+        assert min(float(np.min(cell.widths)) for cell in segment.cells) >= 2 * R_CUT
+    assert segment.closes == NARROW and segment.state.cells[0].is_narrow(R_CUT)
+
+
+def test_a_run_that_has_ended_does_not_go_on_in_a_box_that_is_too_narrow(tmp_path):
+    simulation = moving(dynamics={"stretch": -1.0, "shear": 0.0}, steps=25)
+    run(simulation, out=tmp_path / "run")
     with pytest.raises(InputError, match="perpendicular"):
-        run(simulation, out=tmp_path / "run")
+        run(simulation, resume=tmp_path / "run", steps=49)
+    assert RunFolder.open(tmp_path / "run").summary["status"] == "complete"
+
+
+def _planted(rule: str, first: Cell):
+    """`Cell.spent` with a rule that forgets a part of the strain."""
+
+    def spent(self, x, reference, home, r_list):
+        by = reference.deformation(self)
+        moved = x - (home if rule == "motion without the box" else cells.transformed(home, by))
+        if rule == "strain by volume":
+            loss = r_list * jax.numpy.maximum(0, 1 - jax.numpy.abs(jax.numpy.linalg.det(by)) ** (1 / 3))
+        else:
+            loss = cells.strain_loss(first, self, r_list) if rule == "strain since the first box" else 0.0
+        return self.astype(x.dtype).farthest(moved) + 0.5 * loss
+
+    return spent
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("rule", "kind", "stretch", "shear"),
+    [
+        ("motion in the box alone", Strained, -1.0, 0.0),
+        ("motion without the box", Resting, -3.5, 0.0),
+        ("strain by volume", Strained, 0.0, 2.2),
+        ("strain since the first box", Strained, 1.0, 0.0),
+    ],
+)
+def test_a_rule_that_forgets_a_part_of_the_strain_is_found_in_the_loop(
+    rule, kind, stretch, shear, tmp_path, monkeypatch
+):
+    """By all pairs in numpy at every step, and by the look back at the next rebuild."""
+    options: dict[str, Any] = {
+        "temperature": 0.3,
+        "atoms": liquid(density=0.5, rattle=0.1 if shear else 0.02),
+    }
+    if kind is Resting:
+        # atoms nearly at rest, in rows that are that far apart, come nearer through the faces alone
+        options |= {"atoms": liquid(density=0.3, rattle=0.02), "timestep": 0.1 * TIMESTEP}
+    options["dynamics"] = {"stretch": stretch, "shear": shear}
+    for planted in (False, True):
+        # of a class of its own, so that it is compiled on its own
+        own = type(f"{kind.__name__}{planted}", (kind,), {"name": f"{kind.name}-{planted}"})
+        simulation = moving(own, **options)
+        if planted:
+            monkeypatch.setattr(Cell, "spent", _planted(rule, simulation.cell))
+        judge, lost, looked_back, recorder = AllPairs(simulation), 0, 0, PairRecorder(simulation)
+        for segment in Engine(simulation, 99).segments():
+            recorder.flips(segment)
+            looked_back += recorder.missed
+            for row in range(segment.rows):
+                judge.x, judge.matrix = segment.unsorted("x", row), np.asarray(segment.cell_of(row).matrix)
+                lost += len(judge.forces()[0] - set(decided_pairs(simulation, segment, row).tolist()))
+        # a rebuild comes too late to see the pairs of atoms at rest
+        assert bool(lost) == planted and bool(looked_back) == (planted and kind is Strained)
 
 
 @pytest.mark.parametrize("pbc", list(product((True, False), repeat=3)))

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mdnum.md.cell import transformed
 from mdnum.md.integrators import Integrator, quantity
 
 
@@ -42,6 +43,16 @@ class Forgetful(Strained):
     """The same; of its own class, so that it is compiled on its own."""
 
     name = "forgetful"
+
+
+class Resting(Strained):
+    """The box is strained around atoms that it does not take along."""
+
+    name = "resting"
+
+    def begin(self, x, v, extra, at):
+        x, v, extra, heat = super().begin(x, v, extra, at)
+        return transformed(x, jnp.linalg.inv(self.deform(v, extra, at)[0])), v, extra, heat
 
 
 class Flat(Drifting):

@@ -81,6 +81,9 @@ KEPT_DEFECTS = {
     "rebuilt from old positions": "",
     "counts of the first": "",
     "volume looked at": "",
+    "motion in the box alone": "jax-md (fractional coordinates)",
+    "strain by volume": "",
+    "strain since the first box": "",
     "the caller's array": "",
     "skin of the first": "",
     "tail of a growing count lost": "",
@@ -308,6 +311,14 @@ def _right(positions: bytes, cell: bytes, pbc: bytes, reach: float):
     return search(places, box, np.frombuffer(pbc, bool), reach)
 
 
+#: How much of a length is left after a deformation since the build (and since the first box).
+_STRAIN_RULES = {
+    "motion in the box alone": lambda by, first: 1.0,
+    "strain by volume": lambda by, first: abs(np.linalg.det(by)) ** (1 / 3),
+    "strain since the first box": lambda by, first: np.linalg.svd(first, compute_uv=False)[-1],
+}
+
+
 class Kept:
     """A list with a skin: rebuilt when two atoms could have used it up, or the box has changed."""
 
@@ -366,11 +377,24 @@ class Kept:
             changed = (
                 abs(np.linalg.det(cell) / np.linalg.det(self.cell) - 1) > 1e-12 if self.pbc.all() else False
             )
+        if self.defect in _STRAIN_RULES:
+            return self._strained(positions, cell)
         return changed or most > room
+
+    def _strained(self, positions, cell):
+        """Whether motion in the box and a part of its strain have used up the skin."""
+        full = [_complete(np.asarray(one, float), self.pbc) for one in (cell, self.cell, self.oldest)]
+        since = [np.linalg.solve(one, full[0]) for one in full[1:]]
+        moved = positions - self.reference @ since[0]
+        # the nearest image of motion where it has not been wrapped: there is no other
+        most = float(np.sqrt((moved**2).sum(axis=1)).max(initial=0.0))
+        kept = _STRAIN_RULES[self.defect](*since)
+        return 2 * most + (self.r_cut + self.padding) * max(0.0, 1 - kept) > self.padding
 
     def _build(self, positions, cell):
         self.age = 0
         self.cell, self.reference = np.array(cell), np.array(positions)
+        self.oldest = getattr(self, "oldest", self.cell)
         if self.defect == "the caller's array":
             self.reference = positions
         self.previous = self.reference

@@ -169,6 +169,8 @@ MOVERS = {
     "jitter": lambda x, m, k, drawn, rng: (x + drawn, m),
     # fractional coordinates rest: nothing but the box moves
     "strained": lambda x, m, k, drawn, rng: (x @ STRAIN, m @ STRAIN),
+    # nothing but the box moves, and atoms near its faces come nearer to one another through them
+    "around resting atoms": lambda x, m, k, drawn, rng: (x, m @ STRAIN),
     "wrapping": lambda x, m, k, drawn, rng: (x + drawn + (k % 3 == 0) * rng.integers(-1, 2, x.shape) @ m, m),
     "resting": lambda x, m, k, drawn, rng: (x, m),
     # the same lattice with another vector from the middle on

@@ -159,6 +159,10 @@ def _strain() -> Script:
     yield "box and atoms turn", [(start @ turn, _L * turn) for turn in turns], _L
     mixed = [(start * (1 - 0.004 * k) + 0.01 * k, _L * (1 - 0.004 * k)) for k in range(12)]
     yield "the box shrinks while the atoms drift", mixed, _L
+    # atoms move where the box is largest, so that a list which has served so far is made anew there
+    there = [(start * f, _L * f) for f in (1.0, 1.25, 1.5)]
+    back = [((start + gas(40, 0.8, 102)) * f, _L * f) for f in (1.5, 1.35, 1.2, 1.05, 1.0)]
+    yield "the box grows, the atoms move, the box shrinks back", there + back, _L
     few = gas(5, 2.3, 101)
     path = [(few * f, 2.3 * f) for f in (1.0, 0.9, 0.75, 0.6, 0.5, 0.8)]
     yield "the box shrinks below two cutoffs", path, 2.3
