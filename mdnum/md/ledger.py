@@ -77,7 +77,7 @@ class FlipTable(Columns):
     # None where it is not known: the step of a run; the position among the frames examined, which is not the
     # number in the file and never 0; distance (length) and margin at the frame before, nan for a pair that
     # was nowhere near; radial speed (length per the user's time); what the flip adds to the energy, and to
-    # the force between the two
+    # the force between the two; and, in a run whose box moves, what its last deformation did to the distance
     step: Int[np.ndarray, "flips"] | Any = None
     frame: Int[np.ndarray, "flips"] | Any = None
     before: Float[np.ndarray, "flips"] | Any = None
@@ -85,6 +85,7 @@ class FlipTable(Columns):
     radial_speed: Float[np.ndarray, "flips"] | Any = None
     energy_jump: Float[np.ndarray, "flips"] | Any = None
     force_jump: Float[np.ndarray, "flips"] | Any = None
+    by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
         """What is known, by the names of flips.parquet; all rows are of one rule."""

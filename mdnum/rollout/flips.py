@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.bits import digit_order
 from mdnum.compiled import njit
@@ -69,7 +70,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
-def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, first, factor):
+def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
     """Columns of a ledger from `Changes`, sorted, and whether a margin contradicts its decision.
 
     Args:
@@ -77,11 +78,12 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
         rule: whether distances are compared, not their squares; and whether a margin of 0 is inside.
         boxes, narrow: `stacked` in float64, and in float32 where decisions are made in that.
+        back: deformations to the box of the row before, shape (rows, 3, 3); of no rows where it does not move.
         first: step of the first row. factor: from velocities to those of the ledger.
 
     Returns:
         step, labels, shape (2, flips), and decision; then margin, bound, energy jump, distance, radial
-        speed and force jump, shape (6, flips).
+        speed, force jump and what the box did to the distance, shape (7, flips).
     """
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
@@ -98,7 +100,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
     for f in range(flips):
         place[order[f]] = f
     step, subject = np.empty(flips, np.int64), np.empty((2, flips), np.int64)
-    entered, out, contradicted = np.empty(flips, np.bool_), np.empty((6, flips)), False
+    entered, out, contradicted = np.empty(flips, np.bool_), np.zeros((7, flips)), False
     small, wide = np.float32, np.float64
     # as they were noted: they come from further away than their places, which are near one another
     for q in range(flips):
@@ -126,7 +128,21 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
         step[f], subject[0, f], subject[1, f], entered[f] = first + row, i[q], j[q], now
         out[0, f], out[1, f], out[2, f] = margin, bounds[row, k], sign * by_type[1, k]
         out[3, f], out[4, f], out[5, f] = distance, approach / distance * factor, sign * by_type[2, k]
+        if len(back):
+            b = back[row]
+            x = dx * b[0, 0] + dy * b[1, 0] + dz * b[2, 0]
+            y = dx * b[0, 1] + dy * b[1, 1] + dz * b[2, 1]
+            z = dx * b[0, 2] + dy * b[1, 2] + dz * b[2, 2]
+            out[6, f] = distance - np.sqrt(x * x + y * y + z * z)
     return step, subject, entered, out, contradicted
+
+
+def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
+    """Deformations from the box of each row to that of the row before; none where it does not move."""
+    if not segment.cells:
+        return np.empty((0, 3, 3))
+    before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
+    return np.array([now.deformation(then) for then, now in zip(before, segment.cells, strict=True)])
 
 
 def _noted(before, bits, index, x, v) -> Changes:
@@ -282,7 +298,8 @@ class PairRecorder:
             self._held_keys = None
         step, (i, j), entered, numbers, contradicted = _columns(
             pairs, ends, table.order, self._species, self._kinds, self._by_type, self.bounds(segment),
-            self._rule, *(self._stacked(segment.cells) if segment.cells else self._one_box), segment.first,
+            self._rule, *(self._stacked(segment.cells) if segment.cells else self._one_box),
+            _back(segment), segment.first,
             # user units of time: the ledger is for people
             self.simulation.units.time_factor,
         )  # fmt: skip
@@ -291,7 +308,7 @@ class PairRecorder:
                 "a recorded margin contradicts its decision",
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
             )
-        margin, bound, jump, distance, speed, force_jump = numbers
+        margin, bound, jump, distance, speed, force_jump, by_box = numbers
         if self.simulation.pairwise and self.simulation.model.weights:
             # in the compiled loop each kind of pair has one jump
             sign = np.where(entered, 1.0, -1.0)
@@ -300,7 +317,17 @@ class PairRecorder:
             i=i, j=j, rank=np.zeros(len(i), np.int32), entered=entered, distance=distance,
             margin=margin, bound=bound, ambiguous=np.abs(margin) <= bound, decided_by="program",
             step=step, radial_speed=speed, energy_jump=jump, force_jump=force_jump,
+            by_box=by_box if segment.cells else None,
         )  # fmt: skip
+
+    def caused_by_box(self, ledger: FlipTable) -> Bool[np.ndarray, "flips"]:
+        """Which flips would not have been with the box of the step before, in which the atoms moved as they
+        did; of a box that moves."""
+        root, inclusive = self._rule
+        # the same margin, at the distance in that box
+        change = ledger.by_box if root else ledger.by_box * (2 * ledger.distance - ledger.by_box)
+        margin = ledger.margin + change
+        return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
         """Keys of the pairs inside at the last step, where a list has ended with it."""

@@ -186,7 +186,8 @@ class Rollout:
         pairs = self.recorder.counts(segment)
         ambiguous = self.recorder.ambiguous(segment)
         ledger = self.recorder.flips(segment)
-        rows = series_columns(self.simulation, segment, pairs, ambiguous, ledger)
+        by_box = self.recorder.caused_by_box(ledger) if segment.cells else None
+        rows = series_columns(self.simulation, segment, pairs, ambiguous, ledger, by_box)
         self.folder.append("series", rows)
         if len(ledger):
             self.folder.append("flips", {**ledger.columns(), **self.simulation.first_atoms(ledger.i)})

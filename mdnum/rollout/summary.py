@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.ledger import FlipTable
@@ -60,6 +60,7 @@ class RunTally:
     step: int = -1
     entered: int = 0
     left: int = 0
+    by_box: int | None = None  # flips that the box has caused; None where it does not move
     ambiguous: int = 0
     ambiguous_flips: int = 0
     pairs_first: int = 0
@@ -84,6 +85,8 @@ class RunTally:
         self.pairs_last = int(pairs[-1])
         self.entered += int(ledger.entered.sum())
         self.left += int((~ledger.entered).sum())
+        if "by_box" in rows:
+            self.by_box = (self.by_box or 0) + int(rows["by_box"].sum())
         self.ambiguous += int(rows["ambiguous"].sum())
         self.ambiguous_flips += int(ledger.ambiguous.sum())
         jumps = self.jumps + np.cumsum(rows["energy_jump"])
@@ -135,6 +138,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "dynamics": simulation.integrator.name,
         "flips_entered": tally.entered,
         "flips_left": tally.left,
+        **({} if tally.by_box is None else {"flips_by_box": tally.by_box}),
         "pairs_first": tally.pairs_first,
         "pairs_last": tally.pairs_last,
         "algebra_residual": tally.pairs_last - tally.pairs_first - tally.entered + tally.left,
@@ -206,7 +210,12 @@ def degrees_of_freedom(simulation: Simulation) -> int:
 
 
 def series_columns(
-    simulation: Simulation, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: FlipTable
+    simulation: Simulation,
+    segment: Segment,
+    pairs: np.ndarray,
+    ambiguous: np.ndarray,
+    ledger: FlipTable,
+    by_box: Bool[np.ndarray, "flips"] | None = None,
 ) -> dict[str, np.ndarray]:
     """The rows of series.parquet for a segment.
 
@@ -216,6 +225,7 @@ def series_columns(
         pairs: pairs inside at each row.
         ambiguous: pairs within the rounding bound at each row.
         ledger: the flips of the segment.
+        by_box: which of them the box has caused, where it moves.
     """
     units = simulation.units
     step = np.arange(segment.first, segment.first + segment.rows)
@@ -243,7 +253,7 @@ def series_columns(
         "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
         "conserved": total - segment.rows_of("heat") - segment.rows_of("work"),
-        **({"volume": volume} if segment.cells else {}),
+        **({"volume": volume, "by_box": np.bincount(row[by_box], minlength=count)} if segment.cells else {}),
     }
 
 

@@ -322,6 +322,9 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
     yield Figure("flips", TEXTS("flips_caption"), alt, draw, 3.5)
     if run.flips.total and run.steps:
         yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=run.flips.pairs)
+        if "by_box" in series:
+            caused = int(series["by_box"].sum(dtype=np.int64))
+            yield TEXTS("by_box", flips=caused, share=caused / run.flips.total)
     else:
         yield TEXTS("no_flips")
 

@@ -308,11 +308,33 @@ def test_a_folder_has_the_box_of_every_frame_and_the_volume_of_every_step(tmp_pa
         assert series["pressure"][step] == pytest.approx(both / (3 * volume), rel=1e-9)
 
 
+def test_flips_are_split_into_what_the_box_and_what_motion_in_it_did(tmp_path):
+    """From frames of every step alone: positions relative to the box, put into that of the step before."""
+    summary = run(moving(steps=60, save_every=1), out=tmp_path / "run").summary
+    folder = RunFolder.open(tmp_path / "run")
+    flips, series = folder.read("flips"), folder.read("series")
+    frames: Any = ase.io.read(tmp_path / "run" / "trajectory.traj", index=":")
+    caused = np.zeros(61, int)
+    for step, i, j, entered, distance, by_box in zip(
+        *(flips[name] for name in ("step", "i", "j", "entered", "distance", "by_box")), strict=True
+    ):
+        now, then = frames[step], frames[step - 1]
+        relative = now.get_scaled_positions()[j] - now.get_scaled_positions()[i]
+        relative -= np.rint(relative)
+        moved = np.linalg.norm(relative @ then.cell.array)  # after motion in the box, before its deformation
+        assert distance == pytest.approx(np.linalg.norm(relative @ now.cell.array), rel=1e-12)
+        assert by_box == pytest.approx(distance - moved, abs=1e-12)
+        assert (then.get_distance(i, j, mic=True) < R_CUT) != entered == (distance < R_CUT)
+        caused[step] += (moved < R_CUT) != entered
+    assert np.array_equal(series["by_box"], caused) and summary["flips_by_box"] == caused.sum()
+    assert 20 < caused.sum() < 0.5 * len(flips["step"])
+
+
 def test_a_box_that_does_not_move_is_recorded_nowhere(tmp_path):
     simulation = moving(Drifting)
     run(simulation, out=tmp_path / "run")
     folder = RunFolder.open(tmp_path / "run")
-    assert "volume" not in folder.read("series")
+    assert not {"volume", "by_box"} & {*folder.read("series"), *folder.read("flips")}
     (segment, *_) = Engine(simulation, 10).segments()
     assert segment.record.cell.nbytes == 0 and len(segment.start.cells) == 1
     assert segment.cell_of(0) is segment.cell_of(3)
