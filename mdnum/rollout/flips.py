@@ -78,7 +78,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
         rule: whether distances are compared, not their squares; and whether a margin of 0 is inside.
         boxes, narrow: `stacked` in float64, and in float32 where decisions are made in that.
-        back: deformations to the box of the row before, shape (rows, 3, 3); of no rows where it does not move.
+        back: deformations to the box of the row before, shape (rows, 3, 3); no rows where it does not move.
         first: step of the first row. factor: from velocities to those of the ledger.
 
     Returns:
