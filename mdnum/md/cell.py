@@ -287,7 +287,7 @@ def displacement(
 
 def transformed(x, by):
     """Components of positions, which as rows are multiplied by a deformation (inside jit)."""
-    # a product of matrices is one operation; written out, XLA fuses it with what makes its operands, three times
+    # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
 
@@ -298,9 +298,9 @@ def strain_loss(reference: Cell, now: Cell, r_list):
     at least sigma_min(F) * r_list. Added to twice the largest displacement relative to the box it must stay
     within the skin. On the host and inside jit.
 
-    The bound is of sigma_min(F) >= lambda_min(S), S the symmetric part of F, and lambda_min(S) >= t - sqrt(2/3)
-    |S - t| with t a third of its trace and the norm of Frobenius: exact where the box keeps its shape, at most
-    a sixth of a shear too small, and a step of the loop needs no decomposition.
+    Here sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, S the symmetric part of F, t a third of its
+    trace, and the norm is Frobenius's. That is exact where the box keeps its shape, and off by at most 0.41
+    |S - t| (and the square of a rotation) where it does not; no step of the loop needs a decomposition.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """

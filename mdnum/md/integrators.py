@@ -204,7 +204,7 @@ class Integrator(eqx.Module):
     def check(self, cell: Cell) -> None:
         """Refuse a box or a word that it cannot work with, with an `InputError`; called once, on the host."""
 
-    def freedom(self, masses: Masses) -> int:
+    def freedom(self, masses: Float[Any, "atoms"]) -> int:
         """Degrees of freedom: three for each atom, less three where the total momentum was set to zero."""
         return max(3 * masses.shape[0] - self.constraints, 1)
 

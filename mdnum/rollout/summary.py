@@ -136,6 +136,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "steps_asked": steps,
         "time": tally.step * timestep,
         "dynamics": simulation.integrator.name,
+        "degrees_of_freedom": degrees_of_freedom(simulation),
         "flips_entered": tally.entered,
         "flips_left": tally.left,
         **({} if tally.by_box is None else {"flips_by_box": tally.by_box}),
@@ -205,8 +206,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 def degrees_of_freedom(simulation: Simulation) -> int:
     """3 N, less the three of a center of mass that nothing moves."""
-    conserved = simulation.draw.remove_drift and simulation.integrator.keeps_momentum
-    return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
+    return simulation.integrator.freedom(simulation.masses)
 
 
 def series_columns(
@@ -253,8 +253,27 @@ def series_columns(
         "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
         "conserved": total - segment.rows_of("heat") - segment.rows_of("work"),
-        **({"volume": volume, "by_box": np.bincount(row[by_box], minlength=count)} if segment.cells else {}),
+        **(
+            {
+                "work": segment.rows_of("work"),
+                "volume": volume,
+                **_lattice(segment.rows_of("cell")),
+                "by_box": np.bincount(row[by_box], minlength=count),
+            }
+            if segment.cells
+            else {}
+        ),
     }
+
+
+def _lattice(vectors: Float[np.ndarray, "rows 3 3"]) -> dict[str, np.ndarray]:
+    """Lengths of lattice vectors, and the angles between them in degrees."""
+    lengths = np.linalg.norm(vectors, axis=2)
+    pairs = np.array([1, 2, 0]), np.array([2, 0, 1])
+    dots, products = (np.prod([one[:, k] for k in pairs], axis=0) for one in (vectors, lengths))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angles = np.degrees(np.arccos(np.clip(dots.sum(axis=2) / products, -1, 1)))
+    return dict(zip(("a", "b", "c", "alpha", "beta", "gamma"), (*lengths.T, *angles.T), strict=True))
 
 
 # --- the energy budget: what the ledger says the flips did, against what the energy did -----------------

@@ -434,8 +434,6 @@ def assembled(
         message = f"{origin.name} has a potential with a box of its own, and {integrator.name} moves the box"
         remedy = "Let it take box= (jax_md.space.periodic_general)"
         raise InputError(message, where="dynamics.kind", remedy=remedy)
-    at_rest = draw.remove_drift and integrator.keeps_momentum and len(masses) > 1
-    integrator = replace(integrator, constraints=3 * at_rest)
     velocities = draw.velocities(masses, units, None if draw.drawn else atoms.get_velocities())
     made = Simulation(
         origin, atoms, units, symbols, cell, positions, velocities, masses, species, model, decider, rule,

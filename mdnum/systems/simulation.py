@@ -104,6 +104,9 @@ class Simulation:
     fixed_point: FixedPointUnits | None = None
 
     def __post_init__(self):
+        at_rest = self.draw.remove_drift and self.integrator.keeps_momentum and self.atoms > 1
+        if self.integrator.constraints != 3 * at_rest:
+            object.__setattr__(self, "integrator", replace(self.integrator, constraints=3 * at_rest))
         short = self.policy.state == FIXED_POINT or self.policy.force not in WIDE
         if not self.pairwise and short:
             message = "many-body potentials are evaluated in float64 and float32 only"

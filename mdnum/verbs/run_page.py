@@ -228,12 +228,24 @@ def _what(run: RunView) -> list[tuple[str, str]]:
         **vars(units), **given, "about": system.get("about") or None, "steps": run.steps,
         "atoms": run.summary.get("atoms") or None, "span": float(time[-1] - time[0]),
         "mean": float(np.mean(run.series["temperature"])),
+        **_freedom(run),
         **{name: run.cutoff.get(name) for name in ("energy_jump", "force_jump")},
         **{key: function.get(key) for key in ("from", "to")},
         "breaks": sum(row.get("kinks", 1) for row in function.get("places", ())),
         "first": TEXTS(f"jumps_{run.cutoff['smoothness']}") if function else None,
         "dynamics": in_words(made, vars(units) | {"timestep": units.time}) if made else None,
     })  # fmt: skip
+
+
+def _freedom(run: RunView) -> dict[str, Any]:
+    """Degrees of freedom that a temperature is divided by, and why so many."""
+    freedom, atoms = run.summary.get("degrees_of_freedom"), run.summary.get("atoms") or 0
+    if freedom is None:
+        return {}
+    return {
+        "freedom": freedom,
+        "counted": TEXTS("freedom_all" if freedom == 3 * atoms else "freedom_at_rest"),
+    }
 
 
 def _energy(run: RunView) -> Iterator[Any]:

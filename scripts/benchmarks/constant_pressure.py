@@ -2,9 +2,9 @@
 
 Answer. Thermostats 1 %, barostats 4 to 15 % (docs/speed.md). It takes five minutes.
 
-The liquid of benchmark.py, float64, hard cutoff, on one core: every integrator makes as many steps as the others
-in turn, from the same start. Flips are noted and not decoded. Ratios are medians over the turns, of processor
-time.
+The liquid of benchmark.py, float64, hard cutoff, on one core: every integrator makes as many steps as the
+others in turn, from the same start. Flips are noted and not decoded. Ratios are medians over the turns, of
+processor time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
         atoms, made = liquid(size).atoms, {}
         steps = max(60, asked.steps // len(atoms))
         for name, (kind, numbers) in kinds.items():
-            pressure = {"pressure": 0.5} if "pressure_relaxation" in numbers else {}
+            pressure: dict[str, Any] = {"pressure": 0.5} if "pressure_relaxation" in numbers else {}
             made[name] = mdnum.simulation(
                 atoms, mdnum.LennardJones(1.0, 1.0), mdnum.Cut("hard", R_CUT), units="lj", skin=SKIN, seed=2,
                 timestep=TIMESTEP, temperature=TEMPERATURE, integrator=kind, dynamics=numbers, **pressure,

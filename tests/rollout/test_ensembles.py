@@ -5,14 +5,25 @@ from __future__ import annotations
 from typing import Any
 
 import ase.build
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.md.nose_hoover_chain import MTKNPT, IsotropicMTKNPT, NoseHooverChainNVT
 from ase.units import kB
+from rollout.harness import run
+from rollout.test_resume import assert_goes_on
+from scipy import stats
+from scipy.linalg import expm
 
 import mdnum
+from mdnum.errors import InputError
+from mdnum.md.barostats import exponential, growth
+from mdnum.md.thermostats import rescaled
+from mdnum.numerics import PrecisionPolicy
 from mdnum.references.calculator import MdnumCalculator
-from mdnum.rollout.engine import Engine, unwrapped
+from mdnum.rollout.engine import Engine, first_state, unwrapped
+from mdnum.store import RunFolder
 
 ARGON = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
 CUT = mdnum.Cut("quintic", 6.0)
@@ -45,7 +56,9 @@ def held(kind: str, atoms=None, timestep: float = 0.004, **options: Any) -> mdnu
     """The fluid under one of `KINDS`, from objects."""
     name, numbers = KINDS[kind]
     pressure = {"pressure": 0.01} if "pressure_relaxation" in numbers else {}
-    given = {"temperature": 90.0, "seed": 3, "skin": 0.6, "dynamics": numbers} | pressure | options
+    # a total momentum, as ASE counts degrees of freedom
+    given = {"temperature": 90.0, "seed": 3, "skin": 0.6, "dynamics": numbers, "remove_drift": False}
+    given |= pressure | options
     atoms = fluid() if atoms is None else atoms
     return mdnum.simulation(atoms, ARGON, CUT, timestep=timestep, integrator=name, **given)
 
@@ -57,7 +70,7 @@ def rows(simulation: mdnum.Simulation, steps: int) -> dict[str, np.ndarray]:
         for row in range(segment.rows):
             matrix = np.asarray(segment.cell_of(row).matrix)
             x = unwrapped(matrix, segment.unsorted("x", row), segment.unsorted("images", row))
-            values = {"x": x, "v": segment.unsorted("v", row), "box": matrix}
+            values: dict[str, Any] = {"x": x, "v": segment.unsorted("v", row), "box": matrix}
             for name in ("potential", "kinetic", "heat", "work", "virial"):
                 values[name] = float(segment.rows_of(name)[row])
             for name, value in values.items():
@@ -89,9 +102,8 @@ def by_ase(kind: str, simulation: mdnum.Simulation, atoms, steps: int):
 
 @pytest.mark.parametrize("kind", ["nose-hoover", "mtk", "mtk full"])
 def test_each_step_is_that_of_ase(kind):
-    """With a total momentum and 3 N degrees of freedom, as ASE counts them."""
     atoms = fluid(tilt=0.05 * (kind == "mtk full"))
-    simulation = held(kind, atoms, remove_drift=False)
+    simulation = held(kind, atoms)
     made = rows(simulation, 50)
     for step, (x, v, box, conserved) in enumerate(by_ase(kind, simulation, atoms, 50)):
         away = made["x"][step] - made["x"][0] @ np.linalg.solve(made["box"][0], made["box"][step])
@@ -103,3 +115,153 @@ def test_each_step_is_that_of_ase(kind):
         assert ours == pytest.approx(conserved - first, abs=1e-9), step
     if kind != "nose-hoover":
         assert np.abs(made["box"][-1] - made["box"][0]).max() > 0.01
+
+
+def some(*kinds: str):
+    """All of `KINDS`, those that are not named in nightly tests alone: each is a program to compile."""
+    return [pytest.param(one, marks=[pytest.mark.nightly] * (one not in kinds)) for one in KINDS]
+
+
+@pytest.mark.parametrize("kind", some("nose-hoover", "mtk full", "cell-rescaling full"))
+def test_what_it_conserves_is_of_second_order(kind):
+    """Once the crystal has melted; the total alone does what the bath makes it do."""
+    errors = []
+    for timestep in (0.004, 0.002):
+        numbers = KINDS[kind][1] | ({"compressibility": 0.1} if "rescaling" in kind else {})
+        made = rows(held(kind, timestep=timestep, dynamics=numbers), round(0.6 / timestep))
+        late = made["conserved"][len(made["x"]) // 2 :]
+        errors.append(np.std(late))
+        assert np.ptp(made["potential"] + made["kinetic"]) > 1000 * errors[-1]
+    # an Euler step of the box leaves a random part of first order, which is small while the box is slow
+    least, most = (1.5, 12) if "rescaling" in kind else (3.3, 5)
+    assert least < errors[0] / errors[1] < most
+
+
+def test_a_rescaled_kinetic_energy_has_its_exact_distribution():
+    """Of a step of any length: noncentral chi-square, as each degree of freedom is Ornstein-Uhlenbeck's."""
+    keys, kT = jax.random.split(jax.random.key(1), 4000), 0.7
+    many = jax.jit(jax.vmap(rescaled, (0, *[None] * 5)), static_argnums=2)
+    for kinetic, time, freedom in ((2.0, 0.1, 9), (9.0, 1.0, 9), (0.2, 0.5, 1)):
+        scale = many(keys, kinetic, freedom, kT, 0.8, time)
+        kept = np.exp(-time / 0.8)
+        unit = 0.5 * kT * (1 - kept)
+        law = stats.ncx2(freedom, kept * kinetic / unit)
+        assert stats.kstest(kinetic * np.asarray(scale) ** 2 / unit, law.cdf).pvalue > 0.01
+    assert (np.asarray(many(keys, 0.0, 9, kT, 0.8, 0.1)) == 1).all()
+
+
+@pytest.mark.parametrize("full", [pytest.param(False, marks=pytest.mark.nightly), True])
+def test_cell_rescaling_is_the_step_of_its_paper(full):
+    """From the boxes it has recorded: its noise, its positions and velocities, and its work by densities."""
+    simulation, steps = held("cell-rescaling full" if full else "cell-rescaling", timestep=0.005), 60
+    made, units = rows(simulation, steps), simulation.units
+    dt, kT = 0.005 * units.time_factor, kB * 90.0
+    rate = 2.0 * units.pressure_factor / (0.3 * units.time_factor)  # compressibility over relaxation
+    m, pressure = simulation.masses[:, None], 0.01 / units.pressure_factor
+    at = [simulation.evaluate(x, box) for x, box in zip(made["x"], made["box"], strict=True)]
+    heat = np.diff(made["heat"])
+    noise, scores = [], []
+
+    def pushed(step, v):
+        """Root of the volume, its force, and the traceless excess, of a step with velocities at its end."""
+        box = made["box"][step]
+        root = np.sqrt(abs(np.linalg.det(box)))
+        excess = (m * v).T @ v - root**2 * (at[step].stress + pressure * np.eye(3))
+        part = np.trace(excess) / 3
+        return root, 2 * part / root + kT / root, (excess - part * np.eye(3)) * full
+
+    def odds(root, force, excess, step, strain, middle):
+        """ln of the density of a move from one end."""
+        mean, spread = rate / 4 * force * dt, np.sqrt(rate / 2 * kT * dt)
+        own = rate / 3 / middle
+        z = [(step - mean) / spread]
+        if full:
+            away = (strain - own * excess * dt) / np.sqrt(2 * own * kT * dt)
+            z += [*(np.sqrt(2) * away[np.triu_indices(3, 1)]), *np.diag(away)]
+        return -0.5 * np.sum(np.square(z)), z
+
+    for step in range(steps):
+        box, after = made["box"][step], made["box"][step + 1]
+        by = np.linalg.solve(box, after)
+        v = made["v"][step] * np.sqrt(1 + heat[step] / made["kinetic"][step])
+        v = v + 0.5 * dt * at[step].forces / m
+        w = v @ np.linalg.inv(by)
+        x = (made["x"][step] + 0.5 * dt * v) @ by + 0.5 * dt * w
+        assert np.abs(x - made["x"][step + 1]).max() < 1e-9
+        assert np.abs(w + 0.5 * dt * at[step + 1].forces / m - made["v"][step + 1]).max() < 1e-11
+        assert np.abs(by - by.T).max() < 1e-12
+        (root, force, excess), (root2, force2, excess2) = pushed(step, v), pushed(step + 1, w)
+        w_, u = np.linalg.eigh(by)
+        strain = u @ np.diag(np.log(w_)) @ u.T
+        strain = strain - np.trace(strain) / 3 * np.eye(3)
+        forward, z = odds(root, force, excess, root2 - root, strain, root * root2)
+        back, _ = odds(root2, force2, excess2, root - root2, -strain, root * root2)
+        given = pressure * (root2**2 - root**2) - kT * np.log(root2 / root) + kT * (forward - back)
+        assert made["work"][step] - made["work"][step + 1] == pytest.approx(given, abs=1e-9)
+        noise.append(np.sum(np.square(z)))
+        scores += z
+    freedom = steps * (6 if full else 1)
+    assert 0.001 < stats.chi2(freedom).cdf(np.sum(noise)) < 0.999
+    assert abs(np.sum(scores)) < 4 * np.sqrt(len(scores))
+
+
+def test_the_exponential_of_a_rate():
+    random = np.random.default_rng(5)
+    for size in (0.0, 1e-9, 0.01, 0.4):
+        a = random.standard_normal((3, 3))
+        a = size * (a + a.T) / np.linalg.norm(a + a.T)
+        assert np.abs(exponential(jnp.asarray(a)) - expm(a)).max() < 4e-16
+        assert float(growth(jnp.float64(size))) == pytest.approx(
+            np.expm1(size) / size if size else 1.0, rel=3e-16
+        )
+
+
+def test_degrees_of_freedom_are_those_that_the_start_left(tmp_path):
+    """A momentum that was taken out takes three, of the temperature and of the bath alike."""
+    for remove_drift, freedom in ((True, 321), (False, 324)):
+        simulation = held("nose-hoover", remove_drift=remove_drift)
+        assert simulation.integrator.freedom(simulation.masses) == freedom
+    made = run(simulation, out=tmp_path / "run", steps=5).summary
+    assert made["degrees_of_freedom"] == freedom
+    series = RunFolder.open(tmp_path / "run").read("series")
+    assert series["temperature"] == pytest.approx(2 * series["kinetic"] / (freedom * kB), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_box_stays_along_its_axes_where_it_keeps_its_angles(kind):
+    simulation = held(kind)
+    cell = first_state(simulation).state.cells[-1]
+    assert cell.orthorhombic == ("full" not in kind)
+
+
+@pytest.mark.parametrize("kind", some("cell-rescaling full"))
+def test_a_run_that_was_stopped_goes_on_to_the_bit(kind, tmp_path, monkeypatch):
+    simulation = held(kind, steps=120, save_every=10)
+    whole = run(simulation, out=tmp_path / "whole"), RunFolder.open(tmp_path / "whole")
+    assert_goes_on(whole, simulation, simulation, "v" if kind == "csvr" else "extra", tmp_path, monkeypatch)
+
+
+NUMBERS: dict[str, Any] = {"relaxation": 0.1, "pressure_relaxation": 0.3}
+
+
+@pytest.mark.parametrize(
+    "given, word",
+    [
+        ({"pressure": None}, "pressure"),
+        ({"dynamics": {"relaxation": 0.1}}, "pressure_relaxation"),
+        ({"dynamics": NUMBERS | {"relaxation": -0.1}}, "dynamics.relaxation"),
+        ({"dynamics": NUMBERS | {"box": "half"}}, "dynamics.box"),
+        ({"dynamics": NUMBERS | {"chain": 0}}, "dynamics.chain"),
+        ({"temperature": 0.0}, "dynamics.temperature"),
+        ({"integrator": "mkt"}, "mtk"),
+        ({"integrator": "csvr", "dynamics": TAU}, "'pressure'"),
+        ({"pbc": (True, True, False)}, "mtk .*c is free"),
+        ({"precision": PrecisionPolicy(state="lattice")}, "none of mtk"),
+    ],
+)
+def test_what_a_barostat_cannot_have_is_refused_by_name(given, word):
+    atoms = fluid()
+    given = {"integrator": "mtk", "pressure": 0.01, "temperature": 90.0, "dynamics": NUMBERS} | given
+    atoms.pbc = given.pop("pbc", True)
+    with pytest.raises(InputError, match=word):
+        mdnum.simulation(atoms, ARGON, CUT, timestep=0.004, **given)
