@@ -17,7 +17,7 @@ box repeats; then every atom of the bin is compared with all of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,12 +72,19 @@ def lattice_of(box: Box) -> ReducedLattice:
     Raises:
         InputError: a direction repeats, but its vector is zero, not finite, or in the plane of the others.
     """
+    return _reduced(np.asarray(box.matrix, np.float64).tobytes(), np.asarray(box.pbc, bool).tobytes())
+
+
+# of most files and loops there are a few
+@lru_cache(maxsize=8)
+def _reduced(vectors: bytes, periodic: bytes) -> ReducedLattice:
     from ase.geometry import complete_cell
     from ase.geometry.minkowski_reduction import minkowski_reduce
 
-    pbc = np.asarray(box.pbc, bool)
-    matrix = np.where(pbc[:, None], np.asarray(box.matrix, np.float64), 0.0)
-    for axis in box.broken:
+    # copies: of what cannot be written, numba would compile every search a second time
+    matrix, pbc = np.frombuffer(vectors).reshape(3, 3).copy(), np.frombuffer(periodic, bool).copy()
+    broken, matrix = Box(matrix, pbc).broken, np.where(pbc[:, None], matrix, 0.0)
+    for axis in broken:
         message = f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}"
         remedy = "Give the frame a box, or say that this direction does not repeat"
         raise InputError(message, remedy=remedy, where="box")

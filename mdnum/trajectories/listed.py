@@ -8,17 +8,17 @@ bound of the cutoff are a matter of rounding and are not counted.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
+from mdnum.compiled import njit
 from mdnum.errors import InputError
 from mdnum.md.ledger import Members
 from mdnum.trajectories.arrays import host
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.images import image_shifts, pair_keys
+from mdnum.trajectories.images import cell_of, image_shifts
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.rules import Rule
 from mdnum.trajectories.search import image_distances
@@ -26,43 +26,153 @@ from mdnum.trajectories.tracker import Tracker
 
 # share of pairs that a list has from both atoms, from which on it is a full one that lacks some
 _FULL = 0.1
-# entries that are looked up for that
-_SOME = 10_000
+# atoms whose entries are looked up for that
+_SOME = 16
+# shifts that are told apart along each vector
+_APART = 256
 _KNOWN = (
     "Give jax-md's NeighborList, (i, j) or (i, j, S) as ASE, matscipy and vesin have them, or an array "
     "(2, pairs) or (atoms, neighbors) padded with the number of atoms"
 )
 
 
-@dataclass(frozen=True)
-class GivenList:
-    """A neighbor list as a program has it."""
+@njit
+def _same(given, known):
+    """Whether two arrays hold the same numbers."""
+    for begin in range(0, len(known), 8192):
+        some, others, differ = given[begin : begin + 8192], known[begin : begin + 8192], 0
+        for k in range(len(some)):
+            differ += some[k] != others[k]
+        if differ:
+            return False
+    return True
 
-    entries: int
-    keys: Int[np.ndarray, "entries"]  # ascending
+
+class GivenList(NamedTuple):
+    """A neighbor list as a program has it, without padding: its entries by their first atom."""
+
     shifted: bool  # whether it says which image each neighbor is; else the nearest alone
-    full: bool  # whether it has each pair from both of its atoms
-    atoms: int
+    full: bool  # whether it has each pair from both of its atoms; else from the lower one here
+    first: Int[np.ndarray, "ends"]  # where the entries of each atom begin, and after the last
+    i: Int[np.ndarray, "entries"]
+    j: Int[np.ndarray, "entries"]
+    image: Int[np.ndarray, "shifted"]  # by `_image`: x[j] + shift @ box is meant
 
     @classmethod
     def of(cls, parts: list[np.ndarray], atoms: int) -> GivenList:
-        """A list of the arrays that `arrays_of` gives, whose padding is left out."""
-        i, j, *shifts = parts
-        shift = shifts[0] if shifts else np.zeros((len(i), 0), int)
-        there = (i >= 0) & (i < atoms) & (j >= 0) & (j < atoms) & ((i != j) | shift.any(axis=1))
-        i, j, shift = i[there].astype(np.int64), j[there].astype(np.int64), shift[there].astype(np.int64)
-        keys, some = np.sort(pair_keys(i, j, shift, atoms)), slice(None, None, len(i) // _SOME + 1)
-        back = _among(pair_keys(j[some], i[some], -shift[some], atoms), keys)
-        return cls(len(i), keys, bool(shifts), bool(back.sum() > _FULL * len(back)), atoms)
+        """A list of the arrays that `arrays_of` gives, in int32."""
+        i, j, shift = parts if len(parts) == 3 else (*parts, np.zeros((0, 3), np.int32))
+        found = cls(len(parts) == 3, True, *_by_atom(i, j, shift, atoms, False))
+        # as far as some of the atoms show
+        rows = np.flatnonzero(np.diff(found.first))
+        ends = (found.first[rows[:: len(rows) // _SOME + 1] + k].tolist() for k in (0, 1))
+        some = np.concatenate([np.arange(0), *map(np.arange, *ends)])
+        turned = _turned(found.image[some] if found.shifted else found.image)
+        back = found.has(found.j[some], found.i[some], turned)
+        if back.sum() > _FULL * len(back):
+            return found
+        return cls(found.shifted, False, *_by_atom(i, j, shift, atoms, True))
+
+    def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
+        """Whether it has each of other entries; fastest in the order of i."""
+        return _has(self.first, self.j, self.image, i, j, image)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
         """From how many of its atoms each pair is missing: 0, 1, and 2 in a list that is full."""
-        shift = image_shifts(frame, pairs) if self.shifted else np.zeros((len(pairs), 0), int)
-        there = _among(pair_keys(pairs.i, pairs.j, shift, self.atoms), self.keys)
-        back = _among(pair_keys(pairs.j, pairs.i, -shift, self.atoms), self.keys)
-        if not self.shifted:
-            there, back = there & (pairs.rank == 0), back & (pairs.rank == 0)
-        return 2 - there.astype(int) - back if self.full else 1 - (there | back).astype(int)
+        i, j, image, near = pairs.i, pairs.j, np.zeros(0, np.int32), pairs.rank == 0
+        if self.shifted:
+            image, near = _image(*image_shifts(frame, pairs).T), np.True_
+        if not self.full:
+            return 1 - (near & self.has(i, j, image))
+        i, j, image = np.append(i, j), np.append(j, i), np.append(image, _turned(image))
+        found, order = np.empty(len(i), bool), np.argsort(i)
+        found[order] = self.has(i[order], j[order], image[order] if self.shifted else image)
+        return 2 - (near & found.reshape(2, -1)).sum(axis=0)
+
+
+@njit
+def _image(s0, s1, s2):
+    """A number for a shift."""
+    return (s0 % _APART * _APART + s1 % _APART) * _APART + s2 % _APART
+
+
+def _shift(image: np.ndarray) -> Int[np.ndarray, "images 3"]:
+    """The shift of a number."""
+    return np.stack([image >> 16, image >> 8, image], axis=-1).astype(np.int8).astype(np.int32)
+
+
+def _turned(image: np.ndarray) -> Int[np.ndarray, "images"]:
+    """The numbers of the opposite shifts."""
+    return _image(*-_shift(image).T)
+
+
+@njit
+def _by_atom(i, j, shift, atoms, lower):
+    """Columns of a `GivenList`; no shifts are those of the nearest images."""
+    first, image, ordered, shifted = (
+        np.zeros(atoms + 2, np.int64),
+        np.empty(len(shift), np.int32),
+        0,
+        len(shift),
+    )
+    for k in range(len(i)):
+        a, b = i[k], j[k]
+        ordered += (a >= 0) & (a < atoms) & (b >= 0) & (b < atoms) & (a < b if lower else a != b)
+    for k in range(1, len(i)):
+        ordered -= i[k] < i[k - 1]
+    for k in range(shifted):
+        s0, s1, s2 = shift[k, 0], shift[k, 1], shift[k, 2]
+        # of an atom and an image of itself, the first component that is not 0 is positive
+        back = s0 < 0 or (s0 == 0 and (s1 < 0 or (s1 == 0 and s2 < 0)))
+        back = lower and (i[k] > j[k] or (i[k] == j[k] and back))
+        image[k] = _image(-s0, -s1, -s2) if back else _image(s0, s1, s2)
+    if ordered == len(i):
+        for k in range(len(i)):
+            first[i[k] + 1] = k + 1
+        for a in range(atoms):
+            first[a + 1] = max(first[a + 1], first[a])
+        return first[:-1], i, j, image
+    taken = np.empty(len(i), np.bool_)
+    for k in range(len(i)):
+        a, b = i[k], j[k]
+        taken[k] = 0 <= a < atoms and 0 <= b < atoms and (a != b or (shifted and image[k] != 0))
+        if taken[k]:
+            first[2 + (min(a, b) if lower else a)] += 1
+    for a in range(atoms):
+        first[a + 2] += first[a + 1]
+    columns = np.empty((3, first[-1]), np.int32)
+    for k in range(len(i)):
+        if taken[k]:
+            a, b = (min(i[k], j[k]), max(i[k], j[k])) if lower else (i[k], j[k])
+            at = first[a + 1]
+            first[a + 1] += 1
+            columns[0, at], columns[1, at], columns[2, at] = a, b, image[k] if shifted else 0
+    return first[:-1], columns[0], columns[1], columns[2] if shifted else image
+
+
+@njit
+def _has(first, other, images, i, j, image):
+    found = np.zeros(len(i), np.bool_)
+    # whose entry another atom was last met in; the last such entry, and the one before each
+    of, row, begin, shifted = np.full(len(first), -1, np.int32), -1, 0, len(images) > 0
+    last, before = np.empty(len(first), np.int32), np.empty(np.diff(first).max(), np.int32)
+    for k in range(len(i)):
+        if i[k] != row:
+            row = i[k]
+            begin = first[row]
+            for m in range(first[row + 1] - begin):
+                b = other[begin + m]
+                if shifted:
+                    before[m] = last[b] if of[b] == row else -1
+                    last[b] = m
+                of[b] = row
+        found[k] = of[j[k]] == row
+        if shifted and found[k]:
+            m = last[j[k]]
+            while m >= 0 and images[begin + m] != image[k]:
+                m = before[m]
+            found[k] = m >= 0
+    return found
 
 
 def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
@@ -82,12 +192,6 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
         shapes = ", ".join(str(one.shape) for one in parts[:4])
         raise InputError(f"neighbors of shape {shapes}, of {atoms} atoms", remedy=_KNOWN, where="neighbors")
     return parts
-
-
-def _among(values: np.ndarray, ordered: np.ndarray) -> Bool[np.ndarray, "values"]:
-    """Which values are among others in ascending order."""
-    at = np.minimum(np.searchsorted(ordered, values), len(ordered) - 1)
-    return ordered[at] == values if len(ordered) else np.zeros(len(values), bool)
 
 
 class ListCheck:
@@ -111,11 +215,14 @@ class ListCheck:
                 raise InputError(message, remedy="Give r_cut first", where="neighbors")
             self._kinds, self._radii = self._rule.table(species)
         parts = arrays_of(neighbors, len(self._kinds))
-        same = len(parts) == len(self._parts) and all(map(np.array_equal, parts, self._parts))
-        if self._newest is None or not same:
+        known = zip(parts, self._parts, strict=False)
+        if len(parts) != len(self._parts) or not all(
+            one.shape == other.shape and _same(one.ravel(), other.ravel()) for one, other in known
+        ):
             # copies: programs write into their arrays again
-            self._parts = [np.array(one) for one in parts]
+            self._parts = [np.array(one, np.int32) for one in parts]
             self._newest = GivenList.of(self._parts, len(self._kinds))
+        assert self._newest is not None
         return self._newest
 
     def step(
@@ -128,20 +235,26 @@ class ListCheck:
             tracker, flips: of the rule, after this frame; flips by columns.
             now: the list in use.
         """
-        new, lattice = now is not self._list, lattice_of(frame.box)
-        narrow = lattice.narrowest < 2 * float(self._radii.max())
-        # shifts belong to the cells that atoms were in
-        x, before = frame.positions, self._before
-        jumped = before is not None and np.abs(x - before.positions).max() > lattice.narrowest / 4
+        new, earlier, before = now is not self._list, self._list, self._before
+        x, lattice, reach = frame.positions, lattice_of(frame.box), self._rule.reach
+        placed = Placed(x, lattice, lattice.rounding(frame.furthest, reach))
         self._list, self._before = now, frame
-        if new or narrow or (jumped and now.shifted):
+        every = before is None or lattice.narrowest < 2 * reach
+        if not every and new:
+            every = self._drops(earlier, now, frame, before, placed)
+        elif not every and now.shifted:
+            # shifts belong to the cells that atoms were in
+            every = np.abs(x - before.positions).max() > lattice.narrowest / 4
+        if every:
             pairs = tracker.members()
         else:
-            rows = zip(*(flips[name].tolist() for name in ("i", "j", "rank", "entered")), strict=True)
-            changed = {(i, j, rank): on for i, j, rank, on in rows}
-            keys = [key for key in {**self._open, **changed} if changed.get(key, True)]
-            i, j, rank = np.array(keys, np.int64).reshape(-1, 3).T
-            pairs = Members(i, j, rank, image_distances(Placed(x, lattice, 0.0), i, j, rank))
+            columns, entered = [flips[name] for name in ("i", "j", "rank")], flips["entered"]
+            ids = np.array([column[entered] for column in columns], np.int64)
+            if self._open:
+                left = set(zip(*(column[~entered].tolist() for column in columns), strict=True))
+                still = [key for key in self._open if key not in left]
+                ids = np.concatenate([ids, np.array(still, np.int64).reshape(-1, 3).T], axis=1)
+            pairs = Members(*ids, image_distances(placed, *ids))
         missing = now.missing(frame, pairs)
         pairs, missing = pairs[missing > 0], missing[missing > 0]
         margins = self._radii[self._kinds[pairs.i], self._kinds[pairs.j]] - pairs.distance
@@ -152,8 +265,31 @@ class ListCheck:
             self._open[i, j, rank] = lacks, begin, number, max(margin, deepest)
         certain = margins[margins > tracker.bound]
         deepest, gone = certain.max(initial=0.0), known.keys() - self._open.keys()
-        row = {"listed": now.entries, "new_list": new, "lost": len(certain), "deepest": deepest}
+        row = {"listed": len(now.j), "new_list": new, "lost": len(certain), "deepest": deepest}
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
+
+    def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
+        """Whether a list may lack pairs inside that the one before it had."""
+        i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
+        x, (matrix, inverse) = placed.positions, cell_of(frame)
+        if (earlier.shifted, earlier.full) != (now.shifted, now.full):
+            return True
+        if now.shifted:
+            moved = (x - before.positions) @ inverse * frame.box.pbc
+            whole = np.rint(moved).astype(int)
+            # as long as that tells which image a pair inside goes on as
+            if np.abs(moved - whole).max() + reach / placed.lattice.narrowest >= 0.5:
+                return True
+            there = whole.any(axis=1)
+            some, image = np.flatnonzero(there[i] | there[j]), image.copy()
+            image[some] = _image(*(_shift(image[some]) + whole[i[some]] - whole[j[some]]).T)
+        gone = np.flatnonzero(~now.has(i, j, image))
+        i, j = i[gone], j[gone]
+        if now.shifted:
+            distance = np.linalg.norm(x[j] - x[i] + _shift(image[gone]) @ matrix, axis=1)
+        else:
+            distance = image_distances(placed, i, j, np.zeros_like(i))
+        return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
         """Rows of pairs that were missing up to a frame; of those that still are, where none are named."""

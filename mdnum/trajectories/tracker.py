@@ -12,12 +12,11 @@ from mdnum.bits import digit_order
 from mdnum.errors import InputError
 from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import FrameError
-from mdnum.trajectories.frame import AtomIndices, Box, Frame, furthest
+from mdnum.trajectories.frame import AtomIndices, Frame, furthest
 from mdnum.trajectories.lattice import (
     INSIDE,
     Participants,
     Placed,
-    ReducedLattice,
     binned,
     lattice_of,
     own_images,
@@ -108,7 +107,6 @@ class Tracker:
         # room for sorting, kept: pages that are new to a process can cost more than what is done in them
         self._keys = np.empty((4, 0), np.int64)
         self._who: Participants
-        self._box = b""
         self._last: Moment | None = None
         self.frames = self.pairs = self.near = 0
         self.min_margin = np.inf
@@ -195,7 +193,7 @@ class Tracker:
             message = f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}"
             remedy = "Stop before this frame (a slice of the file), and find out why the run broke"
             raise InputError(message, remedy=remedy)
-        lattice, radius = self._lattice_of(frame.box), self._who.radius
+        lattice, radius = lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
             message = (
@@ -204,13 +202,6 @@ class Tracker:
             raise InputError(message, remedy="Check the unit, and that the file's coordinates are not broken")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
-
-    def _lattice_of(self, box: Box) -> ReducedLattice:
-        # copies: readers reuse their arrays
-        copied = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
-        if (known := copied.matrix.tobytes() + copied.pbc.tobytes()) != self._box:
-            self._box, self._lattice = known, lattice_of(copied)
-        return self._lattice
 
     def _decided(self, now: Moment) -> Moment:
         """The same with its neighbors searched for, and their numbers noted."""

@@ -377,6 +377,38 @@ def test_images_that_a_list_lacks_and_stale_shifts_are_found(tmp_path):
     assert 0 < lost[3] <= own
 
 
+@pytest.mark.parametrize("kind", ["full", "half", "shifted", "half shifted"])
+def test_lists_that_are_made_again_lose_what_brute_force_finds(tmp_path, kind):
+    """Atoms are wrapped, entries come in any order and from either side, and some are left out."""
+    rng, cell = np.random.default_rng(11), np.diag([6.0] * 3)
+    frames = gas(8, 25) % 6.0
+    full, shifted, lost, half, known = "half" not in kind, "shifted" in kind, [], [], {}
+    with mdnum.Recorder(2.5, cell=cell, out=tmp_path / "r", report=False) as one:
+        for step, x in enumerate(frames):
+            if step % 3 == 0:
+                i, j, s = listed(x, cell, 2.9)
+                keep = rng.permutation(len(i))[(0 if step % 2 else 4) :]
+                if not full:
+                    # of each pair the entry that comes first
+                    ends = {(*sorted((i[k], j[k])), *abs(s[k])): k for k in keep[::-1].tolist()}
+                    keep = rng.permutation(list(ends.values())[2:])
+                i, j, s = i[keep], j[keep], s[keep]
+                known = set(zip(i.tolist(), j.tolist(), *(s.T.tolist() if shifted else ()), strict=True))
+            one.see(step, x, neighbors=(i, j, s) if shifted else (i, j))
+            keys = [(a, b, *shift) if shifted else (a, b) for a, b, *shift in images(x, cell, 2.5)]
+            sides = [
+                (key in known) + ((b, a, *(-n for n in rest)) in known)
+                for key in keys
+                for a, b, *rest in [key]
+            ]
+            lost.append(sum(n < 1 + full for n in sides))
+            half.append(full * sum(n == 1 for n in sides))
+    loop, rows = (one.outcome.table(name).to_pydict() for name in ("loop", "lost"))
+    assert loop["lost"] == lost and min(lost) == 0 < max(lost)
+    ends = zip(rows["begin"], rows["end"], rows["missing"], strict=True)
+    assert sum(end - begin for begin, end, missing in ends) == sum(lost)
+
+
 class Dense:
     """What jax-md's dense list has."""
 
