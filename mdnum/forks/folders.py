@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +35,11 @@ Difference = tuple[str, Any, Any]
 _ELSEWHERE = {
     "md": ("about", "name", "record.save_every", "dynamics.steps", "fork", "gradient", "variants"),
     "ball": ("about", "name", "loss", "fork", "gradient", "variants"),
+    "flips": (),
 }
-_SYSTEM = {"md": ("units", "potential.kind"), "ball": ("contact.kind", "integrator.kind")}
+_SYSTEM = {"md": ("units", "potential.kind"), "ball": ("contact.kind", "integrator.kind"), "flips": ()}
+#: What is said of positions that a loop or a file gave, and may differ.
+_GIVEN = ("format", "length", "time", "slice")
 #: Stored at every step; that one of them differs in a bit means that the state does.
 _NUMBERS = ("potential", "kinetic", "displacement", "min_margin")
 #: Of the provenance, what bits depend on; its fingerprint is a hash of these and of the dtypes.
@@ -91,7 +94,8 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     """Where two finished runs diverge.
 
     Args:
-        a, b: run folders of one world, finished or not.
+        a, b: run folders of one world, finished or not; or folders of `mdnum flips` and `mdnum.Recorder`,
+            whose steps are frames.
 
     Raises:
         InputError: the runs are of different worlds or systems, so that no step of theirs corresponds; names
@@ -106,24 +110,15 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
             raise InputError(
                 "this is a fork folder, the answer of `mdnum fork`, and no run",
                 where=str(folder.path),
-                remedy="Give two folders of `mdnum run` or of `mdnum ball`; `mdnum report DIR` shows a fork",
+                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; see a fork by "
+                "`mdnum report DIR`",
             )
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
-        raise InputError("one of these is no run of a ball", where=where, remedy="Compare runs of one world")
+        kinds = f"these are folders of {first.kind} and {second.kind}"
+        raise InputError(kinds, where=where, remedy="Compare runs of one world")
     with first.explained(), second.explained():
         return _compared(first, second, where)
-
-
-def compare_recordings(a: Path, b: Path) -> FolderFork:
-    """Where the decisions of two recorded loops diverge, by their folders; steps are frames."""
-    one, two = RunFolder.open(a), RunFolder.open(b)
-    steps = min(one.rows("frames"), two.rows("frames")) - 1
-    names = ("rule", "i", "j", "rank")
-    same = all(np.array_equal(one.read("members")[name], two.read("members")[name]) for name in names)
-    fork, flips = _alone(one, two, "flips", names[1:], steps, "frame") if same else (0, [])
-    channel, nearest = "" if fork is None else "pair", sorted(flips, key=lambda flip: abs(flip.margin))
-    return FolderFork("flips", a, b, (), (), steps, None, fork, channel, same, decisions=tuple(nearest))
 
 
 def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bool = True) -> Any:
@@ -165,7 +160,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     elsewhere = _ELSEWHERE[world]
     keys = _different(flat(first.system), flat(second.system))
     programs = [row for row in keys if row[0] not in elsewhere and row[0].split(".")[0] not in elsewhere]
-    noun = "atoms" if world == "md" else "balls"
+    noun = "balls" if world == "ball" else "atoms"
     counts = [folder.summary.get(noun) for folder in (first, second)]
     # a run that was killed has no summary; its structure is compared with the other's
     if None not in counts and counts[0] != counts[1]:
@@ -177,6 +172,8 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
                 where=where,
                 remedy=f"{remedy}, which differ in numbers or in choices of the program",
             )
+    if world == "flips":
+        return _of_frames(first, second, where)
     starts = _starts(first, second, programs, where) if world == "md" else []
     found = (_md_dates if world == "md" else _ball_dates)(first, second)
     tables = (
@@ -191,6 +188,33 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
         world=world, a=first.path, b=second.path, differences=(*programs, *starts, *arithmetic),
         causes=(*choices(programs), *["start"] * bool(starts), *["arithmetic"] * bool(arithmetic)),
         same_structure=not starts, decisions=tuple(flips), **{**found, "first_bit": first_bit},
+    )  # fmt: skip
+
+
+def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
+    """Where decisions on the positions of two loops or files diverge."""
+    summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
+    rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
+    names_of = [", ".join(one["rule"] for one in each) for each in rules]
+    if names_of[0] != names_of[1] or between[0] != between[1]:
+        seen = " and ".join(f"{one} {two or ''}".rstrip() for one, two in zip(names_of, between, strict=True))
+        raise InputError(f"pairs are examined by {seen}", where=where, remedy="Compare those of one rule")
+    differences = [(name, *(each[name] for each in summaries)) for name in _GIVEN]
+    frames = [folder.read("frames", ["rule", "number"]) for folder in (first, second)]
+    numbers = [each["number"][each["rule"] == 0] for each in frames]
+    steps = min(map(len, numbers)) - 1
+    if (other := np.flatnonzero(numbers[0][: steps + 1] != numbers[1][: steps + 1])).size:
+        differences.append(("number of the frame", *(int(each[other[0]]) for each in numbers)))
+    members = [folder.read("members", list(names)) for folder in (first, second)]
+    same = all(np.array_equal(*(each[name] for each in members)) for name in names)
+    labels = (*names[1:], "rule")
+    fork, flips = _alone(first, second, "flips", labels, steps, "frame") if same else (0, [])
+    terms = [one["rule"] * (len(summaries[0]["rules"]) > 1) for one in summaries[0]["rules"]]
+    flips = [replace(one, subject=one.subject[:-1], terms=terms[one.subject[-1]]) for one in flips]
+    return FolderFork(
+        "flips", first.path, second.path, tuple(row for row in differences if row[1] != row[2]), (), steps,
+        None, fork, "" if fork is None else "pair", same,
+        decisions=tuple(sorted(flips, key=lambda flip: abs(flip.margin))),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count
+from mdnum.store import RunFolder
 from mdnum.verbs import Reply, frame
 from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
@@ -177,7 +178,7 @@ def fork_folders(
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
 
     Args:
-        a, b: run folders.
+        a, b: run folders; or two of `mdnum.Recorder` or `mdnum flips`, whose steps are frames.
         replay: follow both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
             summary then says whether the replay diverges where the stored tables do: it has their bits where
             versions and processor are the same. Else nothing is run: dates are those of the stored tables.
@@ -198,18 +199,20 @@ def fork_folders(
     keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
     frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
-    system: Any = simulation_in(found.a, objects, built=replay)
+    frames = found.world == "flips"
+    system: Any = None if frames else simulation_in(found.a, objects, built=replay)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
-        with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:
-            answer.result, answer.summary = found, basics(system, found.steps) | plain(found)
+        known = RunFolder.open(found.a).summary if frames else {"system": system.name}
+        with frame.answering("compare", f"fork-{known['system']}", system, **keep) as answer:
+            told = dict.fromkeys(("status", "timestep"), None) if frames else basics(system, found.steps)
+            told |= {name: known[name] for name in ("system", "atoms", "time") if frames}
+            answer.result, answer.summary = found, told | plain(found)
         return answer.outcome
     if found.world != "md":
-        raise InputError(
-            "runs of a ball are not followed again",
-            where=str(found.a),
-            remedy="Vary the choice in which they differ: mdnum fork SYSTEM --vary CHOICE",
-        )
+        remedy = "Vary the choice in which they differ: mdnum fork SYSTEM --vary CHOICE"
+        message, remedy = ("frames", "Leave out replay") if frames else ("runs of a ball", remedy)
+        raise InputError(f"{message} are not followed again", where=str(found.a), remedy=remedy)
     question = PairQuestion(**asked)
     check(question)
     last = min(found.steps, question.steps or found.steps)
@@ -278,7 +281,8 @@ def listed() -> Reply:
 def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: list[Section]) -> Page:
     rows, kind = [*size(view), view.took], view.folder.kind
     sections = [*sections, Section("What was run", [pairs(rows)])]
-    keyed = TEXTS.keys(f"keys_{kind}", **{**view.summary, **keys})
+    of = "_frames" * (view.summary.get("world") == "flips")
+    keyed = TEXTS.keys(f"keys_{kind}{of}", **{**view.summary, **keys})
     return view.page(f"{view.name}: {what}", about, keyed, sections)
 
 
@@ -336,7 +340,8 @@ def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
 def page_compare(view: View, verdict: Verdict) -> Page:
     """The page of two finished runs."""
     s = view.summary
-    different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
+    same = [TEXTS("folders_0_causes")] * (s["world"] != "flips")
+    different = [differences(s["differences"])] if s["differences"] else same
     decisions = table_of(s["decisions"], {
         "only in": "run", s["channel"] if s["channel"] == "pair" else "ball":
 of_pair,
@@ -344,7 +349,7 @@ of_pair,
     })  # fmt: skip
     iterations = Table(("in A", "in B"), [s["iterations"]])
     return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", {}, [
-        Section("What was different", [different], terminal=True),
+        Section("What was different", different, terminal=True),
         Section("Decisions at the fork", [decisions] * bool(s["decisions"]), terminal=True),
         Section("Iterations at the fork", [iterations] * bool(s["iterations"]), terminal=True),
     ])  # fmt: skip

@@ -391,6 +391,8 @@ def size(view: View) -> list[tuple[str, str]]:
     s = view.summary
     rows = [("System", str(s["about"]))] if s.get("about") else []
     parts = many(s["balls"], "ball") if "balls" in s else many(s["atoms"], "atom")
+    if s["timestep"] is None:
+        return [*rows, ("Size", f"{parts}, {many(s['steps'] + 1, 'frame')}")]
     asked = s.get("steps_asked")
     more = f" ({count(asked)} asked for)" if asked and asked > s["steps"] else ""
     text = f"{parts}, {many(s['steps'], 'step')} of {plain(s['timestep'])} {view.units.time}{more}"

@@ -186,15 +186,21 @@ def judge_compare(view: View) -> Verdict:
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
     kind = "same" if summary["fork"] is None and summary["first_bit"] is None else "bits"
-    headline = TEXTS(f"folders_{'fork' if summary['fork'] is not None else kind}", **values)
-    evidence = [TEXTS(f"folders_{min(len(causes), 2)}_causes", n=len(causes), names=", ".join(causes[:6]))]
-    if "start" in causes:
-        evidence.append(TEXTS("folders_start"))
+    of = "_frames" * (summary["world"] == "flips")
+    headline = TEXTS(f"folders_{'fork' if summary['fork'] is not None else kind}{of}", **values)
+    if of:
+        names = [name for name, *_ in summary["differences"]]
+        evidence = [TEXTS("folders_given", names=", ".join(names))] * bool(names)
+        evidence += [TEXTS("folders_start_frames")] * (not summary["same_structure"])
+    else:
+        names = ", ".join(causes[:6])
+        evidence = [TEXTS(f"folders_{min(len(causes), 2)}_causes", n=len(causes), names=names)]
+        evidence += [TEXTS("folders_start")] * ("start" in causes)
     if summary["decisions"]:
         flip = summary["decisions"][0]
         which = of_pair(flip)
         yes = "entered" if flip["entered"] else "left"
-        evidence.append(TEXTS(f"folders_{summary['channel']}_{yes}", **values, which=which, **flip))
+        evidence.append(TEXTS(f"folders_{summary['channel']}_{yes}{of}", **values, which=which, **flip))
     elif summary["iterations"]:
         a, b = summary["iterations"]
         evidence.append(TEXTS("folders_stop", **values, a=a, b=b))

@@ -227,9 +227,9 @@ class Recorder:
 
     def compare(self, other: Recorder) -> FolderFork:
         """Where the decisions of two loops of one rule diverge; closes both."""
-        from mdnum.forks.folders import compare_recordings
+        from mdnum.forks.folders import compare_folders
 
-        return compare_recordings(self.outcome.path, other.outcome.path)
+        return compare_folders(self.outcome.path, other.outcome.path)
 
     def _advance(self) -> None:
         """Examines the frames that wait."""

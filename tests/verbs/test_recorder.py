@@ -592,6 +592,33 @@ def test_two_loops_are_compared_by_their_decisions(tmp_path):
     assert made[0].compare(made[0]).fork is None and made[0].compare(made[2]).fork is None
 
 
+@pytest.mark.parametrize("same", [True, False])
+def test_folders_of_loops_and_of_arrays_are_compared(tmp_path, same):
+    frames, cell = gas(), np.diag([6.0] * 3)
+    other = frames.copy()
+    other[12:, 7] += 0.0 if same else 0.4
+    loop = recorded(tmp_path / "a", frames, pairs={"X-X": 2.0}, cell=6.0, species=["X"] * 24)
+    array = mdnum.flips(other, cell=6.0, cutoffs=2.5, pairs={"X-X": 2.0}, out=tmp_path / "b", report=False)
+    one = mdnum.fork_folders(tmp_path / "a", tmp_path / "b", out=tmp_path / "c")
+    found = {
+        r: [[set(images(x[k], cell, r)) for k in range(24)] for x in (frames, other)] for r in (2.5, 2.0)
+    }
+    fork = next((k for k in range(24) if any(a[k] != b[k] for a, b in found.values())), None)
+    assert one.result.fork == one.summary["fork"] == fork == (None if same else 12)
+    assert one.result.steps == 23 and one.summary["atoms"] == 24
+    assert [row[0] for row in one.result.differences] == ["time"]
+    alone = {key[:2] for a, b in found.values() for key in (a[12] ^ b[12])}
+    assert {each.subject[:2] for each in one.result.decisions} == alone and bool(alone) != same
+    again = mdnum.read(one.path)
+    assert again.verdict.tone == ("good" if same else "info") and (one.path / "report.html").exists()
+    for options, word in (({"replay": True}, "replay"), ({"steps": 3}, "replay")):
+        with pytest.raises(InputError, match=word):
+            mdnum.fork_folders(loop.path, array.path, **options)
+    less = recorded(tmp_path / "d", frames, cell=6.0)
+    with pytest.raises(InputError, match="rule"):
+        mdnum.fork_folders(loop.path, less.path)
+
+
 # ---- loops that end early
 
 KILLED = """
