@@ -52,7 +52,7 @@ class ArrayFrames(Trajectory):
         species, cell, box, pbc, fractional, timestep, length, time: as of `mdnum.Recorder`.
     """
 
-    reader, remembered = "mdnum", 10_000  # a loop may have any number of frames
+    reader, in_memory, remembered = "mdnum", True, 10_000  # a loop may have any number of frames
     reach = 0.0  # of the rules, length, where it is known
 
     def __init__(
@@ -142,16 +142,19 @@ class ArrayFrames(Trajectory):
             self.notes = (_BARE,)
 
     @classmethod
-    def of(cls, frames: Any, cell: Any = None) -> ArrayFrames:
-        """Frames that are all there: an array, or ASE's Atoms in a list."""
-        found = cls("array")
-        found.time = "frame"
-        for k, (x, given) in enumerate(one_by_one(frames, {"cell": cell})):
+    def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
+        """Frames that are all there: an array, or ASE's Atoms in a list; reach as of the class."""
+        given = {name: options.pop(name) for name in ("cell", "box") if name in options}
+        found, given["velocities"] = cls("array", **options), velocities
+        found.reach = reach
+        for k, (x, here) in enumerate(one_by_one(frames, given)):
             if hasattr(x, "get_positions"):
-                found.named, given = x.get_chemical_symbols(), {"cell": x.cell.array, "pbc": x.pbc}
-            found.put(found.read(k, getattr(x, "positions", x), **given))
+                found.named = x.get_chemical_symbols() if found.named is None else found.named
+                here = {"cell": x.cell.array, "pbc": x.pbc, **here}
+            found.put(found.read(k, getattr(x, "positions", x), **here))
         if not found._first:
             raise InputError("no frame in the array", remedy="Give (frames, atoms, 3)", where="positions")
+        found.time = "frame" if found.time == "step" else found.time
         return found
 
     @property

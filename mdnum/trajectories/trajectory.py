@@ -40,6 +40,7 @@ class Trajectory(ABC):
     """
 
     format: str  # the file's format in the reader's word ("XTC", "extxyz")
+    in_memory = False  # whether a program gives the frames, and no file
     reader: str = "mdnum"  # who reads it: "MDAnalysis", "ASE", "mdnum"
     bits: int = 64  # width of a coordinate as the reader gives it, 32 or 64; frames are float64 either way
     length: str = "Å"  # unit in words; "" where the file does not say

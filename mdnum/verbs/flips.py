@@ -19,7 +19,7 @@ from mdnum.errors import InputError, MdnumError, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, selected, stem
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, as_python, ending, selected, stem
 from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, answering, keywords_checked, refuse
 
 if TYPE_CHECKING:
@@ -55,6 +55,14 @@ def flips(
     other: str | Path | None = None,
     *,
     cell: Any = None,
+    box: Any = None,
+    pbc: Any = None,
+    fractional: bool | None = None,
+    species: Any = None,
+    velocities: Any = None,
+    timestep: float | None = None,
+    length: str | None = None,
+    time: str | None = None,
     topology: str | Path | None = None,
     cutoffs: float | Sequence[float] = (),
     pairs: _Pairs | Sequence[_Pairs] = (),
@@ -71,13 +79,17 @@ def flips(
     Example:
         >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
         >>> mdnum.flips(positions, cell=box_lengths, cutoffs=2.5)
+        >>> mdnum.flips(states.position, box=box, fractional=True, cutoffs=2.5)
 
     Args:
         trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
             may stand behind an @ ("run.xtc@100:", "run.xtc@::10"). Or an array (frames, atoms, 3) of lengths,
-            or a list of ASE's Atoms; `Recorder` takes more.
+            or a list of ASE's Atoms; `Recorder` takes neighbor lists and energies too.
         other: another file of the same atoms: where do the two diverge?
-        cell: of an array: lengths, or lattice vectors as rows; of all frames, or one for each.
+        cell, box, velocities: of an array: lengths, or lattice vectors as rows (cell) or columns (box), of
+            all frames or one for each; velocities (frames, atoms, 3) need a timestep.
+        pbc, fractional, species, timestep, length, time: of an array, as of `Recorder`; `timestep` is the
+            time from a frame to the next.
         topology: what the atoms are, where the trajectory does not say.
         cutoffs: a length in the file's unit, or several, a rule each; default the cutoff of the mdnum run
             that the file belongs to. One rule needs no sequence here, nor in `pairs` and `nearest`.
@@ -103,24 +115,31 @@ def flips(
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
     files = {"other": other is not None, "topology": topology is not None, "format": format is not None}
+    arrays: dict[str, Any] = {
+        "cell": cell, "box": box, "pbc": pbc, "fractional": fractional, "species": species,
+        "velocities": velocities, "timestep": timestep, "length": length, "time": time,
+    }  # fmt: skip
+    arrays = {name: one for name, one in arrays.items() if one is not None}
     if in_memory := hasattr(trajectory, "shape") or type(trajectory) in (list, tuple):
         refuse(files, "of files", "Leave it out for arrays")
     else:
-        refuse({"cell": cell is not None}, "of arrays", "Leave it out: a file has boxes of its own")
+        refuse(dict.fromkeys(arrays, True), "of arrays", "Leave it out: a file has its own")
     open_one = partial(open_trajectory, topology=topology, format=format)
-    asked = rules(cutoffs, pairs, nearest, most)
-    if other is not None:
-        from mdnum.verbs.flips_compare import compare
+    with as_python(in_memory):
+        asked = rules(cutoffs, pairs, nearest, most)
+        if other is not None:
+            from mdnum.verbs.flips_compare import compare
 
-        _refuse_topology_first(trajectory, other, topology)
-        a, b = map(open_one, (trajectory, other))
-        a.drop_repeats = b.drop_repeats = drop_repeats
-        return compare(a, b, asked or _default_rules(a), between, **keep)
-    opened = ArrayFrames.of(trajectory, cell) if in_memory else open_one(trajectory)
-    opened.drop_repeats = drop_repeats
-    with examining(opened, asked or _default_rules(opened), between, window, **keep) as one:
-        of = opened.count or 0
-        one.interrupted = one.rows.drain(one.answer.folder, one.passes, one.found, of, one.answer.log)
+            _refuse_topology_first(trajectory, other, topology)
+            a, b = map(open_one, (trajectory, other))
+            a.drop_repeats = b.drop_repeats = drop_repeats
+            return compare(a, b, asked or _default_rules(a), between, **keep)
+        reach = max((one.reach for one in asked), default=0.0)
+        opened = ArrayFrames.of(trajectory, reach, **arrays) if in_memory else open_one(trajectory)
+        opened.drop_repeats = drop_repeats
+        with examining(opened, asked or _default_rules(opened), between, window, **keep) as one:
+            of = opened.count or 0
+            one.interrupted = one.rows.drain(one.answer.folder, one.passes, one.found, of, one.answer.log)
     return one.answer.outcome
 
 
@@ -189,7 +208,7 @@ def examining(
             "repeats": opened.repeats.plain(),
             "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
-            **ending(found.stopped, one.interrupted),
+            **ending(found.stopped, one.interrupted, opened.in_memory),
             "seconds": time.perf_counter() - began, "seconds_of_frames": read - began,
             **answer.summary,
         }  # fmt: skip

@@ -14,7 +14,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Page, Plot, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs import flips_loop
-from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, repeating, resolution
+from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, in_python, repeating, resolution
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02
@@ -45,8 +45,9 @@ def judge(view: FlipsView) -> Verdict:
     found = [*_ended(view), *flips_loop.findings(view, *told), *_of_rules(view), *_others(view)]
     if "lists" in view.summary:
         # options of the command are none of a loop's
-        named = [one.remedy * ("@" not in one.remedy and "--" not in one.remedy) for one in found]
-        found = [replace(one, remedy=remedy) for one, remedy in zip(found, named, strict=True)]
+        found = [replace(one, remedy=one.remedy * (in_python(one.remedy) == one.remedy)) for one in found]
+    elif view.summary.get("in_memory"):
+        found = [replace(one, remedy=in_python(one.remedy)) for one in found]
     quiet = all(one.severity == "info" for one in found)
     return conclude(found, _evidence(view), headline=_headline(view), best="good" if quiet else "info")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,13 +57,38 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
         "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
         "slice": trajectory.slice_words, "between": between, "notes": trajectory.notes,
+        "in_memory": trajectory.in_memory,
     }  # fmt: skip
 
 
-def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
+def in_python(text: str) -> str:
+    """A sentence that names options of the command, as a program writes them: cutoffs=R, array[:9]."""
+
+    def named(option: re.Match[str]) -> str:
+        name = {"cutoff": "cutoffs"}.get(option[1], option[1].replace("-", "_"))
+        return f"{name}={option[2]}" if option[2] else name
+
+    return re.sub(
+        r"@([A-Z0-9]*:[A-Z0-9:]*)", r"array[\1]", re.sub(r'--([a-z-]+)(?: ([A-Z]\b|"\S+"))?', named, text)
+    )
+
+
+@contextmanager
+def as_python(in_memory: bool) -> Iterator[None]:
+    """Errors on arrays name arguments and no options."""
+    try:
+        yield
+    except InputError as error:
+        if in_memory:
+            error.args, error.remedy = (in_python(str(error)),), error.remedy and in_python(error.remedy)
+        raise
+
+
+def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
     """What summary.json says of how the reading ended."""
+    told = None if stopped is None else str(stopped)
     return {
-        "stopped": None if stopped is None else str(stopped),
+        "stopped": in_python(told) if told and in_memory else told,
         "interrupted": interrupted,
         "status": "stopped" if stopped is not None or interrupted else "complete",
     }

@@ -94,6 +94,47 @@ def test_arrays_give_what_a_file_of_them_gives(tmp_path):
         mdnum.flips(frames, cell=6.0, topology=tmp_path / "f.traj", **keep)
 
 
+def test_arrays_take_what_a_recorder_takes(tmp_path):
+    box, given = TILTED, {"species": list("OH" * 12), "timestep": 0.5, "length": "nm", "time": "fs"}
+    frames = gas(frames=12)
+    speeds = np.broadcast_to((frames[1] - frames[0]) / 0.5, frames.shape)
+    fractions = (frames @ np.linalg.inv(box.T)).astype(np.float32)
+    boxes = np.array([(1 + 0.01 * k) * box for k in range(12)])
+    with mdnum.Recorder(2.5, fractional=True, out=tmp_path / "r", report=False, **given) as one:
+        one.see_many(fractions, box=boxes, velocities=speeds)
+    rules = {"cutoffs": 2.5, "fractional": True, "report": False}
+    told = mdnum.flips(fractions, box=boxes, velocities=speeds, out=tmp_path / "f", **rules, **given)
+    assert same(one.outcome, told) and told.table("flips").num_rows > 50
+    for name in ("rules", "length", "time", "interval", "flight", "format", "resolution"):
+        assert one.outcome.summary[name] == told.summary[name]
+    for options in ({"timestep": 0.5}, {"fractional": True}, {"box": box}, {"species": ["H"]}):
+        with pytest.raises(InputError, match=next(iter(options))):
+            mdnum.flips(tmp_path / "f.traj", cutoffs=2.5, **options)
+    with pytest.raises(InputError, match="fractional"):
+        mdnum.flips(fractions[:, :8] % 1, box=box, cutoffs=2.5)
+
+
+def test_remedies_for_arrays_are_python(tmp_path):
+    frames, many = gas(), {"cell": 6.0, "report": False}
+    broken = frames.copy()
+    broken[15:, 3] = np.nan
+    for options, word in (({}, "cutoffs=R"), ({"most": 3}, "cutoffs=R"), ({"pairs": "O"}, "pairs")):
+        with pytest.raises(InputError, match=word) as raised:
+            mdnum.flips(frames, **options, **many)
+        assert "--" not in str(raised.value) and "--" not in raised.value.remedy
+    still = np.repeat(frames[:6], 2, axis=0)
+    kept = [
+        mdnum.flips(x, cutoffs=2.5, nearest=3, out=tmp_path / str(k), **many)
+        for k, x in enumerate((broken, still))
+    ]
+    found = [one for outcome in kept for one in outcome.findings]
+    told = [text for one in found for text in (one.text, one.remedy)]
+    assert not re.search(r"@[\d:A-Z]|--", " ".join(told)) and "array[:15]" in " ".join(told)
+    assert {"STOPPED", "REPEATED_FRAMES"} <= {one.code for one in found}
+    assert any("drop_repeats" in one.remedy for one in found)
+    assert kept[0].summary["frames"] == 15
+
+
 def test_rules_velocities_and_units_are_those_of_a_file(tmp_path):
     frames, rng = gas(frames=20), np.random.default_rng(1)
     speeds = np.broadcast_to((frames[1] - frames[0]) / 0.5, frames.shape)
