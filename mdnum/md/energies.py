@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ase import units
 from jax import lax
 from jaxtyping import Array
 
@@ -28,10 +29,10 @@ _GRAPHS = ("graph", "graphs", "graphs_tuple", "batch")
 #: Keywords by which a function can learn the box and its strain.
 KEYWORDS = ("cell", "box", "perturbation")
 #: Units of length in Å and of energy in eV that a function may be written in.
-LENGTHS: Mapping[str, float] = {"Å": 1.0, "angstrom": 1.0, "nm": 10.0, "bohr": 0.529177210903}
+LENGTHS: Mapping[str, float] = {"Å": 1.0, "angstrom": 1.0, "nm": units.nm, "bohr": units.Bohr}
 ENERGIES: Mapping[str, float] = {
-    "eV": 1.0, "meV": 1e-3, "kcal/mol": 1 / 23.060547830619026, "kJ/mol": 1 / 96.48533212331002,
-    "hartree": 27.211386245988,
+    "eV": 1.0, "meV": 1e-3, "kcal/mol": units.kcal / units.mol, "kJ/mol": units.kJ / units.mol,
+    "hartree": units.Hartree,
 }  # fmt: skip
 
 

@@ -33,9 +33,15 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
     """An array as numpy has it, not copied.
 
     Raises:
-        InputError: it holds numbers of other kinds, or floats of fewer than 32 bits.
+        InputError: it holds numbers of other kinds, floats of fewer than 32 bits, or quantities with units.
     """
-    found = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
+    if hasattr(values, "value_in_unit"):
+        remedy = "Give numbers: .value_in_unit(openmm.unit.nanometer), with length='nm'"
+        raise InputError(f"{name} in {values.unit}", remedy=remedy, where=name)
+    try:
+        found = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
+    except TypeError as error:
+        raise InputError(f"{name}: {error}", remedy="Give float32 or float64", where=name) from None
     if found.dtype.kind not in kinds or (found.dtype.kind == "f" and found.dtype.itemsize < 4):
         expected = "float32 or float64" if "f" in kinds else "integers"
         held = next((one for one in ("position", "positions") if hasattr(values, one)), None)

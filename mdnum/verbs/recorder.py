@@ -13,7 +13,7 @@ import numpy as np
 
 from mdnum.errors import InputError, MdnumError
 from mdnum.reading import FrameError
-from mdnum.trajectories.arrays import ArrayFrames, one_by_one
+from mdnum.trajectories.arrays import ArrayFrames, host, one_by_one
 from mdnum.trajectories.listed import GivenList, ListCheck
 from mdnum.trajectories.trajectory import SAMPLE
 from mdnum.verbs.flips import WINDOW, FrameExamination, examining, rules
@@ -128,7 +128,7 @@ class Recorder:
         if neighbors is not None:
             self._list = self._check.given(neighbors, self._source.species)
         overflow = bool(np.any(np.asarray(getattr(neighbors, "did_buffer_overflow", False))))
-        self._told.append((np.nan if energy is None else float(energy), self._list, overflow))
+        self._told.append((np.nan if energy is None else float(host(energy, "energy")), self._list, overflow))
         self._source.put(frame)
         self._given += 1
         if self._one is not None or self._given >= SAMPLE:
