@@ -49,44 +49,58 @@ def _same(given, known):
 
 
 class GivenList(NamedTuple):
-    """A neighbor list as a program has it, without padding: its entries by their first atom."""
+    """A neighbor list as a program has it, without padding, by the first atom of each entry."""
 
     shifted: bool  # whether it says which image each neighbor is; else the nearest alone
     full: bool  # whether it has each pair from both of its atoms; else from the lower one here
     first: Int[np.ndarray, "ends"]  # where the entries of each atom begin, and after the last
     i: Int[np.ndarray, "entries"]
     j: Int[np.ndarray, "entries"]
-    image: Int[np.ndarray, "shifted"]  # by `_image`: x[j] + shift @ box is meant
+    image: Int[np.ndarray, "entries"]  # by `_image`: x[j] + shift @ box is meant
 
     @classmethod
     def of(cls, parts: list[np.ndarray], atoms: int) -> GivenList:
         """A list of the arrays that `arrays_of` gives, in int32."""
-        i, j, shift = parts if len(parts) == 3 else (*parts, np.zeros((0, 3), np.int32))
-        found = cls(len(parts) == 3, True, *_by_atom(i, j, shift, atoms, False))
+        i, j, *shifts = parts
+        image = _image(*shifts[0].T) if shifts else np.zeros(len(i), np.int32)
+        there = (i >= 0) & (i < atoms) & (j >= 0) & (j < atoms) & ((i != j) | (image != 0))
+        if not there.all():
+            i, j, image = i[there], j[there], image[there]
+        found = cls._ordered(bool(shifts), True, i, j, image, atoms)
         # as far as some of the atoms show
         rows = np.flatnonzero(np.diff(found.first))
         ends = (found.first[rows[:: len(rows) // _SOME + 1] + k].tolist() for k in (0, 1))
         some = np.concatenate([np.arange(0), *map(np.arange, *ends)])
-        turned = _turned(found.image[some] if found.shifted else found.image)
-        back = found.has(found.j[some], found.i[some], turned)
+        back = found.has(found.j[some], found.i[some], _opposite(found.image[some]))
         if back.sum() > _FULL * len(back):
             return found
-        return cls(found.shifted, False, *_by_atom(i, j, shift, atoms, True))
+        # of an atom and an image of itself, the first component that is not 0 is positive
+        turned = (i > j) | ((i == j) & (np.sign(_shift(image)) @ [4, 2, 1] < 0))
+        i, j, image = (np.where(turned, *two) for two in ((j, i), (i, j), (_opposite(image), image)))
+        return cls._ordered(bool(shifts), False, i, j, image, atoms)
+
+    @classmethod
+    def _ordered(cls, shifted: bool, full: bool, *columns: Any) -> GivenList:
+        i, j, image, atoms = columns
+        if (i[1:] < i[:-1]).any():
+            order = np.argsort(i)
+            i, j, image = i[order], j[order], image[order]
+        return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
         """Whether it has each of other entries; fastest in the order of i."""
-        return _has(self.first, self.j, self.image, i, j, image)
+        return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
         """From how many of its atoms each pair is missing: 0, 1, and 2 in a list that is full."""
-        i, j, image, near = pairs.i, pairs.j, np.zeros(0, np.int32), pairs.rank == 0
+        i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
         if not self.full:
             return 1 - (near & self.has(i, j, image))
-        i, j, image = np.append(i, j), np.append(j, i), np.append(image, _turned(image))
+        i, j, image = np.append(i, j), np.append(j, i), np.append(image, _opposite(image))
         found, order = np.empty(len(i), bool), np.argsort(i)
-        found[order] = self.has(i[order], j[order], image[order] if self.shifted else image)
+        found[order] = self.has(i[order], j[order], image[order])
         return 2 - (near & found.reshape(2, -1)).sum(axis=0)
 
 
@@ -101,60 +115,16 @@ def _shift(image: np.ndarray) -> Int[np.ndarray, "images 3"]:
     return np.stack([image >> 16, image >> 8, image], axis=-1).astype(np.int8).astype(np.int32)
 
 
-def _turned(image: np.ndarray) -> Int[np.ndarray, "images"]:
+def _opposite(image: np.ndarray) -> Int[np.ndarray, "images"]:
     """The numbers of the opposite shifts."""
     return _image(*-_shift(image).T)
 
 
 @njit
-def _by_atom(i, j, shift, atoms, lower):
-    """Columns of a `GivenList`; no shifts are those of the nearest images."""
-    first, image, ordered, shifted = (
-        np.zeros(atoms + 2, np.int64),
-        np.empty(len(shift), np.int32),
-        0,
-        len(shift),
-    )
-    for k in range(len(i)):
-        a, b = i[k], j[k]
-        ordered += (a >= 0) & (a < atoms) & (b >= 0) & (b < atoms) & (a < b if lower else a != b)
-    for k in range(1, len(i)):
-        ordered -= i[k] < i[k - 1]
-    for k in range(shifted):
-        s0, s1, s2 = shift[k, 0], shift[k, 1], shift[k, 2]
-        # of an atom and an image of itself, the first component that is not 0 is positive
-        back = s0 < 0 or (s0 == 0 and (s1 < 0 or (s1 == 0 and s2 < 0)))
-        back = lower and (i[k] > j[k] or (i[k] == j[k] and back))
-        image[k] = _image(-s0, -s1, -s2) if back else _image(s0, s1, s2)
-    if ordered == len(i):
-        for k in range(len(i)):
-            first[i[k] + 1] = k + 1
-        for a in range(atoms):
-            first[a + 1] = max(first[a + 1], first[a])
-        return first[:-1], i, j, image
-    taken = np.empty(len(i), np.bool_)
-    for k in range(len(i)):
-        a, b = i[k], j[k]
-        taken[k] = 0 <= a < atoms and 0 <= b < atoms and (a != b or (shifted and image[k] != 0))
-        if taken[k]:
-            first[2 + (min(a, b) if lower else a)] += 1
-    for a in range(atoms):
-        first[a + 2] += first[a + 1]
-    columns = np.empty((3, first[-1]), np.int32)
-    for k in range(len(i)):
-        if taken[k]:
-            a, b = (min(i[k], j[k]), max(i[k], j[k])) if lower else (i[k], j[k])
-            at = first[a + 1]
-            first[a + 1] += 1
-            columns[0, at], columns[1, at], columns[2, at] = a, b, image[k] if shifted else 0
-    return first[:-1], columns[0], columns[1], columns[2] if shifted else image
-
-
-@njit
-def _has(first, other, images, i, j, image):
+def _has(first, other, images, i, j, image, shifted):
     found = np.zeros(len(i), np.bool_)
     # whose entry another atom was last met in; the last such entry, and the one before each
-    of, row, begin, shifted = np.full(len(first), -1, np.int32), -1, 0, len(images) > 0
+    of, row, begin = np.full(len(first), -1, np.int32), -1, 0
     last, before = np.empty(len(first), np.int32), np.empty(np.diff(first).max(), np.int32)
     for k in range(len(i)):
         if i[k] != row:
