@@ -205,7 +205,7 @@ def fork_folders(
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         known = RunFolder.open(found.a).summary if frames else {"system": system.name}
         with frame.answering("compare", f"fork-{known['system']}", system, **keep) as answer:
-            told = dict.fromkeys(("status", "timestep"), None) if frames else basics(system, found.steps)
+            told = {"status": "complete", "timestep": None} if frames else basics(system, found.steps)
             told |= {name: known[name] for name in ("system", "atoms", "time") if frames}
             answer.result, answer.summary = found, told | plain(found)
         return answer.outcome

@@ -1,11 +1,12 @@
 """What does a frame cost that a loop gives to `mdnum.Recorder`, over the same frame of a file?
 
-Answer. As much, and 2.3 times as much with a neighbor list (docs/speed.md). It takes minutes.
+Answer. As much, also with a neighbor list; more with one that is new at every step (docs/speed.md). Minutes.
 
 A Lennard-Jones liquid (density 0.8442, r_cut 2.5, timestep 0.005, float64), every step. Frames go through
 `mdnum flips` from a file (ASE's traj), through a recorder, and through a recorder that is given a neighbor
-list as well, which is made again at every tenth step, or has another order at every step. Contenders take turns in one process. The time of a
-frame is the slope of the least processor time over two numbers of frames: start and page cost nothing.
+list as well, which is made again at every tenth step, or has another order at every step. Contenders take
+turns in one process. The time of a frame is the slope of the least processor time over two numbers of
+frames: start and page cost nothing.
 """
 
 from __future__ import annotations
