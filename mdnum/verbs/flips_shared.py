@@ -57,7 +57,7 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
         "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
         "slice": trajectory.slice_words, "between": between, "notes": trajectory.notes,
-        "in_memory": trajectory.in_memory,
+        **({"in_memory": True} if trajectory.in_memory else {}),
     }  # fmt: skip
 
 

@@ -205,8 +205,10 @@ def fork_folders(
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         known = RunFolder.open(found.a).summary if frames else {"system": system.name}
         with frame.answering("compare", f"fork-{known['system']}", system, **keep) as answer:
-            told = {"status": "complete", "timestep": None} if frames else basics(system, found.steps)
-            told |= {name: known[name] for name in ("system", "atoms", "time") if frames}
+            told = basics(system, found.steps) if system else {
+                **{name: known[name] for name in ("system", "atoms")}, "about": "", "units": "",
+                "steps_asked": found.steps, "timestep": None, "status": "complete", "findings": [],
+            }  # fmt: skip
             answer.result, answer.summary = found, told | plain(found)
         return answer.outcome
     if found.world != "md":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -13,9 +14,12 @@ import ase
 import numpy as np
 import pytest
 from ase.io import write
+from jsonschema import Draft202012Validator
+from schemas import closed
 
 import mdnum
 from mdnum.errors import InputError
+from mdnum.plain import plain
 
 TABLES = ("members", "flips", "frames", "contacts", "lifetimes", "neighbors", "busiest")
 #: A box of jax-md: lattice vectors as columns.
@@ -650,6 +654,9 @@ def test_folders_of_loops_and_of_arrays_are_compared(tmp_path, same):
     assert [row[0] for row in one.result.differences] == ["time"]
     alone = {key[:2] for a, b in found.values() for key in (a[12] ^ b[12])}
     assert {each.subject[:2] for each in one.result.decisions} == alone and bool(alone) != same
+    for each in (one, array, loop):
+        schema = json.loads((Path(mdnum.__file__).parent / f"schemas/{each.kind}.json").read_text())
+        assert Draft202012Validator(closed(schema)).is_valid(plain(each.summary))
     again = mdnum.read(one.path)
     assert again.verdict.tone == ("good" if same else "info") and (one.path / "report.html").exists()
     for options, word in (({"replay": True}, "replay"), ({"steps": 3}, "replay")):
