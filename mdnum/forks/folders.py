@@ -206,7 +206,7 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     if (other := np.flatnonzero(numbers[0][: steps + 1] != numbers[1][: steps + 1])).size:
         differences.append(("number of the frame", *(int(each[other[0]]) for each in numbers)))
     members = [folder.read("members", list(names)) for folder in (first, second)]
-    same = all(np.array_equal(*(each[name] for each in members)) for name in names)
+    same = all(np.array_equal(members[0][name], members[1][name]) for name in names)
     labels = (*names[1:], "rule")
     fork, flips = _alone(first, second, "flips", labels, steps, "frame") if same else (0, [])
     terms = [one["rule"] * (len(summaries[0]["rules"]) > 1) for one in summaries[0]["rules"]]

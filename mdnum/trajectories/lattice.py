@@ -77,12 +77,12 @@ def lattice_of(box: Box) -> ReducedLattice:
 
 # of most files and loops there are a few
 @lru_cache(maxsize=8)
-def _reduced(vectors: bytes, periodic: bytes) -> ReducedLattice:
+def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
     from ase.geometry import complete_cell
     from ase.geometry.minkowski_reduction import minkowski_reduce
 
     # copies: of what cannot be written, numba would compile every search a second time
-    matrix, pbc = np.frombuffer(vectors).reshape(3, 3).copy(), np.frombuffer(periodic, bool).copy()
+    matrix, pbc = np.frombuffer(rows).reshape(3, 3).copy(), np.frombuffer(periodic, bool).copy()
     broken, matrix = Box(matrix, pbc).broken, np.where(pbc[:, None], matrix, 0.0)
     for axis in broken:
         message = f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}"

@@ -209,12 +209,13 @@ class ListCheck:
         x, lattice, reach = frame.positions, lattice_of(frame.box), self._rule.reach
         placed = Placed(x, lattice, lattice.rounding(frame.furthest, reach))
         self._list, self._before = now, frame
-        every = before is None or lattice.narrowest < 2 * reach
-        if not every and new:
+        if before is None or earlier is None or lattice.narrowest < 2 * reach:
+            every = True
+        elif new:
             every = self._drops(earlier, now, frame, before, placed)
-        elif not every and now.shifted:
+        else:
             # shifts belong to the cells that atoms were in
-            every = np.abs(x - before.positions).max() > lattice.narrowest / 4
+            every = now.shifted and np.abs(x - before.positions).max() > lattice.narrowest / 4
         if every:
             pairs = tracker.members()
         else:
@@ -224,7 +225,8 @@ class ListCheck:
                 left = set(zip(*(column[~entered].tolist() for column in columns), strict=True))
                 still = [key for key in self._open if key not in left]
                 ids = np.concatenate([ids, np.array(still, np.int64).reshape(-1, 3).T], axis=1)
-            pairs = Members(*ids, image_distances(placed, *ids))
+            i, j, rank = ids
+            pairs = Members(i, j, rank, image_distances(placed, i, j, rank))
         missing = now.missing(frame, pairs)
         pairs, missing = pairs[missing > 0], missing[missing > 0]
         margins = self._radii[self._kinds[pairs.i], self._kinds[pairs.j]] - pairs.distance
@@ -250,7 +252,7 @@ class ListCheck:
             # as long as that tells which image a pair inside goes on as
             if np.abs(moved - whole).max() + reach / placed.lattice.narrowest >= 0.5:
                 return True
-            there = whole.any(axis=1)
+            there: np.ndarray = whole.any(axis=1)
             some, image = np.flatnonzero(there[i] | there[j]), image.copy()
             image[some] = _image(*(_shift(image[some]) + whole[i[some]] - whole[j[some]]).T)
         gone = np.flatnonzero(~now.has(i, j, image))

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
-# rows that wait to be handed over together: a call costs more than many rows
-_ROWS_HELD = 100_000
+# rows that wait to be handed over together: a call costs more than many rows; and how many a part of a table
+# counts for, each of whose columns is an array
+_ROWS_HELD, _PART = 100_000, 30
 # stretches of repeated frames that are named
 _RANGES = 6
 # share of the frames without motion that does not matter much
@@ -109,7 +110,7 @@ class HeldRows:
         """Adds rows, equally long columns."""
         self.held.setdefault(table, []).append(columns)
         rows = len(next(iter(columns.values())))
-        self._count += rows
+        self._count += rows + _PART
         self.flips += rows * (table == "flips")
 
     def drain(self, folder: RunFolder, passes: Iterator[Any], found: Any, of: int, log: Progress) -> bool:
