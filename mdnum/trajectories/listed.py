@@ -252,7 +252,7 @@ class ListCheck:
             # as long as that tells which image a pair inside goes on as
             if np.abs(moved - whole).max() + reach / placed.lattice.narrowest >= 0.5:
                 return True
-            there: np.ndarray = whole.any(axis=1)
+            there = np.asarray(whole.any(axis=1))
             some, image = np.flatnonzero(there[i] | there[j]), image.copy()
             image[some] = _image(*(_shift(image[some]) + whole[i[some]] - whole[j[some]]).T)
         gone = np.flatnonzero(~now.has(i, j, image))
