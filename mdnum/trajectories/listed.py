@@ -75,8 +75,11 @@ class GivenList(NamedTuple):
         if back.sum() > _FULL * len(back):
             return found
         # of an atom and an image of itself, the first component that is not 0 is positive
-        turned = (i > j) | ((i == j) & (np.sign(_shift(image)) @ [4, 2, 1] < 0))
-        i, j, image = (np.where(turned, *two) for two in ((j, i), (i, j), (_opposite(image), image)))
+        turned, own = i > j, np.flatnonzero(i == j)
+        turned[own] = np.sign(_shift(image[own])) @ [4, 2, 1] < 0
+        if turned.any():
+            i, j = np.where(turned, j, i), np.where(turned, i, j)
+            image = np.where(turned, _opposite(image), image)
         return cls._ordered(bool(shifts), False, i, j, image, atoms)
 
     @classmethod
