@@ -153,6 +153,8 @@ class PairRows:
     # by run, "blow-up" or "runaway" where it ended that way, else ""
     failed: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Any] = field(default_factory=dict)  # whole runs by name, where a world keeps them
+    # of "B" and "B|A", the largest relative change of a length from A's box to theirs, where boxes can differ
+    strain: dict[str, Float[np.ndarray, "rows"]] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -164,7 +166,16 @@ class PairRows:
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
-        columns = ("separation", "energy", "overridden", "furthest", "nearest", "bound", "ambiguous")
+        columns = (
+            "separation",
+            "energy",
+            "overridden",
+            "furthest",
+            "nearest",
+            "bound",
+            "ambiguous",
+            "strain",
+        )
         cut: dict[str, Any] = {
             name: {run: values[:rows] for run, values in getattr(self, name).items()} for name in columns
         }

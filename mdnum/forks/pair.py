@@ -61,7 +61,8 @@ class Fork:
         series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
             (repeats, those at the other displacement last; NaN once all have split), from B "A|B" and
             "B|A from B"; "cross"; "overridden" and "furthest" of B|A; "energy A", ...; of molecular dynamics
-            "nearest A", "bound A", "ambiguous A" and the same of B.
+            "nearest A", "bound A", "ambiguous A" and the same of B; where boxes can differ, the strain
+            between A's and B's, "strain", and that of "strain B|A".
         flips, flips_total: cross-run flips, the first `FLIPS_KEPT`, and how many there are of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
         growth: of the separations "B" and "B|A".
@@ -303,6 +304,11 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
     series |= {f"energy {name}": joined("energy", name) for name in head.energy}
     if "B|A" in head.overridden:
         series |= {name: joined(name, "B|A") for name in ("overridden", "furthest")}
+    # of a run that has ended nobody knows the box
+    for name in head.strain:
+        series["strain" if name == "B" else f"strain {name}"] = np.concatenate(
+            [rows.strain.get(name, np.full(rows.rows, np.nan)) for rows in gathered]
+        )
     for name in head.nearest:
         series |= {f"{column} {name}": joined(column, name) for column in ("nearest", "bound", "ambiguous")}
     return series

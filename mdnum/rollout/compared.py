@@ -47,11 +47,35 @@ class ReferenceFrame:
         axes = np.argsort(self.axes)
         return ReferenceFrame(np.argsort(self.labels), axes, self.signs[axes], shift)
 
-    def positions(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Positions of this run as the other run would have them, up to lattice vectors."""
+    def positions(
+        self, x: Float[np.ndarray, "rows 3 atoms"], by: Float[np.ndarray, "rows 3 3"] | None = None
+    ) -> Float[np.ndarray, "rows 3 atoms"]:
+        """Positions of this run as the other run would have them, up to lattice vectors.
+
+        Args:
+            by: how the box has deformed since the start, at each row, where it moves.
+        """
         if self.is_same:
             return x
-        return self.vectors(x - self.shift[None, :, None])
+        shift = self.shift[None, :] if by is None else self.shift @ by
+        return self.vectors(x - shift[:, :, None])
+
+    def boxes(self, cells: Sequence[Cell], first: Cell) -> tuple[Cell, ...]:
+        """Boxes of this run as the other run would have them.
+
+        Args:
+            first: the box of both at the start, which other axes leave as it is.
+        """
+        if bool((self.axes == np.arange(3)).all()) and bool((self.signs == 1).all()):
+            return tuple(cells)
+        turn = np.zeros((3, 3))
+        turn[self.axes, np.arange(3)] = self.signs
+        if np.array_equal(turn.T @ first.matrix @ turn, first.matrix):
+            matrices = (turn.T @ cell.matrix @ turn for cell in cells)
+        else:
+            # other axes exchange its vectors: what is turned is how it deformed
+            matrices = (first.matrix @ turn.T @ first.deformation(cell) @ turn for cell in cells)
+        return tuple(Cell.create(matrix, first.pbc) for matrix in matrices)
 
     def vectors(self, v: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
         """Velocities, likewise."""
@@ -271,15 +295,32 @@ def _overridden(own, imposed, index, order, x, species, r_cut, boxes, count, fur
 
 
 def separations(
-    cells: Sequence[Cell], a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
+    cells: Sequence[Cell],
+    a: Float[np.ndarray, "rows 3 atoms"],
+    b: Float[np.ndarray, "rows 3 atoms"],
+    others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
     """Largest distance between the same atoms of two runs at each row; NaN where a position is not a number.
 
     Args:
         cells: the box, or one for each row; distances are those of nearest images.
+        others: the second run's box of each row, where it has its own: its positions relative to it are put
+            into that of the first, so that boxes that differ are no motion of atoms far from the origin.
     """
     out = np.empty(len(a))
+    if others:
+        by = np.array([other.deformation(cell) for cell, other in zip(cells, others, strict=True)])
+        b = np.einsum("rkn,rkl->rln", b, by)
     _largest(a, b, stacked(cells), out)
+    return out
+
+
+def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
+    """The largest relative change of a length from one box to another, at each row."""
+    by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
+    out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
+    # a rotation is no strain
+    out[known] = np.abs(np.linalg.svd(by[known], compute_uv=False) - 1).max(axis=1, initial=0.0)
     return out
 
 

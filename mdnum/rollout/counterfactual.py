@@ -133,8 +133,8 @@ class Counterfactual:
         # copies: the record is filled anew by the next stretch
         x, v = (in_user_order(part, table.order) for part in (x, v))
         self._record = record
-        x, v = self.frame.positions(x), self.frame.vectors(v)
-        return Rows(first, x, v, energy, self.failed, None, cells, *noted)
+        own = Rows(first, x, v, energy, simulation.cell, self.failed, None, cells, *noted)
+        return own.seen_by(self.frame)
 
     def _program(self, *, shared: bool) -> tuple[tuple[Array, ...], Any]:
         program = self._engine.program

@@ -8,14 +8,12 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.md.cell import Cell
 from mdnum.program import PairRows
-from mdnum.rollout.compared import CrossFlip, CrossRecorder, ReferenceFrame, differ, separations
+from mdnum.rollout.compared import CrossFlip, CrossRecorder, differ, separations, strains
 from mdnum.rollout.counterfactual import Counterfactual
 from mdnum.rollout.flips import AmbiguousPairs
 from mdnum.rollout.tracks import Rows, Track
@@ -31,7 +29,7 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
     """
     tracks = {"A": leader, "B": follower}
     runs: dict[str, Track | Counterfactual] = {**tracks, **imposed}
-    a, cell = leader.simulation, leader.simulation.cell
+    a = leader.simulation
     crossing: CrossRecorder | None = None
     while leader.segment() is not None:
         end = leader.ready
@@ -44,15 +42,15 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
             crossing = CrossRecorder(leader.first_pairs, follower.first_pairs, a.atoms)
             opening = crossing.opening()
         cross, flips = crossing.take(clock.first, len(clock), leader.flips(end), follower.flips(end))
-        separation = {"B": separation_of(cell, clock, rows_b)}
+        separation = {"B": separation_of(clock, rows_b)}
         # in the labels and axes of the run whose decisions it acts on; distances do not mind
         if "B|A" in rows:
-            separation["B|A"] = separation_of(cell, clock, rows["B|A"])
-            separation["B|A from B"] = _padded(separation_of(cell, rows_b, rows["B|A"]), clock)
+            separation["B|A"] = separation_of(clock, rows["B|A"])
+            separation["B|A from B"] = _padded(separation_of(rows_b, rows["B|A"]), clock)
         if "A|B" in rows:
-            under_b = None if rows["A|B"] is None else _in_frame(rows["A|B"], follower.frame)
-            separation["A|B"] = _padded(separation_of(cell, rows_b, under_b), clock)
-            separation["A|B from A"] = separation_of(cell, clock, under_b)
+            under_b = None if rows["A|B"] is None else rows["A|B"].seen_by(follower.frame)
+            separation["A|B"] = _padded(separation_of(rows_b, under_b), clock)
+            separation["A|B from A"] = separation_of(clock, under_b)
         nearest = {name: _nearest(track.simulation, rows[name], clock) for name, track in tracks.items()}
         doubts = {name: track.doubts(end) for name, track in tracks.items()}
         yield PairRows(
@@ -75,6 +73,11 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
             },
             doubts,
             {name: run.failed for name, run in runs.items()},
+            strain={
+                name: strain_of(clock, rows[name])
+                for name in ("B", "B|A")
+                if name in rows and rows_b is not None and _differ(clock, rows_b)
+            },
         )
         if follower.failed or leader.failed:
             return
@@ -86,23 +89,34 @@ def beside(
     """Separations of runs from one, a stretch of its steps at a time."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
-        yield [separation_of(leader.simulation.cell, rows, run.until(end)) for run in runs]
+        yield [separation_of(rows, run.until(end)) for run in runs]
 
 
-def _in_frame(rows: Rows, frame: ReferenceFrame) -> Rows:
-    return replace(rows, x=frame.positions(rows.x), v=frame.vectors(rows.v), nearest=None)
-
-
-def separation_of(cell: Cell, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
+def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
     """Largest distance between the same atoms of two runs at each step; NaN where the second has ended.
 
-    Nearest images are those of the first run's boxes.
+    Positions are compared relative to the box, as lengths and nearest images in that of the first run.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
         rows = min(len(a), len(b))
-        out[:rows] = separations(a.cells[:rows] or (cell,), a.x[:rows], b.x[:rows])
+        boxes = (a.boxes[:rows], b.boxes[:rows]) if _differ(a, b) else (a.cells[:rows] or (a.box,), ())
+        out[:rows] = separations(boxes[0], a.x[:rows], b.x[:rows], boxes[1])
     return out
+
+
+def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
+    """The strain between the boxes of two runs at each step; NaN where the second has ended."""
+    out = np.full(len(a), np.nan)
+    if b is not None:
+        rows = min(len(a), len(b))
+        out[:rows] = strains(a.boxes[:rows], b.boxes[:rows])
+    return out
+
+
+def _differ(a: Rows, b: Rows) -> bool:
+    """Whether two runs may have different boxes."""
+    return bool(a.cells or b.cells) or not np.array_equal(a.box.matrix, b.box.matrix)
 
 
 def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
@@ -110,6 +124,9 @@ def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
     if b is not None:
         rows = min(len(a), len(b))
         out[:rows] = differ(a.x[:rows], b.x[:rows]) | differ(a.v[:rows], b.v[:rows])
+        if _differ(a, b):
+            boxes = zip(a.boxes[:rows], b.boxes[:rows], strict=True)
+            out[:rows] |= np.array([not np.array_equal(one.matrix, other.matrix) for one, other in boxes])
     return out
 
 

@@ -59,6 +59,7 @@ class RunResult:
     summary: dict[str, Any]  # the content of summary.json
     simulation: Simulation  # the system as objects
     frames: tuple[np.ndarray, np.ndarray]  # first and last positions, shape (atoms, 3) each, wrapped, length
+    ended: Simulation  # the system in the box of the last of them
 
 
 @dataclass
@@ -86,7 +87,9 @@ class Rollout:
         save_every: a trajectory frame every so many steps; 0 for none.
         progress: called with step, steps and a dictionary of figures.
         began: time.perf_counter() at the start, for the time to the first step.
-        shown: called with the simulation and the first and the last positions, as soon as there are any.
+        shown: called with the simulation in its box, and the first and the last positions, as soon as there
+            are any.
+        ended: the simulation in its box at the last step.
     """
 
     simulation: Simulation
@@ -98,6 +101,7 @@ class Rollout:
     shown: Shown | None = None
 
     def __post_init__(self):
+        self.ended = self.simulation
         self.recorder = PairRecorder(self.simulation)
         self.done = _Progress(RunTally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
         self.start: Start | None = None
@@ -132,7 +136,8 @@ class Rollout:
             # from here on a run that is stopped can be resumed
             self.folder.checkpoint(self._to_dict(engine.start), force=True)
         self._say("compile", int(engine.start.state.step))
-        self._show(engine.start.reference if self.done.first is None else self.done.first)
+        first = engine.start.reference if self.done.first is None else self.done.first
+        self._show(self.simulation, first)
         loop_began: float | None = None
         counted = 0
         for segment in engine.segments():
@@ -158,7 +163,8 @@ class Rollout:
         summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
-        self._show(segment.last_positions.T)
+        self.ended = self.simulation.in_row(segment.cell_of(segment.rows - 1))
+        self._show(self.ended, segment.last_positions.T)
         # after the checkpoint: a run that is continued goes on with this list, and drops the row
         if (row := self.done.health.last_row()) is not None:
             self.folder.append("epochs", row)
@@ -166,9 +172,9 @@ class Rollout:
         self.folder.write_summary(summary)
         return summary
 
-    def _show(self, positions: Any) -> None:
+    def _show(self, here: Simulation, positions: Any) -> None:
         if self.shown is not None:
-            self.shown(self.simulation, np.asarray(positions, np.float64))
+            self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
         """Whether rows of the record are asked for so often that they are better kept."""
@@ -353,8 +359,8 @@ def run(
         overrides: dotted keys to values, as for `mdnum.systems.load`.
         resume: continue the run in this folder; bit for bit what it would have been without the stop.
         progress: called now and then with step, steps and a dictionary of figures.
-        shown: called with the simulation and the first and the last positions, shape (atoms, 3), wrapped,
-            length, as soon as there are any; not where the run in the folder has nothing left to do.
+        shown: called with the simulation in its box, and the first and the last positions, shape (atoms, 3),
+            wrapped, length, as soon as there are any; not where the run in the folder has nothing left to do.
 
     Raises:
         InputError: the system cannot be run. FolderError: the folder cannot be used.
@@ -387,7 +393,7 @@ def run(
     done = rollout.done
     assert done.first is not None and done.last is not None
     frames = (np.asarray(done.first, np.float64), np.asarray(done.last, np.float64).T)
-    return RunResult(rollout.folder.path, summary, rollout.simulation, frames)
+    return RunResult(rollout.folder.path, summary, rollout.simulation, frames, rollout.ended)
 
 
 def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progress, began) -> Rollout:
@@ -414,7 +420,9 @@ def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunRes
             return None
         folder.check_start()
         frames = (np.asarray(saved["first"], np.float64), np.asarray(saved["last"], np.float64))
-        return RunResult(path, summary, again(path, given), frames)
+        simulation = again(path, given)
+        cells = Start.from_arrays(saved, simulation).state.cells
+        return RunResult(path, summary, simulation, frames, simulation.in_row(cells[:2][-1]))
 
 
 def _resumed(

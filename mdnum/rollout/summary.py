@@ -70,6 +70,9 @@ class RunTally:
     seconds: float = 0.0
     steps_per_second: float | None = None
     jumps: float = 0.0
+    # heat, work: energy that the atoms have from a thermostat and from the box so far
+    heat: float = 0.0
+    work: float = 0.0
     conserved: LineFit = field(default_factory=LineFit)
     without_jumps: LineFit = field(default_factory=LineFit)
 
@@ -82,6 +85,7 @@ class RunTally:
         if self.step < 0:
             self.pairs_first = int(pairs[0])
         self.step = segment.last
+        self.heat, self.work = (float(segment.rows_of(name)[-1]) for name in ("heat", "work"))
         self.pairs_last = int(pairs[-1])
         self.entered += int(ledger.entered.sum())
         self.left += int((~ledger.entered).sum())
@@ -154,6 +158,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "energy_drift": None if slope is None else slope / simulation.atoms,
         # the flips' own jumps follow the number of pairs, up and down, and are no drift of the integrator
         "energy_drift_without_jumps": None if without is None else without / simulation.atoms,
+        **({"heat": tally.heat, "work": tally.work} if tally.heat or tally.work else {}),
         "energy_budget_residual": budget.residual,
         "energy_budget_tolerance": budget.tolerance,
         "energy_budget_checks": budget.checks,

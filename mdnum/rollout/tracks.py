@@ -27,10 +27,11 @@ class Rows:
     x: Float[np.ndarray, "rows 3 atoms"]
     v: Float[np.ndarray, "rows 3 atoms"]
     energy: Float[np.ndarray, "rows"]  # total energy, shape (rows,)
+    box: Cell  # at step 0
     failed: str = ""  # "blow-up", "runaway", or ""
     # of a run whose decisions are its own: smallest |margin| of any listed pair, in the quantity's space
     nearest: Float[np.ndarray, "rows"] | None = None
-    cells: tuple[Cell, ...] = ()  # the box of each row; none where all have that of the simulation
+    cells: tuple[Cell, ...] = ()  # the box of each row; none where all have the first
     # of one whose decisions are imposed: pairs that it would have decided otherwise, and the largest distance
     # of any of them from its cutoff, length
     overridden: Int[np.ndarray, "rows"] | None = None
@@ -43,6 +44,19 @@ class Rows:
     def last(self) -> int:
         """Step of the last row."""
         return self.first + len(self) - 1
+
+    @property
+    def boxes(self) -> tuple[Cell, ...]:
+        """The box of each row."""
+        return self.cells or (self.box,) * len(self)
+
+    def seen_by(self, frame: ReferenceFrame) -> Rows:
+        """The same in the labels and axes of another run."""
+        if frame.is_same:
+            return self
+        by = np.array([self.box.deformation(cell) for cell in self.cells]) if self.cells else None
+        x, v = frame.positions(self.x, by), frame.vectors(self.v)
+        return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
         """The first rows, and the rest."""
@@ -65,7 +79,8 @@ class Rows:
             for name, column in columns.items()
         }
         cells = tuple(cell for part in parts for cell in part.cells)
-        return cls(first=parts[0].first, failed=parts[-1].failed, cells=cells, **whole)  # type: ignore[arg-type]
+        one = parts[-1]
+        return cls(first=parts[0].first, box=one.box, failed=one.failed, cells=cells, **whole)  # type: ignore[arg-type]
 
 
 _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
@@ -133,7 +148,7 @@ class Track:
             self._flips.append(_flips_of(self._recorder.flips(segment), self.frame))
             self._doubts.append(self._recorder.doubtful(segment))
         self.failed = segment.closes if segment.closes in FAILURES else ""
-        self._ahead.append(rows_of(segment, self.frame, self.failed))
+        self._ahead.append(rows_of(self.simulation, segment, self.frame, self.failed))
         return segment
 
     @property
@@ -169,10 +184,10 @@ def _flips_of(ledger: FlipTable, frame: ReferenceFrame) -> PairFlips:
     return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
-def rows_of(segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """A segment's rows in the user's order of atoms."""
+def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
+    """A segment's rows in the user's order of atoms, as another run has them."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)
-    x, v = frame.positions(x), frame.vectors(v)
-    return Rows(segment.first, x, v, energy, failed, nearest, segment.cells)
+    rows = Rows(segment.first, x, v, energy, simulation.cell, failed, nearest, segment.cells)
+    return rows.seen_by(frame)

@@ -83,7 +83,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
     return name in table and bool(np.any(np.nan_to_num(table[name]) > 0))
 
 
-def _separation(view: View) -> Iterator[Plot]:
+def _separation(view: View) -> Iterator[Plot | str]:
     """The separation of A from B, free and under imposed decisions, with the three dates."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
@@ -117,6 +117,11 @@ def _separation(view: View) -> Iterator[Plot]:
         timestep=s["timestep"], time=view.units.time, length=view.units.length,
         caption=TEXTS("separation_caption" if _has(table, "imposed") else "separation_caption_free"),
     )  # fmt: skip
+    if boxes := s.get("boxes"):
+        yield TEXTS("boxes", **boxes)
+        for name, date in (("first_bit", "the first bit"), ("fork", "the fork"), ("split", "the split")):
+            if boxes[name]:
+                yield TEXTS("boxes_at", date=date, step=s[name], unit=view.units.length, **boxes[name])
 
 
 def _decision(view: View) -> Iterator[Any]:

@@ -32,7 +32,7 @@ _SERIES = {
     "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_imposed": "energy B|A",
     "energy_back": "energy A|B", "imposed_from_b": "B|A from B", "back_from_a": "A|B from A",
     "nearest_a": "nearest A", "nearest_b": "nearest B", "ambiguous_a": "ambiguous A",
-    "ambiguous_b": "ambiguous B",
+    "ambiguous_b": "ambiguous B", "strain": "strain", "strain_imposed": "strain B|A",
 }  # fmt: skip
 _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_b")
 
@@ -197,12 +197,26 @@ def _numbers(made: Fork) -> dict[str, Any]:
         "imposed_largest": imposed.max() if len(imposed) else None,
         "separation_end": free[-1] if len(free) else None,
         "separation_largest": free.max() if len(free) else None,
+        **_boxes(made, dates),
         "overridden": int(overridden.sum()) if len(overridden) else None,
         "cross_flips": made.flips_total, "cross_flips_kept": len(made.flips),
         "failed": {name: word for name, word in made.failed.items() if name in free_runs},
         "failed_imposed": {name: word for name, word in made.failed.items() if name not in free_runs},
         "status": "failed" if free_runs else "complete",
     }  # fmt: skip
+
+
+def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
+    """Strain between the boxes at the end, at most, and beside the separation at each date."""
+    if "strain" not in made.series:
+        return {}
+    strain, free = made.series["strain"], made.series["B"]
+    known = strain[np.isfinite(strain)]
+    return {"boxes": {
+        "end": known[-1] if len(known) else None, "largest": known.max(initial=0.0),
+        **{name: None if at is None else {"strain": strain[at], "separation": free[at]}
+           for name, at in dates.items()},
+    }}  # fmt: skip
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
@@ -233,7 +247,7 @@ def _separation(made: Fork) -> dict[str, Any]:
     columns = {
         name: series.get(key, np.full(len(step), np.nan))
         for name, key in _SERIES.items()
-        if made.twin.a.streams or name not in _MD_ALONE
+        if (made.twin.a.streams or name not in _MD_ALONE) and (key in made.series or "strain" not in key)
     }
     repeats = {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
     return {"step": step, "time": step * made.twin.a.timestep, **columns, **repeats}

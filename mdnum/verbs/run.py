@@ -102,12 +102,12 @@ def run(
         remedy = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
         seen = f"is the folder of `mdnum {folder.layout.command}`, and no run"
         raise InputError(seen, where=str(resume), remedy=remedy)
-    frames: SimpleQueue[np.ndarray | None] = SimpleQueue()
+    frames: SimpleQueue[tuple[Simulation, np.ndarray] | None] = SimpleQueue()
     compared: list[Future[_Beside]] = []
     with ThreadPoolExecutor(1) as thread:
 
         def shown(simulation: Simulation, positions: np.ndarray) -> None:
-            frames.put(positions)
+            frames.put((simulation, positions))
             if not compared:
                 compared.append(thread.submit(_beside_the_loop, simulation, frames, check, report))
 
@@ -123,8 +123,8 @@ def run(
             raise
         if not compared:
             # it had ended before
-            for positions in result.frames:
-                shown(result.simulation, positions)
+            for here, positions in zip((result.simulation, result.ended), result.frames, strict=True):
+                shown(here, positions)
         folder = RunFolder.open(result.folder)
         view = RunView(folder, folder.summary)
         if check:
@@ -169,7 +169,10 @@ class _Beside(NamedTuple):
 
 
 def _beside_the_loop(
-    simulation: Simulation, frames: SimpleQueue[np.ndarray | None], check: bool, report: bool
+    simulation: Simulation,
+    frames: SimpleQueue[tuple[Simulation, np.ndarray] | None],
+    check: bool,
+    report: bool,
 ) -> _Beside:
     """The comparison with ASE and what else takes Python's time, which the loop does not."""
     if report:
@@ -182,9 +185,9 @@ def _beside_the_loop(
 
     periods: list[float | None] = []
 
-    def shown() -> Iterator[np.ndarray]:
-        while (positions := frames.get()) is not None:
-            yield positions
+    def shown() -> Iterator[tuple[Simulation, np.ndarray]]:
+        while (frame := frames.get()) is not None:
+            yield frame
 
     def named() -> Iterator[tuple[str, Atoms]]:
         given = shown()
@@ -193,9 +196,11 @@ def _beside_the_loop(
             both = list(islice(given, 2))
             # of a run that was stopped nobody asks
             given = iter(both if len(both) == 2 else ())
-        for name, positions in zip(("initial", "last"), given, strict=False):
-            periods.append(fastest_period(simulation, positions))
-            atoms = simulation.structure.copy()
+        for name, (here, positions) in zip(("initial", "last"), given, strict=False):
+            periods.append(fastest_period(here, positions))
+            atoms = here.structure.copy()
+            if here is not simulation:
+                atoms.set_cell(here.cell.matrix)
             atoms.set_positions(positions)
             yield name, atoms
 

@@ -280,7 +280,9 @@ def _energy(run: RunView) -> Iterator[Any]:
     )
     caption = TEXTS("energy_caption_smooth" if smooth else "energy_caption")
     if not run.conservative:
-        caption += " " + TEXTS("thermostat")
+        given = {name: summary.get(name) for name in ("heat", "work")}
+        kind = "bath_and_box" if given["work"] else "thermostat"
+        caption += " " + TEXTS(kind if given["heat"] is not None else "bath", **given, unit=units.energy)
     yield Figure("energy", caption, alt, draw, 3.7)
     if run.jump and run.steps:
         moves = float(np.max(np.abs(np.diff(left))))

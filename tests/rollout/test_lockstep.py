@@ -133,7 +133,7 @@ class Scripted(Counterfactual):
         self._step += count
         x = np.zeros((count, 3, 2)) + np.arange(first, first + count)[:, None, None]
         noted = {"overridden": np.arange(first, first + count), "furthest": note}
-        return Rows(first, x, x, x[:, 0, 0].copy(), **noted)
+        return Rows(first, x, x, x[:, 0, 0].copy(), Cell.create(np.eye(3)), **noted)
 
 
 @pytest.mark.parametrize("guard", [0.5, None])
@@ -170,7 +170,7 @@ def test_the_nearest_decision_of_a_mixture_is_no_further_than_any_pair_from_its_
     margin = (radii[:, None] ** 2 - r**2 if compare == "r2 <" else radii[:, None] - r).ravel()
     x = np.zeros((margin.size, 3, 1))
     for smallest in (np.abs(margin), np.full(margin.size, np.inf)):
-        rows = Rows(0, x, x, np.zeros(margin.size), nearest=smallest)
+        rows = Rows(0, x, x, np.zeros(margin.size), simulation.cell, nearest=smallest)
         told = lockstep_module._nearest(simulation, rows, rows)
         true = np.where(np.isinf(smallest), np.inf, np.abs(np.tile(away, len(radii))))
         assert (told <= true * (1 + 1e-6)).all() and (told > 0).all()

@@ -174,7 +174,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
         def watch(segment: Segment, parts: list[np.ndarray] = parts) -> None:
             nonlocal failed
             failed = segment.closes if segment.closes in FAILURES else ""
-            parts.append(rows_of(segment, frame, failed).x)
+            parts.append(rows_of(simulation, segment, frame, failed).x)
 
         other = replace(program, simulation=simulation.with_policy(PrecisionPolicy(**roles)))
         decision = first_difference(exact.tape, taped(other, last, watch))
