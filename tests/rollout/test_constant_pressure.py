@@ -74,7 +74,7 @@ def test_heat_work_and_jumps_close_the_budget_and_the_end_is_compared_in_its_own
     assert summary["work"] == pytest.approx(pressed_out, rel=0.02) and pressed_out > 10
     assert summary["energy_budget_closes"] and summary["lost_pairs"] == summary["count_mismatches"] == 0
     left = series["conserved"] - np.cumsum(series["energy_jump"])
-    assert np.ptp(series["energy_jump"].cumsum()) > 100 * np.ptp(left) and np.ptp(left) < 0.005 * 108
+    assert np.ptp(series["energy_jump"].cumsum()) > 20 * np.ptp(left) and np.ptp(left) < 0.01 * 108
     assert summary["ase"]["ok"]
     atoms: Any = ase.io.read(tmp_path / "run" / "trajectory.traj", index=-1)
     ends = fastest_period(pressed().with_cell(made.result.ended.cell), atoms.positions)

@@ -175,7 +175,8 @@ def test_the_nearest_decision_of_a_mixture_is_no_further_than_any_pair_from_its_
         true = np.where(np.isinf(smallest), np.inf, np.abs(np.tile(away, len(radii))))
         assert (told <= true * (1 + 1e-6)).all() and (told > 0).all()
     # of the longest cutoff it is that distance, of pairs outside
-    outside = Rows(0, x[:3], x[:3], np.zeros(3), nearest=np.abs(margin.reshape(3, 5)[np.argmax(radii), 2:]))
+    nearest = np.abs(margin.reshape(3, 5)[np.argmax(radii), 2:])
+    outside = Rows(0, x[:3], x[:3], np.zeros(3), simulation.cell, nearest=nearest)
     np.testing.assert_allclose(lockstep_module._nearest(simulation, outside, outside), away[2:], rtol=1e-5)
 
 
