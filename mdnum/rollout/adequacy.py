@@ -55,8 +55,12 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
     return 2 * np.pi / square**0.5 / simulation.units.time_factor if square > 0 else None
 
 
-def beyond_cutoff(simulation: Simulation) -> Mapping[str, float] | None:
+def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
     """What pairs beyond the cutoff would add in a bulk whose atoms are spread evenly there (g = 1).
+
+    Args:
+        simulation: the system as objects.
+        volume: of the box, length cubed; default the system's.
 
     Returns:
         `energy` per atom, `pressure` in the user's unit (Allen and Tildesley, section 2.8); None where there
@@ -65,15 +69,15 @@ def beyond_cutoff(simulation: Simulation) -> Mapping[str, float] | None:
     """
     if not simulation.pairwise or not all(simulation.pbc) or simulation.model.weights:
         return None
-    made, rough = (_beyond(simulation, nodes) for nodes in (_NODES, _FEWER))
+    made, rough = (_beyond(simulation, nodes, volume) for nodes in (_NODES, _FEWER))
     if not made[0] or not np.isfinite(made).all() or not np.allclose(made, rough, rtol=_AGREE, atol=0):
         return None
     return {"energy": made[0], "pressure": made[1] * simulation.units.pressure_factor}
 
 
-def _beyond(simulation: Simulation, nodes: int) -> tuple[float, float]:
+def _beyond(simulation: Simulation, nodes: int, volume: float | None) -> tuple[float, float]:
     """Energy and pressure by a quadrature from the cutoff to infinity."""
-    density = simulation.atoms / simulation.cell.volume
+    density = simulation.atoms / (volume or simulation.cell.volume)
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(nodes)
     node, weight = (node + 1) / 2, weight / 2

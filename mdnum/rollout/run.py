@@ -22,6 +22,7 @@ from mdnum.md.ledger import FlipTable
 from mdnum.plain import result
 from mdnum.rollout.engine import FAILURES, NARROW, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder
+from mdnum.rollout.pressure import PressureParts
 from mdnum.rollout.summary import (
     EnergyBudget,
     ListHealth,
@@ -69,11 +70,13 @@ class _Progress:
     tally: RunTally
     health: ListHealth
     budget: EnergyBudget
+    pressure: PressureParts
     first: np.ndarray | None = None
     last: Any = None  # shape (3, atoms), on the device until somebody asks
 
     def to_dict(self) -> dict[str, Any]:
-        return {name: getattr(self, name).to_dict() for name in ("tally", "health", "budget")}
+        parts = {name: getattr(self, name).to_dict() for name in ("tally", "health", "budget")}
+        return {**parts, "pressure": self.pressure.samples}
 
 
 @dataclass
@@ -103,7 +106,8 @@ class Rollout:
     def __post_init__(self):
         self.ended = self.simulation
         self.recorder = PairRecorder(self.simulation)
-        self.done = _Progress(RunTally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
+        parts = ListHealth(self.simulation), EnergyBudget(self.simulation), PressureParts(self.simulation)
+        self.done = _Progress(RunTally(), *parts)
         self.start: Start | None = None
         self._earlier_seconds = 0.0
 
@@ -115,6 +119,7 @@ class Rollout:
             RunTally.from_dict(done["tally"]),
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
+            PressureParts(self.simulation, done.get("pressure", [])),
             saved.get("first"),
             saved["last"].T if "last" in saved else None,
         )
@@ -217,6 +222,7 @@ class Rollout:
             # a step after which nothing is finite has the velocities of its row
             v = segment.state.v if segment.closes != "blow-up" else segment.unsorted("v", segment.rows - 1)
             self._examine(segment, segment.rows - 1, v)
+            self.done.pressure.take(segment)
 
     def _examine(self, segment: Segment, row: int, v: Any) -> None:
         step, x, cell = segment.first + row, segment.unsorted("x", row), segment.cell_of(row)

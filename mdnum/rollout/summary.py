@@ -129,6 +129,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
     alike = all(np.allclose(np.abs(one), np.abs(one[0]), rtol=1e-9, atol=0) for one in jumps)
     timestep = simulation.timestep
     cutoff = simulation.cutoff
+    pressure = done.pressure.summary()
     slope, without = tally.conserved.slope, tally.without_jumps.slope
     return {
         "system": simulation.name,
@@ -182,7 +183,8 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "fixed_point": None
         if simulation.fixed_point is None
         else simulation.fixed_point.to_dict(float(simulation.integrator.timestep)),
-        "beyond_cutoff": beyond_cutoff(simulation),
+        "beyond_cutoff": pressure["tail"] if pressure else beyond_cutoff(simulation),
+        "pressure": pressure,
         "ase": None,
         "findings": [],
         "verdict": "",

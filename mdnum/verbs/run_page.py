@@ -171,6 +171,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
     sections = [
         Section("What was run", [pairs(_what(run))]),
         Section("Energy and its budget", list(_energy(run))),
+        *[Section("Pressure", list(_pressure(run)))] * bool(run.summary.get("pressure")),
         Section("Flips per step", list(_flips_per_step(run))),
         Section("Margins in units of rounding", list(_margins(run))),
         Section("Chatter and residence", list(_chatter(run))),
@@ -301,6 +302,26 @@ def _energy(run: RunView) -> Iterator[Any]:
                 "fixed_point_energy", steps=state["energy_steps"], ours=state["energy_std"],
                 unit=units.energy, float64=state["energy_std_float64"],
             )  # fmt: skip
+
+
+def _pressure(run: RunView) -> Iterator[Any]:
+    """The pressure in parts, and what the cutoff leaves out of it."""
+    parts, units = run.summary["pressure"], run.units
+    rows = TEXTS.rows("pressure", **vars(units), **parts)
+    terms = [
+        (f"Virial part of {name}", f"{number(one['mean'], 4)} {units.pressure}")
+        for name, one in parts["terms"].items()
+    ]
+    at = [name for name, _ in rows].index("Virial part") + 1
+    yield pairs([*rows[:at], *terms, *rows[at:]])
+    if jump := parts["impulsive"]:
+        whole = parts["total"]["mean"] + jump["mean"]
+        barostat = ", and by the target of the barostat" * ("volume" in run.series)
+        yield TEXTS("impulsive", whole=whole, barostat=barostat, unit=units.pressure)
+        if jump["error"]:
+            yield TEXTS("impulsive_resolved", errors=abs(jump["mean"]) / jump["error"])
+    if parts["tail"] is None:
+        yield TEXTS("no_tail")
 
 
 def _flips_per_step(run: RunView) -> Iterator[Any]:

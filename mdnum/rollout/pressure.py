@@ -1,0 +1,119 @@
+"""What the pressure of a run consists of, and what its cutoff leaves out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.md.cell import displacement
+from mdnum.rollout.adequacy import beyond_cutoff
+from mdnum.rollout.engine import Segment
+from mdnum.rollout.flips import decided_pairs
+from mdnum.systems.simulation import Simulation
+
+# pairs just inside the cutoff are counted in two shells of this share of it each; of many pairs some are
+# taken, so that a sample of a large system takes no longer than its step
+_SHELL, _MOST = 0.02, 200_000
+
+
+@dataclass
+class PressureParts:
+    """The pressure of some steps, in parts: kinetic, virial, of each term, and impulsive.
+
+    The impulsive part is that of the jump of the energy at a cutoff, 2/3 π ρ² g(r_cut) r_cut³ u(r_cut) of one
+    kind of pairs (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). A step of molecular dynamics
+    does not have it, nor does a barostat: it is the difference to the pressure of the truncated energy.
+
+    Args:
+        samples: of each step the volume, and these parts, energy/length³.
+    """
+
+    simulation: Simulation
+    samples: list[dict[str, float]] = field(default_factory=list)
+
+    def take(self, segment: Segment) -> None:
+        """Add the last step of a segment, of a run in a box with a volume."""
+        simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
+        volume = simulation.cell.volume
+        if not (np.isfinite(volume) and all(simulation.pbc)):
+            return
+        kinetic, virial = (float(segment.rows_of(name)[row]) for name in ("kinetic", "virial"))
+        parts = {"volume": volume, "kinetic": 2 * kinetic / (3 * volume), "virial": virial / (3 * volume)}
+        jumps = simulation.pairwise and bool(np.any(simulation.jumps()[0]))
+        several = simulation.pairwise and len(simulation.model.terms) > 1
+        if jumps or several:
+            keys = decided_pairs(simulation, segment, row)
+            stride = 1 if several else max(1, len(keys) // _MOST)
+            i, j = np.divmod(keys[::stride], simulation.atoms)
+            x = segment.unsorted("x", row).astype(np.float64)
+            r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x[i % simulation.atoms], x[j])))
+            if several:
+                parts |= {name: one / (3 * volume) for name, one in _virials(simulation, i, j, r).items()}
+            if jumps:
+                parts["impulsive"] = stride * _impulsive(simulation, i, j, r) / (3 * volume)
+        self.samples.append(parts)
+
+    def summary(self) -> dict[str, Any] | None:
+        """Means in the user's unit with their standard errors, as if samples were independent; and what pairs
+        beyond the cutoff would add at the mean volume. None without a sample."""
+        if not self.samples:
+            return None
+        count, factor = len(self.samples), self.simulation.units.pressure_factor
+
+        def mean(name: str, factor: float = factor) -> dict[str, float | None]:
+            values = factor * np.array([one[name] for one in self.samples])
+            error = float(np.std(values, ddof=1)) / count**0.5 if count > 1 else None
+            return {"mean": float(np.mean(values)), "error": error}
+
+        for one in self.samples:
+            one["total"] = one["kinetic"] + one["virial"]
+        named = [name for name in self.samples[0] if name not in (*_OWN, "impulsive")]
+        moves = self.simulation.integrator.moves_cell
+        volume = float(np.mean([one["volume"] for one in self.samples])) if moves else None
+        return {
+            "samples": count,
+            **{name: mean(name) for name in ("total", "kinetic", "virial")},
+            "terms": {name: mean(name) for name in named},
+            "impulsive": mean("impulsive") if "impulsive" in self.samples[0] else None,
+            "tail": beyond_cutoff(self.simulation, volume),
+        }
+
+
+_OWN = ("volume", "kinetic", "virial", "total")
+
+
+def _virials(
+    simulation: Simulation, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], r: np.ndarray
+) -> Mapping[str, float]:
+    """Sum over pairs of r · F of each term; i as for `Simulation.type_of`."""
+    found, channel, i = {}, i // simulation.atoms, i % simulation.atoms
+    for number, part in enumerate(simulation.model.parts):
+        here = channel == number
+        a, b, r2 = i[here], j[here], jnp.asarray(r[here] ** 2)
+        kind = None if simulation.pair_types == 1 else jnp.asarray(simulation.type_of(a, b))
+        for name, term in part.typed.terms.items():
+            bare = replace(term, weights=())
+            slope = np.asarray(bare.evaluate(r2, kind, bare.at_cutoff())[1])
+            for weight in term.weights:
+                slope = slope * np.asarray(weight)[a] * np.asarray(weight)[b]
+            found[name] = float(-2 * np.sum(np.asarray(r2) * slope))
+    return found
+
+
+def _impulsive(
+    simulation: Simulation,
+    i: Int[np.ndarray, "pairs"],
+    j: Int[np.ndarray, "pairs"],
+    r: Float[np.ndarray, "pairs"],
+) -> float:
+    """Sum of r_cut u(r_cut) times the number of pairs per length there, which two shells inside tell."""
+    r_cut = np.array(simulation.decider.r_cut)[simulation.type_of(i, j)]
+    shell = np.floor((r_cut - r) / (_SHELL * r_cut))
+    # the line through both shells, at the cutoff
+    line = np.select([shell <= 0, shell == 1], [1.5, -0.5], 0.0)
+    return float(np.sum(line * simulation.jumps_of(i, j)[0])) / _SHELL
