@@ -65,7 +65,8 @@ def test_a_list_that_is_kept_gives_the_run_of_one_rebuilt_at_every_step(kind, bo
 
 
 def test_heat_work_and_jumps_close_the_budget_and_the_end_is_compared_in_its_own_box(tmp_path):
-    made: Any = mdnum.run(pressed("mtk", "isotropic"), out=tmp_path / "run", report=False)  # type: ignore[arg-type]
+    simulation: Any = pressed("mtk", "isotropic")
+    made: Any = mdnum.run(simulation, out=tmp_path / "run", report=False)
     summary, series = made.summary, RunFolder.open(tmp_path / "run").read("series")
     owed = series["total"] - series["conserved"]
     assert summary["heat"] + summary["work"] == pytest.approx(owed[-1], rel=1e-9)
@@ -82,6 +83,6 @@ def test_heat_work_and_jumps_close_the_budget_and_the_end_is_compared_in_its_own
     assert np.allclose(made.result.ended.cell.matrix, atoms.cell.array, atol=0, rtol=1e-15)
     assert summary["fastest_period"] == pytest.approx(min(starts, ends), rel=1e-6)
     # a run that has ended already is compared there too
-    again: Any = mdnum.run(None, resume=tmp_path / "run", report=False)
+    again: Any = mdnum.run(simulation, resume=tmp_path / "run", report=False)
     assert np.array_equal(again.result.ended.cell.matrix, made.result.ended.cell.matrix)
     assert again.summary["ase"]["ok"] and again.summary["fastest_period"] == summary["fastest_period"]

@@ -290,6 +290,7 @@ def test_a_folder_has_the_box_of_every_frame_and_the_volume_of_every_step(tmp_pa
     simulation = moving(cutoff="switched")
     made: Any = mdnum.run(simulation, out=tmp_path / "run")  # type: ignore[arg-type]
     assert made.summary["ase"]["ok"] and made.summary["energy_budget_closes"]
+    assert made.summary["pressure"]["impulsive"] is None
     segments = Engine(simulation, STEPS).segments()
     boxes = [segment.cell_of(row) for segment in segments for row in range(segment.rows)]
     series = RunFolder.open(tmp_path / "run").read("series")

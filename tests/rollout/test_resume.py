@@ -211,7 +211,9 @@ def test_a_step_that_is_far_too_long_blows_up_and_says_where(path, tmp_path, tim
         assert np.all(np.isfinite(series[name]))
     assert len(frames) == kept + 1
     # what came before is a complete ledger
-    assert_ledger_is_complete(RunResult(folder.path, summary, build(system), (frames[0], frames[-1])), folder)
+    simulation = build(system)
+    whole = RunResult(folder.path, summary, simulation, (frames[0], frames[-1]), simulation)
+    assert_ledger_is_complete(whole, folder)
     with pytest.raises(FolderError):
         run(None, resume=folder.path)
 
