@@ -171,7 +171,11 @@ def page(run: RunView, verdict: Verdict) -> Page:
     sections = [
         Section("What was run", [pairs(_what(run))]),
         Section("Energy and its budget", list(_energy(run))),
-        *[Section("Pressure", list(_pressure(run)))] * bool(run.summary.get("pressure")),
+        *(
+            Section("Pressure", list(_pressure(run, parts)))
+            for parts in [run.summary.get("pressure")]
+            if parts
+        ),
         Section("Flips per step", list(_flips_per_step(run))),
         Section("Margins in units of rounding", list(_margins(run))),
         Section("Chatter and residence", list(_chatter(run))),
@@ -304,9 +308,9 @@ def _energy(run: RunView) -> Iterator[Any]:
             )  # fmt: skip
 
 
-def _pressure(run: RunView) -> Iterator[Any]:
+def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
     """The pressure in parts, and what the cutoff leaves out of it."""
-    parts, units = run.summary["pressure"], run.units
+    units = run.units
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [
         (f"Virial part of {name}", f"{number(one['mean'], 4)} {units.pressure}")

@@ -435,7 +435,7 @@ def test_a_box_that_becomes_too_narrow_ends_the_run_with_everything_recorded(tmp
     frames: Any = ase.io.read(tmp_path / "run" / "trajectory.traj", index=":")
     assert [atoms.info["step"] for atoms in frames] == list(range(0, last + 1, 10))
     assert folder.has_checkpoint() and folder.read("epochs")["reason"][-1] == NARROW
-    with pytest.raises(FolderError, match=r"perpendicular.*skin of at most"):
+    with pytest.raises(FolderError, match=r"perpendicular.*at most"):
         run(moving(**shrinking), resume=tmp_path / "run")
 
 
