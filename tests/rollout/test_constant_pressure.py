@@ -32,15 +32,9 @@ def pressed(kind: str = "cell-rescaling", box: str = "full", **options: Any) -> 
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("kind", "box"),
-    [
-        ("cell-rescaling", "full"),
-        pytest.param("cell-rescaling", "isotropic", marks=pytest.mark.nightly),
-        pytest.param("mtk", "full", marks=pytest.mark.nightly),
-        pytest.param("mtk", "isotropic", marks=pytest.mark.nightly),
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", ["cell-rescaling", "mtk"])
+@pytest.mark.parametrize("box", ["isotropic", "full"])
 def test_a_list_that_is_kept_gives_the_run_of_one_rebuilt_at_every_step(kind, box):
     """The same keys; sums do not depend on their order."""
     runs = []
