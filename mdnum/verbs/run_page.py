@@ -246,7 +246,7 @@ def _freedom(run: RunView) -> dict[str, Any]:
     """Degrees of freedom that a temperature is divided by, and why so many."""
     freedom, atoms = run.summary.get("degrees_of_freedom"), run.summary.get("atoms") or 0
     if freedom is None:
-        return {}
+        return dict.fromkeys(("freedom", "counted"))
     return {
         "freedom": freedom,
         "counted": TEXTS("freedom_all" if freedom == 3 * atoms else "freedom_at_rest"),
