@@ -18,7 +18,7 @@ class NoseHoover(mdnum.Integrator):
         return jnp.zeros(2)  # the friction, and its integral over time
 
     def pull(self, v, masses):
-        return (2 * self.kinetic(v, masses) / (3 * (v.shape[1] - 1) * self.kT) - 1) / self.tau**2
+        return (2 * self.kinetic(v, masses) / (self.freedom(masses) * self.kT) - 1) / self.tau**2
 
     def begin(self, x, v, extra, at):
         half = 0.5 * self.timestep
@@ -34,7 +34,7 @@ class NoseHoover(mdnum.Integrator):
 
     def exchanged(self, extra, at):
         friction, integral = extra  # heat, and work, which a box would do
-        return -3 * (len(at.masses) - 1) * self.kT * (0.5 * (self.tau * friction) ** 2 + integral), 0.0
+        return -self.freedom(at.masses) * self.kT * (0.5 * (self.tau * friction) ** 2 + integral), 0.0
 
 
 atoms = ase.build.bulk("Ar", "fcc", a=5.4, cubic=True).repeat(4)
