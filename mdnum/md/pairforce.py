@@ -310,10 +310,9 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
         others = factors(force.model, map(mul, own[3:], other[3:]))
-        fx, fy, fz, energy, *virial = terms_of(d, r2, inside, types, *others)
         # a slot of padding is nowhere, and no number times nothing is no number
-        located = [jnp.where(inside, term, 0) for term in (fx, fy, fz, *(virial if tensor else ()))]
-        terms = (*located[:3], energy, *(located[3:] if tensor else virial))
+        located = [jnp.where(inside, c, 0) for c in d]
+        terms = terms_of(located, r2, inside, types, *others)
         return (*terms, margin) if decisions else terms
 
     flags = [one for one in (given, where) if one is not None]
