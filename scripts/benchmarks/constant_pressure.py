@@ -1,6 +1,7 @@
 """What does a step at constant temperature or pressure cost beside one at constant energy?
 
-Answer. Thermostats 1 %, barostats 4 to 15 % (docs/speed.md). It takes five minutes.
+Answer. Thermostats 2 to 3 %, barostats 6 to 10 %, those of a full box 42 to 51 % (docs/speed.md).
+It takes five minutes.
 
 The liquid of benchmark.py, float64, hard cutoff, on one core: every integrator makes as many steps as the
 others in turn, from the same start. Flips are noted and not decoded. Ratios are medians over the turns, of
