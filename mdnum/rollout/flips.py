@@ -404,7 +404,14 @@ def _write_keys(bits, index, order, place, keys):
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
     """Keys of the pairs that the program counted as inside at a row of a segment."""
-    return _keys(simulation, segment.table, segment.rows_of("bits")[row])
+    return _keys(simulation, segment.table, bits_of(segment, row))
+
+
+def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
+    """Packed decisions at a row of a segment; those of the last one without making its steps once more."""
+    if row == segment.rows - 1 and segment.held is not None and segment.closes != "blow-up":
+        return np.asarray(segment.held)
+    return segment.rows_of("bits")[row]
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,14 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.md.cell import displacement
+from mdnum.numerics import set_bits
 from mdnum.rollout.adequacy import beyond_cutoff
 from mdnum.rollout.engine import Segment
-from mdnum.rollout.flips import decided_pairs
+from mdnum.rollout.flips import bits_of
 from mdnum.systems.simulation import Simulation
 
-# pairs just inside the cutoff are counted in two shells of this share of it each; of many pairs some are
-# taken, so that a sample of a large system takes no longer than its step
-_SHELL, _MOST = 0.02, 200_000
+# pairs just inside the cutoff are counted in two shells of this share of it each; of more atoms every so many
+# are asked for theirs, or a sample of a large system would take as long as many steps
+_SHELL, _MOST = 0.02, 2_000
 
 
 @dataclass
@@ -36,6 +38,11 @@ class PressureParts:
     simulation: Simulation
     samples: list[dict[str, float]] = field(default_factory=list)
 
+    @cached_property
+    def _jumps(self) -> Float[np.ndarray, "kinds"]:
+        """What a pair of each kind brings as it enters; they do not depend on the box."""
+        return self.simulation.jumps()[0] if self.simulation.pairwise else np.zeros(1)
+
     def take(self, segment: Segment) -> None:
         """Add the last step of a segment, of a run in a box with a volume."""
         simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
@@ -44,18 +51,26 @@ class PressureParts:
             return
         kinetic, virial = (float(segment.rows_of(name)[row]) for name in ("kinetic", "virial"))
         parts = {"volume": volume, "kinetic": 2 * kinetic / (3 * volume), "virial": virial / (3 * volume)}
-        jumps = simulation.pairwise and bool(np.any(simulation.jumps()[0]))
+        jumps = bool(np.any(self._jumps))
         several = simulation.pairwise and len(simulation.model.terms) > 1
         if jumps or several:
-            keys = decided_pairs(simulation, segment, row)
-            stride = 1 if several else max(1, len(keys) // _MOST)
-            i, j = np.divmod(keys[::stride], simulation.atoms)
+            atoms, table = simulation.atoms, segment.table
+            stride = 1 if several else max(1, atoms // _MOST)
+            slot, column = set_bits(bits_of(segment, row)[:, ::stride])
+            channel, slot = np.divmod(slot, table.slots)
+            i, j = table.order[column * stride], table.order[table.index[slot, column * stride]]
             x = segment.unsorted("x", row).astype(np.float64)
-            r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x[i % simulation.atoms], x[j])))
+            r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x[i], x[j])))
+            # a pair is there from both ends; its channel counts as one of its first atom
+            i, j, share = np.minimum(i, j) + channel * atoms, np.maximum(i, j), stride / (6 * volume)
             if several:
-                parts |= {name: one / (3 * volume) for name, one in _virials(simulation, i, j, r).items()}
+                parts |= {name: share * one for name, one in _virials(simulation, i, j, r).items()}
             if jumps:
-                parts["impulsive"] = stride * _impulsive(simulation, i, j, r) / (3 * volume)
+                kind = simulation.type_of(i, j)
+                weighted = simulation.model.weights
+                jump = simulation.jumps_of(i, j)[0] if weighted else self._jumps[kind]
+                r_cut = np.array(simulation.decider.r_cut)[kind]
+                parts["impulsive"] = share * _impulsive(r, r_cut, jump)
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
@@ -106,14 +121,10 @@ def _virials(
 
 
 def _impulsive(
-    simulation: Simulation,
-    i: Int[np.ndarray, "pairs"],
-    j: Int[np.ndarray, "pairs"],
-    r: Float[np.ndarray, "pairs"],
+    r: Float[np.ndarray, "pairs"], r_cut: Float[np.ndarray, "pairs"], jump: Float[np.ndarray, "pairs"]
 ) -> float:
     """Sum of r_cut u(r_cut) times the number of pairs per length there, which two shells inside tell."""
-    r_cut = np.array(simulation.decider.r_cut)[simulation.type_of(i, j)]
     shell = np.floor((r_cut - r) / (_SHELL * r_cut))
     # the line through both shells, at the cutoff
     line = np.select([shell <= 0, shell == 1], [1.5, -0.5], 0.0)
-    return float(np.sum(line * simulation.jumps_of(i, j)[0])) / _SHELL
+    return float(np.sum(line * jump)) / _SHELL
