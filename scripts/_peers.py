@@ -91,8 +91,8 @@ def lammps_version() -> str | None:
 
 
 def lammps_of(simulation: Simulation, *commands: str) -> Any:
-    """LAMMPS on one core with the Lennard-Jones liquid of a simulation in reduced units, cut off hard: the same
-    list rule, and commands of one's own before the first forces."""
+    """LAMMPS on one core with the Lennard-Jones system of a simulation in reduced units: lj/cut, the same
+    list rule, then further commands and the first forces."""
     # its wheel needs an MPI that is not on the loader's path when it comes from a wheel, too
     mpi = Path(sys.prefix) / "lib" / "libmpi.so.12"
     if mpi.is_file():

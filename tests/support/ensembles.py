@@ -1,14 +1,13 @@
-"""Judges of an ensemble: of plain arrays of a run they say whether it is the one that its integrator promises.
+"""Tests of an ensemble: whether plain arrays of a run are those of the ensemble that its integrator promises.
 
 Each returns a `Judgment`: what was measured, what is expected, and the standard error of their difference,
-which counts how long values stay alike by block averages (Flyvbjerg and Petersen 1989). None of them knows
-mdnum. Where an expectation is not exact, it comes from `monte_carlo`, which samples the same ensemble by another
-method.
+which counts correlation by block averages (Flyvbjerg and Petersen 1989). None of them knows mdnum. Where an
+expectation is not exact, it comes from `monte_carlo`, which samples the same ensemble by another method.
 
-Ensembles. With the velocity of the center of mass at zero the momenta have 3 N - 3 degrees of freedom, and the
-volume has the weight V^(N-1) exp(-p V / kT) times the configurational integral at fixed scaled positions; with a
-thermostat that moves the center of mass they are 3 N and V^N. Of an ideal gas the volume is then distributed as
-Gamma(N) or Gamma(N + 1) in units of kT/p.
+Ensembles. With the velocity of the center of mass at zero the momenta have 3 N - 3 degrees of freedom, and
+the volume has the weight V^(N-1) exp(-p V / kT) times the configurational integral at fixed scaled positions;
+with a thermostat that moves the center of mass they are 3 N and V^N. The volume of an ideal gas is then
+distributed as Gamma(N) or Gamma(N + 1) in units of kT/p.
 """
 
 from __future__ import annotations
@@ -43,16 +42,15 @@ class Judgment(NamedTuple):
 
 
 def settled(a: Any, share: float = 0.2) -> np.ndarray:
-    """A series without its first part, in which a run forgets its start; of runs side by side, one after another."""
+    """A series without its first part, in which a run forgets its start; of several runs, joined."""
     a = np.asarray(a, np.float64)
     return a[..., int(share * a.shape[-1]) :].ravel()
 
 
 def mean(a: Any, blocks: int = 16) -> tuple[float, float]:
-    """The average of a series and its standard error: the largest that blocks of two lengths tell.
+    """The average of a series and its standard error, the larger of those from two block lengths.
 
-    Right where a block is longer than the values stay alike; shorter ones make it too small, so that the longer
-    of the two lengths decides there.
+    The error is right where a block is longer than the correlation time, and too small where it is shorter.
     """
     a = np.asarray(a, np.float64)
     errors = []
@@ -88,7 +86,7 @@ def ideal_volume(volume: Any, kT: float, pressure: float, gamma: int) -> dict[st
 
 
 def kinetic_energy(kinetic: Any, kT: float, freedom: int) -> dict[str, Judgment]:
-    """Equipartition, and the fluctuation that makes it canonical: a Gamma distribution of half the freedom."""
+    """Equipartition, and the variance of the canonical ensemble, a Gamma distribution."""
     return {
         "equipartition": average(kinetic, 0.5 * freedom * kT),
         "canonical": variance(kinetic, 0.5 * freedom * kT**2),
@@ -100,10 +98,33 @@ def mean_pressure(pressure: Any, expected: float) -> Judgment:
     return average(pressure, expected)
 
 
-def compressibility(volume: Any, kT: float, kappa: float, error: float = 0.0) -> Judgment:
-    """The variance of the volume beside kT <V> times the isothermal compressibility, measured otherwise."""
-    expected = kT * float(np.mean(volume)) * kappa
-    return variance(volume, expected, expected * error / kappa)
+def harmonic(energy: Any, least: float, kT: float, modes: int) -> Judgment:
+    """Half a kT of each mode, in what a crystal holds near its minimum: U + p V where the box is one of them.
+
+    Args:
+        least: U + p V of the crystal at rest.
+        modes: 3 N - 3, one more for a volume that moves, six for a box.
+    """
+    return average(energy, least + 0.5 * modes * kT)
+
+
+def shape(box: Any) -> np.ndarray:
+    """How far boxes are from a cube: squares of h hᵀ / V^(2/3) - 1, summed; no rotation changes it."""
+    box = np.asarray(box, np.float64)
+    metric = box @ np.swapaxes(box, -1, -2) / np.abs(np.linalg.det(box))[..., None, None] ** (2 / 3)
+    return np.sum((metric - np.eye(3)) ** 2, axis=(-1, -2))
+
+
+def compressibility(volumes: Sequence[Any], pressures: Sequence[float], kT: float) -> Judgment:
+    """The variance of the volume over kT <V>, at two similar pressures, beside -d ln V / dp between them."""
+    (first, one), (second, other) = (mean(volume) for volume in volumes)
+    kappa = np.log(first / second) / (pressures[1] - pressures[0])
+    error = np.hypot(one / first, other / second) / abs(pressures[1] - pressures[0])
+    own = [variance(volume, 0.0) for volume in volumes]
+    at = (kT * first, kT * second)
+    value = 0.5 * sum(each.value / scale for each, scale in zip(own, at, strict=True))
+    spread = 0.5 * np.hypot(*(each.error / scale for each, scale in zip(own, at, strict=True)))
+    return Judgment(value, float(kappa), float(np.hypot(error, spread)))
 
 
 def two_pressures(volumes: Sequence[Any], pressures: Sequence[float], kT: float) -> Judgment:
@@ -137,7 +158,7 @@ def two_pressures(volumes: Sequence[Any], pressures: Sequence[float], kT: float)
 
 
 def conserves(conserved: Any, kinetic: Any, most: float = 0.1) -> bool:
-    """Whether what should be conserved moves less, over all of a run, than a tenth of what the kinetic energy does."""
+    """Whether the range of the conserved energy over a run is below a tenth of the kinetic energy's."""
     spread = np.ptp(np.asarray(conserved), axis=-1).mean()
     return bool(spread < most * np.ptp(np.asarray(kinetic), axis=-1).mean())
 
@@ -167,17 +188,7 @@ def _pair(r2: float, r_cut: float, shift: float) -> float:
 
 
 @njit(cache=True)
-def _energy(x: np.ndarray, box: np.ndarray, r_cut: float, shift: float) -> float:
-    """Of all pairs, scaled positions in any box, whose vectors are its rows; nearest images."""
-    total = 0.0
-    for i in range(len(x)):
-        for j in range(i):
-            total += _between(x, i, j, x[i], box, r_cut, shift)
-    return total
-
-
-@njit(cache=True)
-def _between(x, i, j, at, box, r_cut, shift):  # noqa: ARG001
+def _between(x, j, at, box, r_cut, shift):
     s0, s1, s2 = at[0] - x[j, 0], at[1] - x[j, 1], at[2] - x[j, 2]
     s0, s1, s2 = s0 - np.rint(s0), s1 - np.rint(s1), s2 - np.rint(s2)
     r2 = 0.0
@@ -188,7 +199,17 @@ def _between(x, i, j, at, box, r_cut, shift):  # noqa: ARG001
 
 
 @njit(cache=True)
-def monte_carlo(x, box, kT, pressure, r_cut, sweeps, full, seed):
+def _energy(x: np.ndarray, box: np.ndarray, r_cut: float, shift: float) -> float:
+    """Of all pairs, scaled positions in any box, whose vectors are its rows; nearest images."""
+    total = 0.0
+    for i in range(len(x)):
+        for j in range(i):
+            total += _between(x, j, x[i], box, r_cut, shift)
+    return total
+
+
+@njit(cache=True)
+def monte_carlo(x, box, kT, pressure, r_cut, sweeps, full, rng):
     """Metropolis sampling at constant pressure of a Lennard-Jones system, shifted at its cutoff.
 
     The center of mass is at rest as in the dynamics: the weight of a volume is V^(N-1) exp(-p V / kT), and of
@@ -198,13 +219,13 @@ def monte_carlo(x, box, kT, pressure, r_cut, sweeps, full, seed):
     Args:
         x: positions, shape (N, 3). box: lattice vectors as rows, lower triangular.
         full: whether the shape changes, too. Else the box is scaled.
-        sweeps: moves of all atoms, each with one of the box. The largest moves follow the acceptance over the
-            first fifth, which is not returned.
+        sweeps: moves of all atoms, each with one of the box, after a quarter as many that are not returned,
+            in which the largest moves follow the acceptance.
+        rng: a generator of numpy.
 
     Returns:
         potential energy, volume and the six entries of the box after each sweep, shape (sweeps, 8).
     """
-    np.random.seed(seed)
     n = len(x)
     s = x @ np.linalg.inv(box)
     box = box.copy()
@@ -217,15 +238,15 @@ def monte_carlo(x, box, kT, pressure, r_cut, sweeps, full, seed):
     warm = sweeps // 4
     for sweep in range(-warm, sweeps):
         for _ in range(n):
-            i = np.random.randint(n)
-            to = s[i] + reach * (2 * np.random.random(3) - 1) / box[0, 0]
+            i = rng.integers(0, n)
+            to = s[i] + reach * (2 * rng.random(3) - 1) / box[0, 0]
             change = 0.0
             for j in range(n):
                 if j != i:
-                    change += _between(s, i, j, to, box, r_cut, shift)
-                    change -= _between(s, i, j, s[i], box, r_cut, shift)
+                    change += _between(s, j, to, box, r_cut, shift)
+                    change -= _between(s, j, s[i], box, r_cut, shift)
             tried += 1
-            if change <= 0 or np.random.random() < np.exp(-change / kT):
+            if change <= 0 or rng.random() < np.exp(-change / kT):
                 s[i] = to
                 energy += change
                 moved += 1
@@ -234,18 +255,18 @@ def monte_carlo(x, box, kT, pressure, r_cut, sweeps, full, seed):
         if full:
             for a in range(3):
                 for b in range(a + 1):
-                    trial[a, b] += stretch * (2 * np.random.random() - 1)
+                    trial[a, b] += stretch * (2 * rng.random() - 1)
             weight = (n - 3) * np.log(trial[0, 0] * trial[1, 1] * trial[2, 2] / volume)
             weight += 2 * np.log(trial[0, 0] / box[0, 0]) + np.log(trial[1, 1] / box[1, 1])
         else:
             # uniform in ln V, which adds a factor V
-            growth = stretch * (2 * np.random.random() - 1)
+            growth = stretch * (2 * rng.random() - 1)
             trial *= np.exp(growth / 3)
             weight = n * growth
         larger = trial[0, 0] * trial[1, 1] * trial[2, 2]
         other = _energy(s, trial, r_cut, shift)
         bends += 1
-        if np.log(np.random.random()) < weight - (other - energy + pressure * (larger - volume)) / kT:
+        if np.log(rng.random()) < weight - (other - energy + pressure * (larger - volume)) / kT:
             box, energy = trial, other
             bent += 1
         if sweep < 0 and tried >= 50 * n:

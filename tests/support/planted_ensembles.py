@@ -35,11 +35,11 @@ def _pressure(dials: Any, at: Any, start: Any) -> Any:
 class DialedMTK(MTK):
     """Martyna, Tobias and Klein's, isotropic.
 
-    Dials: kinetic 2, the kinetic energy counts twice in the pressure; virial 0, it is missing, -1, it has the sign
-    of a stress; stale 1, the volume of the pressure is that of the start; freedom 3, the center of mass, at rest,
-    has its share of the temperature; correction 0, without the kinetic energy that they add (Hoover, Melchionna);
-    slowing 0, velocities do not shrink as the box grows; push 2, the box moves as if half as heavy, and its
-    energy is counted as a whole; chain 0, what its thermostat has taken is not counted.
+    Dials: kinetic 2, the kinetic energy counts twice in the pressure; virial 0, it is missing, -1, it has the
+    sign of a stress; stale 1, the pressure has the volume of the start; freedom 3, the thermostat counts the
+    center of mass, which is at rest; correction 0, without the kinetic energy that they add (Hoover,
+    Melchionna); slowing 0, velocities do not shrink as the box grows; push 2, the box moves as if half as
+    heavy, and its energy is that of the whole inertia; chain 0, the energy of its thermostat is not counted.
     """
 
     dials: Any = eqx.field(kw_only=True)
