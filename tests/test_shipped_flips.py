@@ -23,6 +23,8 @@ LIKE_OTHERS = {
     "pair/leaving-well",
     "silicon/tersoff-512",
     "copper/eam-500",
+    "copper/eam-npt-500",
+    "lj/liquid-npt-500",
 }
 SHORT = {"neighbors.skin": 0.15}
 JAX_MD = {"neighbors.builder": "jax-md", **SHORT}

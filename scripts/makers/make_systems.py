@@ -190,6 +190,12 @@ def crystal_108() -> Atoms:
     return reduced(fcc(4 ** (1 / 3), 3), [(0.02, 5000)], 108, one, one)
 
 
+def lj_liquid_500() -> Atoms:
+    """About the density that the pressure of its file gives, 0.735; melted at 1.6."""
+    one = np.ones((1, 1))
+    return reduced(fcc((4 / 0.735) ** (1 / 3), 5), [(1.6, 4000), (0.8, 10000)], 500, one, one)
+
+
 def kob_andersen_1000() -> Atoms:
     """Kob and Andersen's mixture (Phys. Rev. E 51, 4626, 1995), 80:20 at density 1.2; melted at 3, then 1."""
     edge = (1000 / 1.2) ** (1 / 3)
@@ -225,6 +231,7 @@ STRUCTURES: dict[str, Callable[[], Atoms]] = {
     "argon/tilted-500": tilted_500,
     "argon/crystal-108": crystal_108,
     "binary/kob-andersen-1000": kob_andersen_1000,
+    "lj/liquid-npt-500": lj_liquid_500,
     "pair/at-cutoff": at_cutoff,
     "pair/leaving-well": leaving_well,
 }

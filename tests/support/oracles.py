@@ -101,11 +101,12 @@ def recomputed_flips(frames, cell, pbc, r_cut, compare="r2 <"):
 
     Args:
         frames: positions at step 0, 1, 2, ..., each of shape (atoms, 3).
+        cell: lattice vectors as rows, shape (3, 3), or those of each frame.
         r_cut: one radius, or a function of index arrays (i, j) that gives one for each pair.
     """
     rows, before, counts = [], None, []
     for step, positions in enumerate(frames):
-        i, j, d = all_pairs(positions, cell, pbc)
+        i, j, d = all_pairs(positions, cell[step] if np.ndim(cell) == 3 else cell, pbc)
         radius = r_cut(i, j) if callable(r_cut) else r_cut
         inside, margin = margins(d, radius, compare)
         counts.append(int(inside.sum()))

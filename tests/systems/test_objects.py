@@ -80,6 +80,13 @@ def from_objects(made):
     }  # fmt: skip
     if made.integrator.name == "langevin":
         given["friction"] = made.integrator.number("friction", made.units)
+    elif made.integrator.name != "nve":
+        own, units = made.integrator, made.units
+        numbers = {
+            key: own.number(key, units) for key in own.numbers() if key not in ("timestep", "temperature")
+        }
+        words = {key: getattr(own, key) for key in ("box", "chain") if hasattr(own, key)}
+        given |= {"integrator": own.name, "dynamics": numbers | words}
     if not isinstance(model, CutPotential):
         return mdnum.simulation(made.structure, model, **given)
     numbers = {name: by_pair(made, leaf) for name, leaf in model.potential.leaves.items()}

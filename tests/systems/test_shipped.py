@@ -61,7 +61,9 @@ def test_the_tilted_box_has_no_right_angle_and_rahmans_liquid_his_density():
     assert atoms.get_masses().sum() * 1.66053907 / atoms.get_volume() == pytest.approx(1.374, rel=0.02)
 
 
-@pytest.mark.parametrize("name", ["argon/liquid-864", "argon/langevin-500", "binary/kob-andersen-1000"])
+@pytest.mark.parametrize(
+    "name", ["argon/liquid-864", "argon/langevin-500", "binary/kob-andersen-1000", "lj/liquid-npt-500"]
+)
 def test_liquids_are_liquid(name: str):
     # a crystal's structure factor at its lattice vectors is of the order of the number of atoms
     atoms = load(name).atoms

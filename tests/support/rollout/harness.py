@@ -189,8 +189,8 @@ def assert_ledger_is_complete(result: RunResult, folder: RunFolder) -> int:
     simulation = result.simulation
     spec = simulation.origin.system.spec
     compare = "r <" if spec.cutoff is None else spec.cutoff.compare
-    cell = simulation.origin.system.atoms.cell.array
-    frames = frames_of(folder)
+    read: Any = ase.io.read(folder.path / "trajectory.traj", index=":")
+    frames, cell = [atoms.positions for atoms in read], np.array([atoms.cell.array for atoms in read])
     series, flips = folder.read("series"), folder.read("flips")
     assert len(frames) == len(series["step"])
     rows, counts = recomputed_flips(

@@ -2,9 +2,9 @@
 
 Answer. TO BE WRITTEN
 
-256 Lennard-Jones atoms, cut at 2.5 σ and shifted there, under every such integrator of each code: a
-liquid at T = 0.8 ε/k_B and the density 0.73 σ⁻³; the same at a quarter of the critical pressure (0.032 ε/σ³) in
-a cube; and a crystal at T = 0.3 and that pressure in a box of any shape. The start is the same; lists,
+256 Lennard-Jones atoms, cut at 2.5 σ and shifted there, under every such integrator of each code: a liquid
+at T = 0.8 ε/k_B and the density 0.73 σ⁻³; the same at a quarter of the critical pressure (0.032 ε/σ³) in a
+cube; and a crystal at T = 0.3 and that pressure in a box of any shape. The start is the same; lists,
 integrators and random numbers are not.
 
     density      atoms per σ³
