@@ -149,7 +149,7 @@ def _all_pairs(s: np.ndarray, box: np.ndarray, r_cut: float) -> tuple[float, np.
 class AllPairs(Calculator):
     """The liquid in ASE, without a list: ASE's own Lennard-Jones takes hundreds of times as long."""
 
-    implemented_properties = ("energy", "free_energy", "forces", "stress")
+    implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012
 
     def calculate(self, atoms: Any = None, properties: Any = (), system_changes: Any = all_changes) -> None:
         """All of them at once."""
