@@ -97,6 +97,8 @@ def liquid_judged(rows: dict[str, np.ndarray], expected: dict[str, tuple[float, 
 
 
 KINDS = [DialedMTK, DialedRescaling]
+#: With forces each is compiled for seconds.
+WITH_FORCES = [DialedMTK, pytest.param(DialedRescaling, marks=pytest.mark.nightly)]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -112,7 +114,7 @@ def test_an_ideal_gas_finds(name):
     assert not all(judged.values())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WITH_FORCES)
 def test_a_liquid_is_that_of_monte_carlo(kind):
     rows = liquid_run(dialed(kind, LIQUID, 3.57))
     judged = liquid_judged(rows, MONTE_CARLO, KT, LIQUID["pressure"])
@@ -133,7 +135,10 @@ def test_a_liquid_is_that_of_monte_carlo(kind):
         assert not ensembles.compressibility(quiet, PRESSURES, KT).passes
 
 
-@pytest.mark.parametrize("name", planted.WRONG_VIRIAL)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=[pytest.mark.nightly] * ("rescaling" in one)) for one in planted.WRONG_VIRIAL],
+)
 def test_a_liquid_finds(name):
     kind, wrong = planted.WRONG_VIRIAL[name]
     with np.errstate(all="ignore"):
@@ -153,7 +158,7 @@ def of_rest(p: float) -> tuple[float, float]:
     return enthalpy(found.x), ATOMS * found.x**3 / 2**0.5
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WITH_FORCES)
 def test_a_cold_crystal_holds_half_a_kT_a_mode(kind):
     """Of 3 N - 3 vibrations and the volume; and it comes back from half a percent of either side."""
     kT, p = 0.002, 1.0
