@@ -1,6 +1,7 @@
 """Are averages at constant temperature and pressure those of LAMMPS and ASE?
 
-Answer. TO BE WRITTEN
+Answer. Yes: density, energy, pressure and temperature of 14 runs agree within their errors
+(docs/constant-pressure.md). It takes many minutes.
 
 256 Lennard-Jones atoms, cut at 2.5 σ and shifted there, under every such integrator of each code: a liquid
 at T = 0.8 ε/k_B and the density 0.73 σ⁻³; the same at a quarter of the critical pressure (0.032 ε/σ³) in a

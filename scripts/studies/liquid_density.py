@@ -1,6 +1,8 @@
 """How much of a liquid's density is cutoff, tail, skin, time step and thermostat?
 
-Answer. TO BE WRITTEN
+Answer. The cutoff decides: against a cutoff at 2.5 σ one at 2.2 σ takes 7 % off, one at 3.0 σ adds 4 %, and what
+lies beyond 2.5 σ 9 %. Skin, time step and thermostat change less than the 0.7 % that a run of 40 τ resolves
+(docs/constant-pressure.md). It takes minutes.
 
 A Lennard-Jones liquid of 256 atoms at T = 0.8 ε/k_B and a quarter of its critical pressure (0.032 ε/σ³) under
 stochastic cell rescaling, cut off at 2.5 σ, skin 0.3 σ, time step 0.004 τ; each row changes one of these.
@@ -79,7 +81,7 @@ def density(time: float, given: dict[str, Any]) -> tuple[float, float, int]:
 def main() -> None:
     """Run and print the table."""
     made = parser(__file__, __doc__)
-    made.add_argument("--time", type=float, default=60.0, help="of each run, τ (default %(default)s)")
+    made.add_argument("--time", type=float, default=40.0, help="of each run, τ (default %(default)s)")
     made.add_argument("--only", nargs="*", metavar="WORD", help="rows with one of these words, and the first")
     arguments = made.parse_args()
     rows, first = [], None
