@@ -1,7 +1,7 @@
 """How much of a liquid's density is cutoff, tail, skin, time step and thermostat?
 
-Answer. The cutoff decides: against a cutoff at 2.5 σ one at 2.2 σ takes 7 % off, one at 3.0 σ adds 4 %, and what
-lies beyond 2.5 σ 9 %. Skin, time step and thermostat change less than the 0.7 % that a run of 40 τ resolves
+Answer. The cutoff decides: against a cutoff at 2.5 σ one at 2.2 σ takes 7 % off, one at 3.0 σ adds 4 %, and
+what lies beyond 2.5 σ 9 %. Skin, time step and thermostat change less than a run of 40 τ resolves, about 1 %
 (docs/constant-pressure.md). It takes minutes.
 
 A Lennard-Jones liquid of 256 atoms at T = 0.8 ε/k_B and a quarter of its critical pressure (0.032 ε/σ³) under
