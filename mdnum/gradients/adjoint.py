@@ -27,18 +27,19 @@ from jaxtyping import Array, Float, UInt8
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, crossings, of_energy, onto_crossings
 from mdnum.gradients.losses import LossFrame
-from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
+from mdnum.gradients.parameters import Cotangents, onto_start, quantities, with_quantities
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, in_box
 from mdnum.md import kernel
 from mdnum.md.decide import Tables, halves_of, unpacked
-from mdnum.md.integrators import KickDrift, check_kick, unsorted
-from mdnum.md.pairforce import ChannelForce, ManyBodyForce, PairForce, factors
+from mdnum.md.integrators import Integrator, by_atom, one_step, unsorted
+from mdnum.md.pairforce import ChannelForce, Forces, ManyBodyForce, PairForce, factors
 from mdnum.md.potentials import Channels, of_type
 from mdnum.rollout.epoch import over_rows
 
 #: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
-#: all distances, the forces themselves (for the derivatives by the integrator's numbers), weights of atoms.
-MODEL, SCALE, FORCE, WEIGHT = "model", "scale", "force", "weight"
+#: all distances, the forces themselves (for the derivatives by the integrator's numbers), weights of atoms;
+#: and a strain of all distances, which a box that moves needs.
+MODEL, SCALE, FORCE, WEIGHT, STRAIN = "model", "scale", "force", "weight", "strain"
 ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
@@ -47,7 +48,9 @@ class ForceCotangents(NamedTuple):
 
     x: Float[Array, "3 atoms"]  # on the positions
     model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
-    scale: Float[Array, ""]  # on a common factor of all distances (the box and everything in it), at 1
+    # on a common factor of all distances (the box and everything in it), at 1; with STRAIN on a strain of
+    # them, shape (3, 3)
+    strain: Float[Array, "*axes"]
     force: Float[Array, "3 atoms"]  # the forces themselves, energy/length
 
 
@@ -58,15 +61,16 @@ def pull_back(
     bits: UInt8[Array, "words atoms"],
     onto_force: Float[Array, "3 atoms"],
     onto_energy: Float[Array, ""],
-    onto_virial: Float[Array, ""],
+    onto_virial: Float[Array, "*axes"],
     wanted: frozenset[str] = frozenset(),
 ) -> ForceCotangents:
     """The transpose of one evaluation of forces, energy and virial at given decisions.
 
     Args:
         x: sorted, wrapped positions, length. bits: the decisions that were acted on, packed.
-        onto_force, onto_energy, onto_virial: cotangents of the forces, the potential energy and the virial.
-        wanted: of MODEL, SCALE, FORCE and WEIGHT; what is not wanted comes back as zeros.
+        onto_force, onto_energy: cotangents of the forces and of the potential energy.
+        onto_virial: of the virial, or of its tensor, shape (3, 3) and symmetric.
+        wanted: of MODEL, SCALE, FORCE, WEIGHT and STRAIN; what is not wanted comes back as zeros.
 
     Error: a rounding error for each pair, in the dtype of the force; sums slot by slot.
     """
@@ -76,8 +80,8 @@ def pull_back(
             pull_back(part, x, tables, own, onto_force, onto_energy, onto_virial, wanted)
             for part, own in each
         ]
-        on_x, model, scale, whole = zip(*made, strict=True)
-        return ForceCotangents(reduce(add, on_x), Channels(model), reduce(add, scale), reduce(add, whole))
+        on_x, model, strain, whole = zip(*made, strict=True)
+        return ForceCotangents(reduce(add, on_x), Channels(model), reduce(add, strain), reduce(add, whole))
     of = _of_pairs if isinstance(force, PairForce) else _of_energy
     return of(force, x, tables, bits, onto_force, onto_energy, onto_virial, wanted)
 
@@ -104,6 +108,13 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), dtype))
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
+    def virials(d, r2):
+        """What the virial's cotangent multiplies in a pair's slope, and that of its tensor times the pair."""
+        if not virial.ndim:
+            return virial * r2, None
+        turned = [reduce(add, (virial[a, b] * d[b] for b in range(3))) for a in range(3)]
+        return reduce(add, (d[a] * turned[a] for a in range(3))), turned
+
     def through(r2, along, inside, types, weights):
         """Energy and slope as a function of r², of each slot's own parameters and end and of what all share;
         those of the slots; and the cotangents of energy and slope."""
@@ -115,7 +126,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
             u, s = eqx.combine(potential, shared).evaluate(r2)
             return cut.cut(r2, u, s, end, *weights)
 
-        onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along + virial * r2, 0)
+        onto = jnp.where(inside, 0.5 * energy, 0), -jnp.where(inside, along, 0)
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
@@ -134,7 +145,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
     def onto_weights(r2, along, inside, types, weights, others):
         """Of each slot, what it adds to its atom: the pair is in a slot of the other one, too."""
-        onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along + virial * r2, 0)
+        onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
@@ -143,28 +154,35 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         what a block of slots adds on those that all pairs share."""
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
+        own_virial, turned = virials(d, r2)
+        whole = along + own_virial
         by_slot = by_shared = None
         if of_shared:
-            slope, by_r2, by_slot, by_shared = with_shared(r2, along, inside, types, weights)
+            slope, by_r2, by_slot, by_shared = with_shared(r2, whole, inside, types, weights)
             slope = jnp.where(inside, slope, 0)
             # the reverse pass had all of it but the r² in the virial
-            rest = jnp.where(inside, by_r2, 0) - virial * slope
+            rest = jnp.where(inside, by_r2, 0) - (0 if turned else virial * slope)
         else:
             (_, slope), (_, bend) = jax.jvp(
                 lambda q: model.evaluate(q, types, at, *weights), (r2,), (jnp.ones_like(r2),)
             )
             slope, bend = jnp.where(inside, slope, 0), jnp.where(inside, bend, 0)
             # derivative by r² of what this slot adds to energy and virial
-            rest = energy * (0.5 * slope) - virial * (bend * r2 + slope) - bend * along
+            of_virial = bend * own_virial if turned else virial * (bend * r2 + slope)
+            rest = energy * (0.5 * slope) - of_virial - bend * along
             if MODEL in wanted:
-                ended, slots, onto = through(r2, along, inside, types, weights)
+                ended, slots, onto = through(r2, whole, inside, types, weights)
                 by_slot = jax.vjp(lambda slots: ended(r2, slots, shared), slots)[1](onto)[0]
         pull, twist = slope + slope, 4 * rest
+        if turned:
+            dw = [one + 2 * other for one, other in zip(dw[:3], turned, strict=True)] + list(dw[3:])
         made = [pull * dw[c] - twist * d[c] for c in range(3)]
         if FORCE in wanted:
             made += [pull * d[c] for c in range(3)]
-        if SCALE in wanted:
-            made += [2 * r2 * rest]
+        if STRAIN in wanted:
+            made += [d[a] * (2 * rest * d[b] - slope * dw[b]) for a in range(3) for b in range(3)]
+        elif SCALE in wanted:
+            made += [2 * r2 * rest - slope * (along + 2 * own_virial if turned else along)]
         if MODEL in wanted:
             made += [
                 leaf if types is None else jnp.where(types == kind, leaf, 0)
@@ -172,7 +190,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
                 for kind in range(types_of)
             ]
         if WEIGHT in wanted and weights:
-            made += onto_weights(r2, along, inside, types, weights, dw[3 + several :])
+            made += onto_weights(r2, whole, inside, types, weights, dw[3 + several :])
         return made, by_shared
 
     one_loop = force.in_one_loop(tables) and not of_shared
@@ -181,7 +199,11 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
     on_x = jnp.stack(sums[:3]).astype(x.dtype)
     made = jnp.stack(sums[3:6]).astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x)
     del sums[: 6 if FORCE in wanted else 3]
-    scale = jnp.sum(sums.pop(0)) if SCALE in wanted else jnp.zeros((), dtype)
+    strain = jnp.zeros((), dtype)
+    if STRAIN in wanted:
+        strain = jnp.stack([jnp.sum(sums.pop(0)) for _ in range(9)]).reshape(3, 3)
+    elif SCALE in wanted:
+        strain = jnp.sum(sums.pop(0))
     onto_model, onto_weight = jax.tree.map(jnp.zeros_like, (force.model, model.weights))
     if WEIGHT in wanted and onto_weight:
         places = jax.tree.structure(onto_weight)
@@ -191,7 +213,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         flat = jnp.stack([jnp.sum(total) for total in sums]).reshape(-1, types_of)
         onto_own, onto_at = jax.tree.unflatten(jax.tree.structure((own, at)), list(flat))
         (onto_model,) = back_to_model((onto_own, onto_shared if of_shared else shared, onto_at))
-    return ForceCotangents(on_x, replace(onto_model, weights=onto_weight), scale, made)
+    return ForceCotangents(on_x, replace(onto_model, weights=onto_weight), strain, made)
 
 
 def _differences(cell, own, other):
@@ -244,30 +266,33 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
     values = quantities(force)
     neighbor, dtype = force.neighbors(lax.stop_gradient(x), tables, bits), force.dtype
     matrix = jnp.asarray(force.cell.matrix).astype(dtype)
-    w, virial = onto_force.T.astype(dtype), onto_virial.astype(dtype)
+    unit = jnp.eye(3, dtype=dtype)
+    w, virial = onto_force.T.astype(dtype), onto_virial.astype(dtype) * (1 if onto_virial.ndim else unit)
 
-    def energy(x, values, scale):
+    def energy(x, values, by):
         other: Any = with_quantities(force, values)
-        return force.energy_of(tables, neighbor, other.potential)(x, matrix, scale * jnp.eye(3, dtype=dtype))
+        return force.energy_of(tables, neighbor, other.potential)(x, matrix, by)
 
-    at = (x.T.astype(dtype), values, jnp.ones((), dtype))
+    at = (x.T.astype(dtype), values, unit)
     still = jax.tree.map(jnp.zeros_like, values)
     if MODEL in wanted:
         slope = jax.grad(energy, argnums=(0, 1, 2))
-        (by_x, by_model, by_scale), (bend_x, bend_model, bend_scale) = jax.jvp(slope, at, (w, still, virial))
+        (by_x, by_model, by_strain), (bend_x, bend_model, bend) = jax.jvp(slope, at, (w, still, virial))
         model = jax.tree.map(
             lambda bend, one: (onto_energy * one - bend).astype(one.dtype), bend_model, by_model
         )
     else:
-        slope = jax.grad(lambda x, scale: energy(x, values, scale), argnums=(0, 1))
-        (by_x, by_scale), (bend_x, bend_scale) = jax.jvp(slope, (at[0], at[2]), (w, virial))
+        slope = jax.grad(lambda x, by: energy(x, values, by), argnums=(0, 1))
+        (by_x, by_strain), (bend_x, bend) = jax.jvp(slope, (at[0], at[2]), (w, virial))
         model = still
-    # forces on atoms that are measured in units of the box shrink with the square of its scale
-    scale = 2 * jnp.sum(w * by_x) - bend_scale + (onto_energy - virial) * by_scale
+    # forces and the virial belong to the places after the strain, and the slopes to those before
+    strain = onto_energy * by_strain - bend + w.T @ by_x - by_strain @ virial
+    if STRAIN not in wanted:
+        strain = jnp.trace(strain) if SCALE in wanted else jnp.zeros((), dtype)
     return ForceCotangents(
         (onto_energy * by_x - bend_x).T.astype(x.dtype),
         model,
-        scale if SCALE in wanted else jnp.zeros_like(scale),
+        strain.astype(dtype),
         -by_x.T.astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x),
     )
 
@@ -282,10 +307,12 @@ class AdjointCarry(NamedTuple):
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
     v: Float[Array, "3 atoms"]  # of the half-kicked velocities that lead there
-    # model, integrator, scale: of parameters and of a common factor of all distances, so far
+    extra: Any  # of what of the extra state is no integer
+    # of the lattice vectors there; where the box does not move, of a common factor of them alone
+    matrix: Float[Array, "3 3"]
+    # model, integrator: of parameters, so far
     model: Any
     integrator: Any
-    scale: Float[Array, ""]
     # of the frame of step 0 where the loss compares with it, user's order
     origin: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]
     r_cut: Float[Array, "types"]  # of the cutoffs by the times of flips, so far
@@ -314,8 +341,7 @@ def reverse(
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential that decides by itself with its flips, or an integrator that is no
-            linear `KickDrift`.
+        InputError: a many-body potential that decides by itself, with its flips.
 
     Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
     """
@@ -343,23 +369,28 @@ class StretchReversal:
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
         force = simulation.force
-        check_kick(simulation.integrator)
         if guard is not None and not simulation.imposable:
             raise InputError(
                 "what flips add is known for pair potentials, and for energies that the list decides",
                 remedy="Use the method symmetric for a many-body potential",
                 where=simulation.name,
             )
+        if simulation.integrator.moves_cell:
+            wanted |= {SCALE, STRAIN}
         self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
         self.onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
         nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
-        model, integrator = jax.tree.map(jnp.zeros_like, (quantities(force), numbers))
-        scale, zero = jnp.zeros((), force.policy.dtype("force")), jnp.zeros((), jnp.float64)
+        extra = eqx.filter(tape.start.state.extra, eqx.is_inexact_array)
+        model, integrator, extra = jax.tree.map(jnp.zeros_like, (quantities(force), numbers, extra))
+        if simulation.fixed_point is not None:
+            # a bath of integers is put aside, and not differentiated
+            extra = ()
+        zero, matrix = jnp.zeros((), jnp.float64), jnp.zeros((3, 3), jnp.float64)
         r_cut = jnp.zeros(len(simulation.decider.r_cut), jnp.float64)
         self.met: Crossings | None = None
         self.carry = AdjointCarry(
-            nothing, nothing, model, integrator, scale, (nothing, nothing), r_cut, (zero, zero)
+            nothing, nothing, extra, matrix, model, integrator, (nothing, nothing), r_cut, (zero, zero)
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
@@ -381,18 +412,21 @@ class StretchReversal:
 
     def cotangents(self) -> Cotangents:
         """The derivatives, once the start has been reached."""
-        simulation, carry = self.tape.simulation, self.carry
-        x = np.asarray(carry.x + carry.origin[0], np.float64)
-        v = np.asarray(carry.v + carry.origin[1], np.float64)
-        # distances stretch with the box; the velocities of the start do not
-        scale = float(carry.scale) - float(np.sum(v * np.asarray(simulation.velocities).T))
-        return Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
+        simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
+        integrator, by_x, by_v = onto_start(simulation, start, carry.extra)
+        by_x, whole = (np.asarray(part, np.float64) for part in (by_x + carry.x, carry.origin[0]))
+        # the box, and all that is in it
+        scale = float(np.sum(by_x * np.asarray(start.x)) + np.sum(whole * np.asarray(self.tape.origin.x)))
+        scale += float(np.sum(np.asarray(carry.matrix) * np.asarray(self.force.cell.matrix)))
+        v = np.asarray(by_v + carry.v + carry.origin[1], np.float64)
+        numbers = jax.tree.map(jnp.add, carry.integrator, integrator)
+        return Cotangents(carry.model, numbers, by_x + whole, v, scale, np.asarray(carry.r_cut))
 
 
 @partial(jax.jit, static_argnames=("wanted",))
 def transposed(
     force: PairForce | ManyBodyForce,
-    integrator: KickDrift,
+    integrator: Integrator,
     masses: Float[Array, "atoms"],
     tables,
     rows,
@@ -404,37 +438,44 @@ def transposed(
     carry: AdjointCarry,
     wanted: frozenset[str],
 ):
-    """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace."""
-    loss, origin, around, onto_total, pace = looking
-    order = tables.order
-    # carried from list to list in the user's order
-    carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order])
-    dtype = rows[1].dtype
-    mass_row = masses.astype(dtype)
-    # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
-    numbers, rest = eqx.partition(integrator, eqx.is_inexact_array)
+    """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace.
 
-    def drift(x, v, numbers, scale, step):
-        whole = eqx.combine(numbers, rest)
-        x, v, _ = whole.drift(x, v, masses * (scale * scale), step, order)
-        return x, v
+    The step between two evaluations of forces is transposed by JAX, by its positions, velocities, extra
+    state, forces, virial and box. That of a linear `KickDrift` has the same derivative whatever the forces,
+    so these need not be in the rows; the integrator's numbers get what `pull_back` has made.
+    """
+    loss, origin, around, onto_total, pace = looking
+    order, moves = tables.order, integrator.moves_cell
+    # carried from list to list in the user's order
+    extra = by_atom(lambda part: part[..., order], carry.extra)
+    carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order], extra=extra)
+    dtype = rows[1].dtype
+    numbers, rest = eqx.partition(integrator, eqx.is_inexact_array)
+    inverse, axes = jnp.asarray(force.cell.inverse), max(1, sum(force.cell.pbc))
+
+    def box(matrix):
+        return force.cell.spanned(matrix) if moves else replace(force.cell, matrix=matrix)
+
+    def advance(numbers, x, v, extra, made, matrix, whole, number):
+        end = one_step(
+            eqx.combine(numbers, rest), box(matrix), masses, order, number, x, v,
+            eqx.combine(extra, whole), made,
+        )  # fmt: skip
+        ahead = eqx.filter(end.ahead, eqx.is_inexact_array)
+        return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
         """Cotangents of one frame and of the origin, from those of the sums."""
 
-        def seen_at(x, v, potential, virial, origin, length, timestep):
-            at = (row[0], x, v, row[3], potential, virial)
-            here = around._replace(
-                matrix=around.matrix * length, volume=around.volume * length**3, timestep=timestep
-            )
-            frame = frame_of(at, order, around.matrix)
-            scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
-            x0, v0 = (part * length.astype(dtype) for part in origin)
-            return loss.observe(scaled, LossFrame(origin_step, x0, v0, nan, nan), here)
+        def seen_at(x, v, potential, virial, origin, matrix, timestep):
+            here = in_box(around, matrix)._replace(timestep=timestep)
+            frame = frame_of((row[0], x, v, row[3], potential, virial), order, matrix)
+            return loss.observe(frame, LossFrame(origin_step, *origin, nan, nan), here)
 
         nan, origin_step = origin.potential, origin.step
-        one = jnp.ones((), jnp.float64)
-        _, back = jax.vjp(seen_at, row[1], row[2], row[4], row[5], (origin.x, origin.v), one, around.timestep)
+        matrix = row[6] if moves else around.matrix
+        given = row[1], row[2], row[4], row[5], (origin.x, origin.v), matrix, around.timestep
+        _, back = jax.vjp(seen_at, *given)
         return back(onto_total)
 
     def blind(row):
@@ -442,70 +483,89 @@ def transposed(
 
     def step(carry: AdjointCarry, given):
         row, told, see, span = given
-        number, x, v = row[0], row[1], row[2]
+        number, x, v, inputs = row[0], row[1], row[2], row[7]
         half = (0.5 * integrator.timestep).astype(dtype)
         second = jnp.where(number == 0, jnp.zeros((), dtype), half)
-        one = jnp.ones((), jnp.float64)
-        # drift is linear in x and v, so where it is transposed does not matter to them
-        _, back = jax.vjp(lambda x, v: drift(x, v, numbers, one, number), x, v)
-        onto_x, onto_kicked = back((carry.x, carry.v))
-        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_length, onto_time = lax.cond(
+        matrix = row[6] if moves else jnp.asarray(force.cell.matrix)
+        extra, whole, forces = (), (), Forces(jnp.zeros_like(x), None, row[5], None)
+        if inputs:
+            v, forces = inputs.v, forces._replace(force=inputs.force, tensor=inputs.tensor)
+            extra, whole = eqx.partition(inputs.extra, eqx.is_inexact_array)
+        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_matrix, onto_time = lax.cond(
             see, look, blind, row
         )
-        onto_v = onto_kicked + loss_v
-        w = (half * onto_kicked + second * onto_v) / mass_row
-        made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
-        model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
+        onto = carry.x, carry.v, carry.extra, carry.matrix, loss_v
+        _, back = jax.vjp(lambda *at: advance(numbers, *at, whole, number), x, v, extra, forces, matrix)
+        onto_x, onto_v, onto_extra, onto_forces, by_matrix = back(onto)
+        # what the integrator makes of the virial
+        pressing = onto_forces.virial
+        if inputs and inputs.tensor is not None:
+            pressing = pressing * jnp.eye(3) + onto_forces.tensor
+            onto_virial_all = onto_virial * jnp.eye(3) + 0.5 * (pressing + pressing.T)
+        else:
+            onto_virial_all = onto_virial + pressing if inputs else onto_virial
+        here = replace(force, cell=box(matrix)) if moves else force
+        made = pull_back(
+            here, x, tables, told, onto_forces.force, onto_potential, onto_virial_all, wanted
+        )
+        model, numbers_bar, onto_box = carry.model, carry.integrator, carry.matrix
         if wanted & {MODEL, WEIGHT}:
             model = jax.tree.map(jnp.add, model, made.model)
         if FORCE in wanted:
-            acceleration = made.force / mass_row
-            kicked = integrator.kick(v, half, acceleration)
-            _, back = jax.vjp(lambda numbers, scale: drift(x, kicked, numbers, scale, number), numbers, one)
-            by_numbers, by_scale = back((carry.x, carry.v))
-            kick = jnp.sum(onto_kicked * acceleration) + jnp.where(
-                number == 0, 0, jnp.sum(onto_v * acceleration)
+            if not inputs:
+                forces = forces._replace(force=made.force)
+                v = v - second * (made.force / masses.astype(dtype))
+            _, back = jax.vjp(
+                lambda numbers: advance(numbers, x, v, extra, forces, matrix, whole, number), numbers
             )
+            (by_numbers,) = back(onto)
             by_numbers = eqx.tree_at(
                 lambda one: one.timestep,
                 by_numbers,
-                by_numbers.timestep + (0.5 * kick + onto_time).astype(by_numbers.timestep.dtype),
+                by_numbers.timestep + onto_time.astype(by_numbers.timestep.dtype),
             )
             numbers_bar = jax.tree.map(jnp.add, numbers_bar, by_numbers)
-            scale = scale + by_scale.astype(scale.dtype)
         if SCALE in wanted:
-            scale = scale + made.scale + onto_length.astype(scale.dtype)
+            # a strain moves positions with the box: what is left when these have theirs belongs to the box
+            at, by_x = x.astype(jnp.float64), made.x.astype(jnp.float64)
+            onto_box = by_matrix + onto_matrix
+            if moves:
+                onto_box += here.cell.inverse.T @ (made.strain.astype(jnp.float64) - at @ by_x.T)
+            else:
+                onto_box += inverse.T * ((made.strain.astype(jnp.float64) - jnp.sum(at * by_x)) / axes)
         potential = jnp.where(see, onto_potential.astype(jnp.float64), carry.frame[0])
         virial = jnp.where(see, onto_virial.astype(jnp.float64), carry.frame[1])
         started = jax.tree.map(jnp.add, carry.origin, onto_origin)
         onto_x = onto_x + loss_x + made.x
         after = AdjointCarry(
-            onto_x, onto_v, model, numbers_bar, scale, started, carry.r_cut, (potential, virial)
-        )
-        trace = after._replace(origin=())
+            onto_x, onto_v, onto_extra, onto_box, model, numbers_bar, started, carry.r_cut,
+            (potential, virial),
+        )  # fmt: skip
+        trace = after._replace(origin=(), extra=())
         weights = jnp.zeros(0)
         if crossed is not None:
             met = crossed.row(span, x.shape[1])
-            # the forces are there wherever the derivative by scale is wanted
-            arriving = v - half * made.force / mass_row
             share = pace.share(number, integrator.timestep)
-            here = (x, arriving, jnp.asarray(force.cell.matrix))
             sums = (share * after.frame[0], share * after.frame[1])
+            # a jump of the virial that comes earlier acts on the box for a longer part of the step
+            squeeze = pressing / integrator.timestep if inputs else None
             pull = None
-            if isinstance(force, ManyBodyForce):
-                onto = (after.v + half * after.x) / mass_row
-                pull = of_energy(force, tables, told, met, span[1], x, (onto, *sums))
-            push, weights, by_radius, by_scale = onto_crossings(
-                met, after.x, after.v, here, sums, masses, integrator.timestep, carry.r_cut.shape[0], pull
+            if isinstance(here, ManyBodyForce):
+                onto = (after.v + half * after.x) / masses.astype(dtype)
+                pull = of_energy(here, tables, told, met, span[1], x, (onto, *sums), squeeze)
+            push, weights, by_radius, by_matrix = onto_crossings(
+                met, after.x, after.v, sums, masses, integrator.timestep, carry.r_cut.shape[0], pull, squeeze
             )
             after = after._replace(
                 x=after.x + push,
                 v=after.v - half * push,
+                matrix=after.matrix + by_matrix if SCALE in wanted else after.matrix,
                 r_cut=after.r_cut + by_radius,
-                scale=after.scale + by_scale.astype(after.scale.dtype),
             )
         return after, (weights, trace)
 
     spans = None if crossed is None else crossed.spans
     carry, by_row = over_rows(step, carry, (rows, bits, seen, spans), used, backward=True)
-    return carry._replace(x=unsorted(carry.x, order), v=unsorted(carry.v, order)), by_row
+    x, v = unsorted(carry.x, order), unsorted(carry.v, order)
+    extra = by_atom(lambda part: unsorted(part, order), carry.extra)
+    return carry._replace(x=x, v=v, extra=extra), by_row

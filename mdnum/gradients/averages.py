@@ -146,7 +146,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
         other = pull_back(smooth, row[1], tables, told, still, one, zero, wanted)
         energy = jnp.sum(smooth(row[1], tables, decisions=False, given=told).energy, dtype=jnp.float64)
         kinetic = 0.5 * jnp.sum(masses * jnp.sum(jnp.square(row[2].astype(jnp.float64)), axis=0))
-        both = ((own.model, own.scale), (other.model, other.scale))
+        both = ((own.model, own.strain), (other.model, other.strain))
         (own_model, own_scale), theirs = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), both)
         return (value, by_potential, by_virial, energy, kinetic), (own_model, own_scale + by_length), theirs
 

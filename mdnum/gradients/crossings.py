@@ -145,44 +145,59 @@ def onto_crossings(
     met: Met,
     onto_x: Float[Array, "3 atoms"],
     onto_v: Float[Array, "3 atoms"],
-    here: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"], Float[Array, "3 3"]],
     onto_sums: tuple[Float[Array, ""], Float[Array, ""]],
     masses: Float[Array, "atoms"],
     timestep: Float[Array, ""],
     types: int,
     pull: Float[Array, "most"] | None = None,
-) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, ""]]:
+    squeeze: Float[Array, "*axes"] | None = None,
+) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
     """The transpose of the saltation of one step's crossings.
 
     A crossing lies between two steps, on average in their middle, where positions are half a drift short of
-    the later step's.
+    the later step's. With n from i to j, the force jump f and the radial speed s = n · (v_j - v_i) +
+    n · (dh/dt h^-1) r, in which the box has its part, a distance that is longer by dr there (by
+    n · (dx_j - dx_i) less what the lattice vectors between the two moved) changes by a share dr/s of a time
+    how long the jump has acted:
+
+        d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
+        d(W) = (f r_cut n ⊗ n) dr/s        on whatever the integrator makes of the virial's tensor W
+
+    so the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where S is the cotangent of the
+    virial in a step over the time step.
 
     Args:
         met: the crossings between the step before and this one.
         onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
-        here: these wrapped positions and velocities themselves, and the lattice vectors.
         onto_sums: cotangents of potential energy and virial per time, as frames at equal times see them.
         timestep: internal time. types: number of pair types.
         pull: cotangent of each distance, where a crossing does not act along its pair alone.
+        squeeze: cotangent of the virial that the integrator acts on, or of its tensor, over the time step.
 
     Returns:
         what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
-        crossing, by the cutoff of each pair type, and by a common factor of all distances.
+        crossing, by the cutoff of each pair type, and by the lattice vectors.
     """
     dtype = onto_x.dtype
     half = (0.5 * timestep).astype(dtype)
-    x, v, matrix = here
     if pull is None:
         pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
         onto_potential, onto_virial = onto_sums
+        if squeeze is not None:
+            onto_virial = onto_virial + _of_tensor(squeeze, met.normal)
         pull = pull + (onto_potential * met.potential + onto_virial * met.virial).astype(dtype)
     applied = jnp.where(met.kind >= 0, pull, 0)
     along = applied * met.normal.astype(dtype)
     push = jnp.zeros_like(onto_x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
     kind = jnp.where(met.kind >= 0, met.kind, 0)
     by_radius = jnp.zeros(types, jnp.float64).at[kind].add(-applied.astype(jnp.float64))
-    by_scale = jnp.sum(applied * _along(met, x - half * v, matrix)).astype(jnp.float64)
-    return push, -pull.astype(jnp.float64), by_radius, by_scale
+    by_matrix = -(met.images.astype(jnp.float64) @ along.T.astype(jnp.float64))
+    return push, -pull.astype(jnp.float64), by_radius, by_matrix
+
+
+def _of_tensor(squeeze, normal):
+    """n · S n of each normal, of a tensor S or of a number times the unit tensor."""
+    return jnp.sum(normal * (squeeze @ normal), axis=0) if squeeze.ndim else squeeze
 
 
 def of_energy(
@@ -193,6 +208,7 @@ def of_energy(
     count: Int[Array, ""],
     x: Float[Array, "3 atoms"],
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
+    squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
     """The cotangents of the distances at which an energy gets or loses a pair: E(with) - E(without).
 
@@ -204,11 +220,15 @@ def of_energy(
         count: of its crossings.
         x: this step's wrapped positions.
         onto: cotangents of the velocities, over the masses, and of potential energy and virial.
+        squeeze: as for `onto_crossings`.
     """
     w, potential, virial = onto
     index, atom = tables.index, jnp.arange(x.shape[1])
     slots = jnp.arange(8, dtype=jnp.uint8)[None, :, None]
     matrix, unit = force.cell.matrix.astype(force.dtype), jnp.eye(3, dtype=force.dtype)
+    strain = virial * unit
+    if squeeze is not None:
+        strain = strain + (squeeze if squeeze.ndim else squeeze * unit)
     short = 0.5 * (force.potential.r_cut - _along(met, x, jnp.asarray(force.cell.matrix)))
 
     def one(k, found):
@@ -220,11 +240,11 @@ def of_energy(
             force.energy_of(tables, force.neighbors(at, tables, held)) for held in (bits | pair, bits & ~pair)
         ]
 
-        def change(x, scale):
-            return ends[0](x, matrix, scale * unit) - ends[1](x, matrix, scale * unit)
+        def change(x, by):
+            return ends[0](x, matrix, by) - ends[1](x, matrix, by)
 
-        here = at.T.astype(force.dtype), jnp.ones((), force.dtype)
-        jump, slope = jax.jvp(change, here, (w.T.astype(force.dtype), virial.astype(force.dtype)))
+        here = at.T.astype(force.dtype), unit
+        jump, slope = jax.jvp(change, here, (w.T.astype(force.dtype), strain.astype(force.dtype)))
         return found.at[k].set(met.push[k] * (potential * jump - slope))
 
     return lax.fori_loop(0, count, one, jnp.zeros_like(met.push)).astype(x.dtype)
@@ -295,6 +315,8 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     if simulation.channels > 1:
         ledger = replace(ledger, i=low % simulation.atoms)
     cell, x, ahead = HostCell(simulation.cell), stretch.x.reshape(-1), stretch.x_before.reshape(-1)
+    boxes = [stretch.cell_of(row - 1, simulation.cell) for row in range(stretch.rows + 1)]
+    matrices, inverses = (np.array([getattr(one, name) for one in boxes]) for name in ("matrix", "inverse"))
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -303,11 +325,18 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
-    earlier = np.stack(cell.displacement(positions(row - 1, i), positions(row - 1, j)), axis=1)
-    now_i, now_j = positions(row, i).astype(np.float64), positions(row, j).astype(np.float64)
-    now = np.stack(cell.displacement(now_i, now_j), axis=1)
-    inverse = np.asarray(simulation.cell.inverse, np.float64)
-    images = np.rint((now_j - now_i - now) @ inverse).astype(np.int64)
+    def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest images of the differences, and the lattice vectors from these to the wrapped ones."""
+        start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
+        inverse = inverses[rows + 1]
+        if stretch.cell.size:
+            n = np.rint(np.einsum("ka,kab->kb", end - start, inverse))
+            near = end - start - np.einsum("ka,kab->kb", n, matrices[rows + 1])
+        else:
+            near = np.stack(cell.displacement(start, end), axis=1)
+        return near, np.rint(np.einsum("ka,kab->kb", end - start - near, inverse)).astype(np.int64)
+
+    (earlier, _), (now, images) = apart(row - 1), apart(row)
     change = np.linalg.norm(now, axis=1) - np.linalg.norm(earlier, axis=1)
     speed = change / float(simulation.integrator.timestep)
     middle = earlier + now

@@ -40,7 +40,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """What does not change along a run."""
+    """What a loss may know beside a frame; the box is that of the frame."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -207,7 +207,29 @@ class MeanPressure(Loss):
         return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
+        return _bulk(around)
+
+
+class MeanVolume(Loss):
+    """Volume of the box, averaged over frames, length³."""
+
+    name, label, unit = "volume", "volume of the box, averaged over steps", "{length}³"
+    of_single_frames = True
+
+    def observe(self, frame, origin, around):
+        return around.volume
+
+    def reason_unavailable(self, around: LossContext) -> str | None:
+        return _bulk(around)
+
+
+class MeanDensity(MeanVolume):
+    """Mass of all atoms over the volume, averaged over frames, mass/length³."""
+
+    name, label, unit = "density", "mass over volume, averaged over steps", "{mass}/{length}³"
+
+    def observe(self, frame, origin, around):
+        return jnp.sum(around.masses) / around.volume
 
 
 class EinsteinDiffusion(Loss):
@@ -329,8 +351,8 @@ class RadialDistribution(Loss):
 
     def reason_unavailable(self, around: LossContext) -> str | None:
         """Distances are those of nearest images."""
-        if not float(around.volume) > 0:
-            return "the box has no volume: it is not periodic everywhere"
+        if why := _bulk(around):
+            return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
         reach = self.r_max + 2 * self.width
         if reach > half:
@@ -390,6 +412,11 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
     return counts[2 : bins + 2]
 
 
+def _bulk(around: LossContext) -> str | None:
+    """Why nothing is measured by the volume; else None."""
+    return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
+
+
 def _correlation(frame: LossFrame, origin: LossFrame):
     return jnp.mean(jnp.sum(frame.v.astype(jnp.float64) * origin.v.astype(jnp.float64), axis=0))
 
@@ -403,7 +430,8 @@ def _kinetic(frame: LossFrame, around: LossContext) -> Float[Array, ""]:
 LOSSES: Registry[Loss] = Registry("loss", "mdnum.losses", Loss)
 for _loss in (
     MeanSquaredDisplacement, VelocityAutocorrelation, EinsteinDiffusion, GreenKuboDiffusion,
-    RadialDistribution, MeanPotential, MeanTemperature, MeanPressure, FinalProjection,
+    RadialDistribution, MeanPotential, MeanTemperature, MeanPressure, MeanVolume,
+    MeanDensity, FinalProjection,
 ):  # fmt: skip
     LOSSES.add(_loss.name, _loss, description=_loss.label)
 

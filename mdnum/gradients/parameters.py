@@ -75,6 +75,22 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
     return replace(force, potential=manybody.with_quantities(force.potential, values))
 
 
+def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
+    """Derivatives by the integrator's numbers, first positions and velocities, from those of the extra state
+    that these begin with.
+
+    Args:
+        start: the state of step 0.
+    """
+
+    def begun(numbers, x, v):
+        made = eqx.combine(numbers, rest).init(x, v, jnp.asarray(simulation.masses))
+        return eqx.filter(made, eqx.is_inexact_array)
+
+    numbers, rest = eqx.partition(simulation.integrator, eqx.is_inexact_array)
+    return jax.vjp(begun, numbers, start.x, start.v)[1](extra)
+
+
 def names(simulation: Simulation) -> tuple[str, ...]:
     """Parameters that a simulation can be differentiated by."""
     # there is no derivative by a temperature of 0

@@ -15,7 +15,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
-from mdnum.md.integrators import check_one_box, without_kick
+from mdnum.md.integrators import without_kick
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
 from mdnum.systems.simulation import Simulation
@@ -54,7 +54,6 @@ class Problem:
             raise InputError(f"steps = {self.steps}; expected at least 1")
         # a state that the integrator has no steps for is refused before anything is run
         assert self.simulation.propagator is not None
-        check_one_box(self.simulation.integrator, "gradients")
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
                 f"the loss {self.loss.name} looks at no step up to {self.steps}",
@@ -226,11 +225,15 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
     return notes
 
 
-def pairs_only(simulation: Simulation) -> str | None:
-    """Why the reverse pass of pairs does not apply; None where it does."""
+def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
+    """Why the reverse pass of pairs does not apply; None where it does.
+
+    Args:
+        any_step: whether it is for any integrator.
+    """
     if not isinstance(simulation.force, PairForce):
         return "it is for pair potentials"
-    return without_kick(simulation.integrator) or rounded(simulation)
+    return (None if any_step else without_kick(simulation.integrator)) or rounded(simulation)
 
 
 def one_term(simulation: Simulation) -> str | None:

@@ -129,7 +129,7 @@ class Symmetric(Method):
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
         simulation = problem.simulation
-        return pairs_only(simulation) if simulation.pairwise else without_kick(simulation.integrator)
+        return pairs_only(simulation, any_step=True) if simulation.pairwise else None
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         made = passed(problem, names, saltation=False, budget=self.budget, progress=progress)
@@ -159,10 +159,10 @@ class EventAware(Method):
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
         simulation = problem.simulation
         if simulation.pairwise:
-            return pairs_only(simulation)
+            return pairs_only(simulation, any_step=True)
         if not simulation.imposable:
             return "it is for pair potentials, and for energies that take a listed pair wherever it is"
-        return without_kick(simulation.integrator)
+        return None
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         made = passed(problem, names, guard=self.guard, budget=self.budget, progress=progress)
@@ -331,7 +331,7 @@ def radial_speed(simulation: Simulation) -> float:
 def wanted(names: Sequence[str]) -> frozenset[str]:
     """What the reverse pass has to work out for these parameters."""
     parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
-    parts |= {"dynamics": {FORCE}, "box": {SCALE, FORCE}}
+    parts |= {"dynamics": {FORCE}, "box": {SCALE}}
     return frozenset(
         part for name in names
         for part in ((WEIGHT,) if parameters.is_weight(name) else parts.get(name.partition(".")[0], ()))

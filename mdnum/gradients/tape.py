@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
 from mdnum.gradients.losses import NOT_REAL, Loss, LossContext, LossFrame
-from mdnum.md.integrators import unsorted
+from mdnum.md.cell import Cell
+from mdnum.md.integrators import unsorted, without_kick
 from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.backward import BackwardRun, Stretched
@@ -52,27 +53,33 @@ class TapeStretch:
     # potential, virial: by row
     potential: Float[np.ndarray, "room"]
     virial: Float[np.ndarray, "room"]
+    cell: Float[np.ndarray, "room vectors 3"]  # lattice vectors, where they move
+    inputs: Any  # `StepInputs`, where the integrator is no linear kick and drift; else ()
+    # the box of the step before, where it moves
+    cell_before: Cell
     table: PairTable  # the list
     ledger: FlipTable | None = None  # its flips; None where they were not asked for
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes."""
-        kept = (self.x, self.v, self.images, self.bits, self.x_before, self.table.index)
-        return sum(array.nbytes for array in kept)
+        kept = ([getattr(self, name) for name in _COLUMNS], self.x_before, self.table.index)
+        return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
         """A copy with room for so many rows; default those in use."""
-        kept: dict[str, Any] = {}
-        for name in _COLUMNS:
-            rows = getattr(self, name)[: self.rows]
-            kept[name] = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
-            kept[name][: self.rows] = rows
-        return replace(self, **kept)
+
+        def copied(rows: np.ndarray) -> np.ndarray:
+            kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
+            kept[: self.rows] = rows[: self.rows]
+            return kept
+
+        return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
         """A copy with room for as many rows as other stretches have: not every length is compiled for."""
-        per_row = sum(getattr(self, name)[0].nbytes for name in _COLUMNS)
+        columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
+        per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
 
     @property
@@ -82,20 +89,34 @@ class TapeStretch:
 
     @property
     def columns(self):
-        """Columns as a loss needs them: step, x, v, images, potential, virial."""
-        return (self.steps, self.x, self.v, self.images, self.potential, self.virial)
+        """Columns as a loss needs them, step, x, v, images, potential, virial, cell; and the inputs."""
+        return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
+
+    def cell_of(self, row: int, cell: Cell) -> Cell:
+        """The box at a row, on the host; row -1 is the step before the first.
+
+        Args:
+            cell: that of a run whose box does not move.
+        """
+        if not self.cell.size:
+            return cell
+        return self.cell_before if row < 0 else Cell.create(self.cell[row], cell.pbc)
 
 
 #: Columns of a record that a tape keeps.
-_COLUMNS = ("x", "v", "images", "bits", "potential", "virial")
+_COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 
 def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
     """A copy of what a segment recorded from a start; the segment's own record is used again."""
-    columns: dict[str, Any] = {name: np.asarray(getattr(segment.record, name)) for name in _COLUMNS}
+    columns: dict[str, Any] = {name: getattr(segment.record, name) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
-    made = TapeStretch(segment.first, segment.rows, **columns, x_before=x_before, table=segment.table)
-    return replace(made, ledger=ledger).roomy()
+    before = jax.tree.map(np.asarray, start.state.cells[len(start.state.cells) > 1])
+    made = TapeStretch(
+        segment.first, segment.rows, **jax.tree.map(np.asarray, columns), x_before=x_before,
+        cell_before=before, table=segment.table, ledger=ledger,
+    )  # fmt: skip
+    return made.roomy()
 
 
 class Pace(NamedTuple):
@@ -156,7 +177,8 @@ class RunTape:
         self._recorder = PairRecorder(simulation) if flips else None
         # stretches that are kept; of others what it takes to run them again
         self._made: list[TapeStretch | tuple[Start, FlipTable | None]] = []
-        self._engine = Engine(simulation, steps, start=self.start)
+        inputs = without_kick(simulation.integrator) is not None
+        self._engine = Engine(simulation, steps, start=self.start, inputs=inputs)
         self._begin()
         for segment in self._engine.segments():
             if segment.closes in FAILURES:
@@ -293,8 +315,11 @@ class ReversibleTape(RunTape):
         for made in way.stretches():
             self._compare(made)
             self.stretches += 1
-            columns: Any = {name: np.asarray(getattr(made.record, name)) for name in _COLUMNS}
-            yield TapeStretch(made.first, made.rows, **columns, x_before=made.x_before, table=made.table)
+            columns: Any = {name: getattr(made.record, name) for name in _COLUMNS}
+            yield TapeStretch(
+                made.first, made.rows, **columns, x_before=made.x_before,
+                cell_before=self.simulation.cell, table=made.table,
+            )  # fmt: skip
         # the first state, every bit of it
         for name in ("x", "v", "images"):
             a, b = (np.asarray(getattr(state, name)) for state in (self.start.state, way.back))
@@ -337,8 +362,8 @@ def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.nda
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """A row in the user's order, without the faces of the box."""
-    step, x, v, images, potential, virial = row
+    """A row in the user's order, without the faces of the box, which has those lattice vectors."""
+    step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
@@ -349,7 +374,8 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
         row, see = row
 
         def add(total):
-            part = loss.observe(frame_of(row, order, around.matrix), origin, around)
+            here = in_box(around, row[6]) if row[6].size else around
+            part = loss.observe(frame_of(row, order, here.matrix), origin, here)
             return jax.tree.map(jnp.add, total, part)
 
         return lax.cond(see, add, lambda total: total, total), None
@@ -357,8 +383,14 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
     return over_rows(step, total, (rows, seen), used)[0]
 
 
+def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
+    """The surroundings with other lattice vectors."""
+    volume = jnp.abs(jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2])))
+    return around._replace(matrix=matrix, volume=jnp.where(around.volume > 0, volume, 0.0))
+
+
 def surroundings(simulation: Simulation) -> LossContext:
-    """Masses and box of a simulation."""
+    """Masses and box of a simulation at its start."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
     parts = (

@@ -139,7 +139,11 @@ class Cell(eqx.Module):
         Args:
             by: shape (3, 3), float64. A box along x, y and z must stay so, or have orthorhombic = False.
         """
-        matrix, flags = self.matrix @ by, np.array(self.pbc)
+        return self.spanned(self.matrix @ by)
+
+    def spanned(self, matrix) -> Cell:
+        """The box of other lattice vectors, as rows, with the same axes periodic (inside jit)."""
+        flags = np.array(self.pbc)
         rows = jnp.where(flags[:, None], matrix, 0.0)
         # of the products of rows: a free axis, which has none, keeps an inverse of 0
         square = rows @ rows.T + np.diag(np.where(flags, 0.0, 1.0))

@@ -196,5 +196,5 @@ class BackwardRun:
 
 def _rolled(record: EpochRecord, rows: int) -> EpochRecord:
     """The rows that were filled from the end, brought to the front; a copy on the host."""
-    columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record[:-1]]
+    columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record[:-2]]
     return EpochRecord(*columns)

@@ -27,6 +27,7 @@ from mdnum.rollout.epoch import (
     EpochRecord,
     EpochState,
     Pins,
+    StepInputs,
     empty_record,
     run_epoch,
 )
@@ -201,6 +202,7 @@ class Engine:
             double precision a tenth of the memory, and `Segment.rows_of` makes the steps of a segment once
             more where somebody asks.
         pins: decisions to act on instead of the run's own. The record holds its own all the same.
+        inputs: whether rows also have what a derivative of their step is taken at.
     """
 
     def __init__(
@@ -212,6 +214,7 @@ class Engine:
         record: bool = True,
         rows: bool = True,
         pins: Pins | None = None,
+        inputs: bool = False,
     ):
         check_not_forked()
         self.simulation = simulation
@@ -227,9 +230,13 @@ class Engine:
         masses, half_skin, r_list, r_cut = jax.device_put((simulation.masses, *map(np.float64, lengths)))
         self.program = EpochProgram(
             simulation.force, simulation.propagator, masses, half_skin, r_list, r_cut,
-            rule.every, rule.delay, rule.check, record, self.rows,
+            rule.every, rule.delay, rule.check, record, self.rows, inputs=inputs,
         )  # fmt: skip
         self._moves = self.program.integrator.moves_cell
+        state, tensor = self.start.state, None
+        if self.program.integrator.anisotropic:
+            tensor = jax.ShapeDtypeStruct((3, 3), np.dtype(np.float64))
+        self._inputs = StepInputs(state.v, state.extra, state.v, tensor) if inputs else ()
         self._cell = jax.tree.map(np.asarray, self.start.state.cells[0])
         # a liquid has one change for ten atoms a step; where there are more, room is doubled
         self._room_for_changes(0 if self.rows else max(64, simulation.atoms // 4))
@@ -245,6 +252,7 @@ class Engine:
         """Rows of a record: a power of two within the memory allowed."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
+        per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))
         rows = max(2, min(_MOST_ROWS, _RECORD_BYTES // per_row))
         # no list is expected to live longer than the run
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
@@ -259,7 +267,8 @@ class Engine:
         if held is not None and held.bits.shape[:2] == (rows, words) and had == changes:
             return held
         dtype = self.simulation.policy.dtype("state")
-        return empty_record(rows, words, self.simulation.atoms, dtype, self.record, changes, self._moves)
+        rest = changes, self._moves, self._inputs
+        return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
         """Return a record that nobody reads any more."""
@@ -360,7 +369,7 @@ class Engine:
         """The steps from a start to a last one of the same list, recorded row by row."""
         engine = Engine(self.simulation, last, start=start, pins=self.pins)
         parts: list[list[Any]] = [
-            [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-1]]
+            [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-2]]
             for segment in engine.segments()
         ]
         whole: list[Any] = [np.concatenate(columns) for columns in zip(*parts, strict=True)]

@@ -99,6 +99,7 @@ class EpochProgram(eqx.Module):
     # whether they do so row by row, with positions; else as changes from one row to the next
     rows: bool = eqx.field(static=True, default=True)
     most: int = eqx.field(static=True, default=0)  # changes of one row that there is room for, without rows
+    inputs: bool = eqx.field(static=True, default=False)  # whether rows have what their step was made of
 
 
 class EpochState(NamedTuple):
@@ -114,6 +115,15 @@ class EpochState(NamedTuple):
     extra: Any = ()  # of the integrator, as `Integrator.init` makes it
     # the box, float64; where the integrator moves it, also those of the step before and of the list's build
     cells: tuple[Cell, ...] = ()
+
+
+class StepInputs(NamedTuple):
+    """What a step is made of beside its positions, box and virial, for derivatives; atoms sorted."""
+
+    v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
+    extra: Any  # the extra state then
+    force: Float[Array, "3 atoms"]  # energy/length, in the dtype of the state
+    tensor: Float[Array, "3 3"] | None  # as `Forces.tensor`
 
 
 class EpochRecord(NamedTuple):
@@ -136,6 +146,7 @@ class EpochRecord(NamedTuple):
     inside: Float[Array, "rows"]  # how many decisions are yes, without rows; shape (rows,)
     cell: Float[Array, "rows vectors 3"]  # lattice vectors, shape (rows, 3, 3), or (rows, 0, 3) of one box
     changes: Changes | None = None  # of decisions from row to row, instead of rows
+    inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
         """The boxes of the first rows, on the host; none where there is one for all."""
@@ -168,13 +179,21 @@ class EpochOutcome(NamedTuple):
 
 
 def empty_record(
-    rows: int, words: int, atoms: int, dtype, record: bool, changes: int | None = None, cells: bool = False
+    rows: int,
+    words: int,
+    atoms: int,
+    dtype,
+    record: bool,
+    changes: int | None = None,
+    cells: bool = False,
+    inputs: Any = (),
 ) -> EpochRecord:
     """Room for the rows of an epoch; without recording only the per-step numbers have room.
 
     Args:
         changes: room for so many instead of for decisions and positions.
         cells: whether rows have their own box.
+        inputs: `StepInputs` of any step, where rows have them.
     """
     record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
@@ -186,6 +205,7 @@ def empty_record(
         **{name: zeros(rows, np.float64) for name in _NUMBERS},
         cell=zeros((rows, 3 * cells, 3), np.float64),
         changes=None if changes is None else Changes.empty(changes, dtype),
+        inputs=jax.tree.map(lambda one: zeros((rows, *one.shape), one.dtype), inputs),
     )
 
 
@@ -196,14 +216,12 @@ def inside_of(bits: UInt8[Array, "words atoms"]) -> Int[Array, ""]:
 
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     """Write one row of the named columns."""
-    return record._replace(
-        **{
-            name: lax.dynamic_update_index_in_dim(
-                getattr(record, name), jnp.asarray(value, getattr(record, name).dtype), row, 0
-            )
-            for name, value in values.items()
-        }
-    )
+
+    def put(column, value):
+        return lax.dynamic_update_index_in_dim(column, jnp.asarray(value, column.dtype), row, 0)
+
+    changed = {name: jax.tree.map(put, getattr(record, name), value) for name, value in values.items()}
+    return record._replace(**changed)
 
 
 def over_rows(
@@ -312,6 +330,8 @@ def run_epoch(
         }
         if moves:
             values["cell"] = cell.matrix
+        if program.inputs:
+            values["inputs"] = StepInputs(v, extra, made.force.astype(dtype), made.tensor)
         if program.record:
             d = made.decisions
             assert d is not None

@@ -92,12 +92,12 @@ class GrowthWatch:
             self.norms[first : first + rows, 2] = np.sqrt(np.mean(np.sum(v * v, axis=1), axis=1))
         leaves, structure = jax.tree.flatten((trace.model, trace.integrator))
         leaves = [np.asarray(leaf) for leaf in leaves]
-        scale, r_cut = np.asarray(trace.scale, np.float64), np.asarray(trace.r_cut)
+        matrix, r_cut = np.asarray(trace.matrix), np.asarray(trace.r_cut)
         for row in range(rows if self._scalars else 0):
             model, integrator = jax.tree.unflatten(structure, [leaf[row] for leaf in leaves])
-            turned = float(np.sum(onto_v[row] * v[row]))
-            own_scale = float(scale[row]) - turned
-            parts = Cotangents(model, integrator, onto_x[row], onto_v[row], own_scale, r_cut[row])
+            box = stretch.cell_of(row, self.simulation.cell).matrix
+            scale = float(np.sum(onto_x[row] * stretch.x[row]) + np.sum(matrix[row] * np.asarray(box)))
+            parts = Cotangents(model, integrator, onto_x[row], onto_v[row], scale, r_cut[row])
             # a temperature scales the velocities that the run has here
             here = replace(self.simulation, velocities=v[row].T)
             for name in self._scalars:
