@@ -368,7 +368,7 @@ class StretchReversal:
 
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
-        force = simulation.force
+        force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
                 "what flips add is known for pair potentials, and for energies that the list decides",
@@ -377,6 +377,7 @@ class StretchReversal:
             )
         if simulation.integrator.moves_cell:
             wanted |= {SCALE, STRAIN}
+            force = replace(force, cell=tape.start.state.cells[0])
         self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
         self.onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
         nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))

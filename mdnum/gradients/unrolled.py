@@ -27,9 +27,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from mdnum.errors import NumericalError
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import LossContext, LossFrame
-from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
+from mdnum.gradients.parameters import Cotangents, onto_start, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings
+from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, in_box, no_sums, surroundings
+from mdnum.md.cell import Cell
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import by_atom, one_step, unsorted
 from mdnum.md.neighbors import PairTable
@@ -51,17 +52,18 @@ class Inputs(NamedTuple):
     # x, v: wrapped positions and velocities of step 0, user's order
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
-    scale: Float[Array, ""]  # a common factor of the box and of all positions, 1
+    scale: Float[Array, ""]  # a common factor of the frame that a loss compares with, 1
 
 
 class StepEnds(NamedTuple):
     """What one step hands to the next and a derivative goes through, user's order: wrapped positions,
-    half-kicked velocities, sums of the loss, what of the extra state is no integer."""
+    half-kicked velocities, sums of the loss, what of the extra state is no integer, the box."""
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
     total: Any
     extra: Any
+    matrix: Float[Array, "3 3"]  # lattice vectors
 
 
 class RunConstants(NamedTuple):
@@ -70,7 +72,9 @@ class RunConstants(NamedTuple):
     force: Any
     integrator: Any
     masses: Float[Array, "atoms"]
+    # half the skin, radius of the list
     half_skin: Float[Array, ""]
+    r_list: Float[Array, ""]
     loss: Any
     around: LossContext
     # lattice vectors taken off the positions of step 0. The rest as in a rollout
@@ -83,6 +87,7 @@ class Place(NamedTuple):
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
     home: Float[Array, "3 atoms"]  # wrapped positions at which the list was built
+    cell: Cell  # the box there
     built: Int[Array, ""]  # at which step
     extra: Any  # the integers of the extra state
 
@@ -119,47 +124,48 @@ def chunk(
     every, delay, check = rule
     order, scale = tables.order, inputs.scale
     dtype = between.x.dtype
-    matrix = jnp.asarray(fixed.force.cell.matrix) * scale
     force = with_quantities(fixed.force, inputs.model)
-    force = replace(force, cell=replace(force.cell, matrix=matrix))
     integrator = eqx.combine(inputs.numbers, eqx.filter(fixed.integrator, eqx.is_inexact_array, inverse=True))
-    cell = force.cell.astype(dtype)
+    moves, template = integrator.moves_cell, place.cell
+    first = replace(template, matrix=between.matrix)
     masses = fixed.masses[order]
     home = place.home[:, order]
-    around = fixed.around._replace(
-        matrix=fixed.around.matrix * scale,
-        volume=fixed.around.volume * scale**3,
-        timestep=integrator.timestep,
-    )
+    around = fixed.around._replace(timestep=integrator.timestep)
+    matrix = fixed.around.matrix * scale
     whole = inputs.x * scale.astype(dtype) + (matrix.T @ fixed.images.astype(matrix.dtype)).astype(dtype)
     nan = jnp.full((), jnp.nan)
     origin = LossFrame(jnp.zeros((), jnp.int64), whole, inputs.v, nan, nan)
 
-    def used_up(x, step):
-        largest = lax.stop_gradient(cell).farthest(lax.stop_gradient(x) - home)
+    def used_up(x, cell, step):
+        x, cell = lax.stop_gradient((x, cell))
+        if moves:
+            largest = cell.spent(x, template, home, fixed.r_list)
+        else:
+            largest = cell.astype(dtype).farthest(x - home)
         age = step - place.built
         allowed = (age >= delay) & (age % every == 0)
         return allowed & (largest > fixed.half_skin) if check else allowed
 
     def observe(total, row):
-        seen = fixed.loss.observe(frame_of(row, order, matrix), origin, around)
+        *row, matrix = row
+        seen = fixed.loss.observe(frame_of(row, order, matrix), origin, in_box(around, matrix))
         return jax.tree.map(jnp.add, total, seen)
 
     def act(carry, see):
-        step, x, v, images, extra, total, _, finite, rows = carry
-        made = force(x, tables, decisions=True, tensor=integrator.anisotropic)
-        end = one_step(integrator, force.cell, masses, order, step, x, v, extra, made)
+        step, x, v, images, extra, matrix, total, _, finite, rows = carry
+        cell = template.spanned(matrix) if moves else first
+        made = replace(force, cell=cell)(x, tables, decisions=True, tensor=integrator.anisotropic)
+        end = one_step(integrator, cell, masses, order, step, x, v, extra, made)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
-        total = lax.cond(
-            see, observe, lambda total, _: total, total, (step, x, end.v, images, potential, made.virial)
-        )
+        row = step, x, end.v, images, potential, made.virial, cell.matrix
+        total = lax.cond(see, observe, lambda total, _: total, total, row)
         assert made.decisions is not None
         row = (x, end.v, made.decisions.bits)
         images = images + lax.stop_gradient(end.images).astype(jnp.int32)
         finite = finite & jnp.isfinite(potential) & jnp.isfinite(jnp.sum(jnp.square(end.v)))
         step = step + 1
-        at = step, end.x, end.kicked, images, end.ahead
-        return (*at, total, used_up(end.x, step), finite, rows + 1), row
+        at = step, end.x, end.kicked, images, end.ahead, end.cell.matrix if moves else matrix
+        return (*at, total, used_up(end.x, end.cell, step), finite, rows + 1), row
 
     nothing = jax.eval_shape(force.decide, between.x, tables).bits
 
@@ -173,13 +179,16 @@ def chunk(
 
     extra = by_atom(lambda a: a[..., order], eqx.combine(between.extra, place.extra))
     start = (place.step, between.x[:, order], between.v[:, order], place.images[:, order], extra)
-    start += (between.total, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
-    (step, x, v, images, extra, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, seen)
+    start += (between.matrix if moves else (), between.total, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
+    (step, x, v, images, extra, matrix, *rest), (xs, vs, bits) = lax.scan(one, start, seen)
+    total, due, finite, rows = rest
+    matrix = matrix if moves else between.matrix
     x, v, images = (unsorted(part, order) for part in (x, v, images))
     extra, whole = eqx.partition(by_atom(lambda a: unsorted(a, order), extra), eqx.is_inexact_array)
-    new = Place(step, images, jnp.where(due, x, place.home), jnp.where(due, step, place.built), whole)
-    record = ChunkRecord(new, rows, finite, xs, vs, bits)
-    return StepEnds(x, v, total, extra), lax.stop_gradient(record)
+    cell = jax.tree.map(partial(jnp.where, due), template.spanned(matrix), template) if moves else template
+    home, built = jnp.where(due, x, place.home), jnp.where(due, step, place.built)
+    record = ChunkRecord(Place(step, images, home, cell, built, whole), rows, finite, xs, vs, bits)
+    return StepEnds(x, v, total, extra, matrix), lax.stop_gradient(record)
 
 
 @partial(jax.jit, static_argnames=("rule",))
@@ -213,7 +222,7 @@ class ChunkedProgram:
         self.rule = (rule.every, rule.delay, rule.check)
         self.fixed = RunConstants(
             simulation.force, simulation.integrator, jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2, jnp.float64), problem.loss, surroundings(simulation), state.images,
+            jnp.asarray(rule.skin / 2), jnp.asarray(simulation.r_cut + rule.skin), problem.loss, surroundings(simulation), state.images,
         )  # fmt: skip
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
         self.inputs = Inputs(quantities(simulation.force), numbers, state.x, state.v, jnp.ones(()))
@@ -221,9 +230,9 @@ class ChunkedProgram:
         # the sums are kept as numbers; what the loss makes of them comes last
         total = no_sums(problem.loss, origin, self.fixed.around)
         extra, whole = eqx.partition(state.extra, eqx.is_inexact_array)
-        between = StepEnds(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total, extra)
-        zero = jnp.zeros((), jnp.int64)
-        self.start = Snapshot(between, Place(zero, state.images, between.x, zero, whole), 0)
+        cell, zero = state.cells[0].astype(np.float64), jnp.zeros((), jnp.int64)
+        between = StepEnds(state.x, state.v, total, extra, cell.matrix)
+        self.start = Snapshot(between, Place(zero, state.images, state.x, cell, zero, whole), 0)
         self._verlet = simulation.verlet_list()
         # the list in use, by the step at which it was built and its capacity
         self._used: tuple[tuple[int, int], tuple[PairTable, Tables]] | None = None
@@ -257,24 +266,19 @@ class ChunkedProgram:
         if self._used is None or self._used[0] != key:
             self._verlet.slots = at.slots
             home = np.asarray(at.place.home, np.float64).T.copy()
-            table = self._verlet.build(home, self.simulation.cell)
+            table = self._verlet.build(home, jax.tree.map(np.asarray, at.place.cell))
             self._used = (key, (table, self.simulation.tables(table)))
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
         """Derivatives by what a rollout is made of, from those of the inputs and of the first positions."""
-
-        def begun(numbers, x, v):
-            rest = eqx.filter(self.fixed.integrator, eqx.is_inexact_array, inverse=True)
-            return eqx.filter(eqx.combine(numbers, rest).init(x, v, self.fixed.masses), eqx.is_inexact_array)
-
-        _, back = jax.vjp(begun, self.inputs.numbers, self.start.between.x, self.inputs.v)
-        numbers, x, v = back(start.extra)
+        numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
         x = np.asarray(inputs.x + start.x, np.float64)
         v = np.asarray(inputs.v + start.v, np.float64)
-        stretched = float(np.sum(np.asarray(start.x, np.float64) * np.asarray(self.inputs.x)))
+        whole = [(start.x, self.inputs.x), (start.matrix, self.start.between.matrix)]
+        stretched = sum(float(np.sum(np.asarray(a, np.float64) * np.asarray(b))) for a, b in whole)
         scale, none = float(inputs.scale) + stretched, np.zeros(len(self.simulation.decider.r_cut))
         return Cotangents(inputs.model, inputs.numbers, x, v, scale, none)
 
@@ -320,8 +324,7 @@ class Unrolled(Method):
         value, by_total = jax.value_and_grad(lambda total: problem.loss.value(total, program.frames))(
             at.between.total
         )
-        nothing = jnp.zeros_like(at.between.x)
-        onto = StepEnds(nothing, nothing, by_total, jax.tree.map(jnp.zeros_like, at.between.extra))
+        onto = jax.tree.map(jnp.zeros_like, at.between)._replace(total=by_total)
         inputs = jax.tree.map(jnp.zeros_like, program.inputs)
         own: Marks = {}
         for block in reversed(range(len(kept))):
