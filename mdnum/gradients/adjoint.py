@@ -468,15 +468,15 @@ def transposed(
     def look(row):
         """Cotangents of one frame and of the origin, from those of the sums."""
 
-        def seen_at(x, v, potential, virial, origin, matrix, timestep):
-            here = in_box(around, matrix)._replace(timestep=timestep)
-            frame = frame_of((row[0], x, v, row[3], potential, virial), order, matrix)
+        def seen_at(x, v, potential, virial, origin, timestep, *box):
+            here = (in_box(around, *box) if box else around)._replace(timestep=timestep)
+            frame = frame_of((row[0], x, v, row[3], potential, virial), order, here.matrix)
             return loss.observe(frame, LossFrame(origin_step, *origin, nan, nan), here)
 
         nan, origin_step = origin.potential, origin.step
-        matrix = row[6] if moves else around.matrix
-        given = row[1], row[2], row[4], row[5], (origin.x, origin.v), matrix, around.timestep
-        _, back = jax.vjp(seen_at, *given)
+        box = ((row[6] if moves else around.matrix),) if SCALE in wanted else ()
+        given = row[1], row[2], row[4], row[5], (origin.x, origin.v), around.timestep
+        _, back = jax.vjp(seen_at, *given, *box)
         return back(onto_total)
 
     def blind(row):
@@ -492,7 +492,7 @@ def transposed(
         if inputs:
             v, forces = inputs.v, forces._replace(force=inputs.force, tensor=inputs.tensor)
             extra, whole = eqx.partition(inputs.extra, eqx.is_inexact_array)
-        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_matrix, onto_time = lax.cond(
+        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_time, *onto_matrix = lax.cond(
             see, look, blind, row
         )
         onto = carry.x, carry.v, carry.extra, carry.matrix, loss_v
@@ -529,7 +529,7 @@ def transposed(
         if SCALE in wanted:
             # a strain moves positions with the box: what is left when these have theirs belongs to the box
             at, by_x = x.astype(jnp.float64), made.x.astype(jnp.float64)
-            onto_box = by_matrix + onto_matrix
+            onto_box = by_matrix + onto_matrix[0]
             if moves:
                 onto_box += here.cell.inverse.T @ (made.strain.astype(jnp.float64) - at @ by_x.T)
             else:

@@ -368,14 +368,19 @@ def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> Lo
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
+def seen_in(row, order: Int[Array, "atoms"], origin: LossFrame, around: LossContext):
+    """What a loss observes of a row: frame, origin and the surroundings, with the box of the row."""
+    around = in_box(around, row[6]) if row[6].size else around
+    return frame_of(row, order, around.matrix), origin, around
+
+
 @jax.jit
 def _summed(loss, total, rows, used, seen, origin, around, order):
     def step(total, row):
         row, see = row
 
         def add(total):
-            here = in_box(around, row[6]) if row[6].size else around
-            part = loss.observe(frame_of(row, order, here.matrix), origin, here)
+            part = loss.observe(*seen_in(row, order, origin, around))
             return jax.tree.map(jnp.add, total, part)
 
         return lax.cond(see, add, lambda total: total, total), None

@@ -82,3 +82,35 @@ class Pressed(Drifting):
         pressure = (2 * self.kinetic(v, at.masses) + at.virial) / (3 * volume)
         growth = self.timestep * self.stiffness * (pressure - self.pressure)
         return (1 + growth) * jnp.eye(3), v / (1 + growth).astype(v.dtype), extra + growth
+
+
+class Piston(Integrator):
+    """A box of inertia against an outer pressure (Andersen), isotropic, in the splitting of Tuckerman 2006."""
+
+    name = "piston"
+    pressure: Any = eqx.field(default=None)  # energy/length³
+    inertia: Any = eqx.field(default=None)  # energy time²
+
+    def init(self, x, v, masses):
+        return jnp.zeros(())
+
+    def push(self, v, rate, at, time):
+        volume = jnp.abs(jnp.linalg.det(at.cell.matrix))
+        excess = (2 + 2 / at.masses.shape[0]) * self.kinetic(v, at.masses) + at.virial
+        return rate + time * (excess - 3 * volume * self.pressure) / self.inertia
+
+    def kick(self, v, rate, at, time):
+        slow = jnp.exp(-0.5 * (1 + 1 / at.masses.shape[0]) * rate * time)
+        return slow * (slow * v + time * at.acceleration)
+
+    def finish(self, v, extra, at, time):
+        v = self.kick(v, extra, at, time)
+        return v, self.push(v, extra, at, time)
+
+    def begin(self, x, v, extra, at):
+        rate = self.push(v, extra, at, 0.5 * self.timestep)
+        v = self.kick(v, rate, at, 0.5 * self.timestep)
+        return x + self.timestep * jnp.exp(-0.5 * self.timestep * rate) * v, v, rate, jnp.zeros(())
+
+    def deform(self, v, extra, at):
+        return jnp.exp(self.timestep * extra) * jnp.eye(3), v, extra

@@ -20,7 +20,7 @@ from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import AdjointCarry, StretchReversal, transposed
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
-from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
+from mdnum.gradients.tape import RunTape, TapeStretch, seen_in
 from mdnum.md.cell import HostCell
 from mdnum.md.decide import GROUP
 from mdnum.numerics.jaxprs import Operation, count_bad, first_not_finite, is_inexact
@@ -111,9 +111,9 @@ def _in_forward(tape: RunTape) -> NotFinite:
     for stretch in tape.forward():
         seen = tape.seen(stretch)
         for row in np.flatnonzero(seen[: stretch.rows]):
-            columns = tuple(np.asarray(part)[row] for part in stretch.columns)
-            frame = frame_of(columns, jnp.asarray(stretch.table.order), tape.around.matrix)
-            made = first_not_finite(lambda frame: tape.loss.observe(frame, tape.origin, tape.around), frame)
+            columns = jax.tree.map(lambda part, row=row: part[row], stretch.columns)
+            frame, *rest = seen_in(columns, jnp.asarray(stretch.table.order), tape.origin, tape.around)
+            made = first_not_finite(lambda frame, rest=rest: tape.loss.observe(frame, *rest), frame)
             if made is not None:
                 return replace(_blamed(stretch.first + int(row), "loss", made), forward=False)
     made = first_not_finite(lambda total: tape.loss.value(total, tape.frames), tape.total)
@@ -170,7 +170,7 @@ def _pair(
             ends = int(back.met.i[k]), int(back.met.j[k])
     if ends is None:
         return (int(table.order[made.index[-1]]), *nowhere[1:]) if made.shape[-1] == atoms else nowhere
-    cell = HostCell(back.tape.simulation.cell)
+    cell = HostCell(stretch.cell_of(row, back.tape.simulation.cell))
     x = stretch.x[row].astype(np.float64)
     displacement = cell.displacement(x[:, [ends[0]]].T, x[:, [ends[1]]].T)
     low, high = sorted(int(table.order[end]) for end in ends)
