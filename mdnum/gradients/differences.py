@@ -319,8 +319,9 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
     if last.closes in FAILURES:
         raise NumericalError(f"a replica ended in a {last.closes} at step {last.last}, before its start")
     x, v, images = (last.unsorted(name, last.rows - 1) for name in ("x", "v", "images"))
-    x = unwrapped(np.asarray(simulation.cell.matrix), x, images)
-    return replace(simulation, positions=np.asarray(x, np.float64), velocities=np.asarray(v, np.float64))
+    cell = last.cell_of(last.rows - 1)
+    x = unwrapped(np.asarray(cell.matrix), x, images)
+    return replace(simulation.in_row(cell), positions=np.asarray(x, np.float64), velocities=np.asarray(v, np.float64))
 
 
 @dataclass(frozen=True)

@@ -336,7 +336,9 @@ class RadialDistribution(Loss):
         # bins reach two widths further, and no further than nearest images do
         half = 0.5 * float(min(simulation.cell.widths))
         bins = options.get("bins", 60)
-        own: dict[str, Any] = {"every": 10, "bins": bins, "r_max": 0.999 * half / (1 + 2 / bins)}
+        # a box that moves has room to shrink
+        room = 0.9 if simulation.integrator.moves_cell else 0.999
+        own: dict[str, Any] = {"every": 10, "bins": bins, "r_max": room * half / (1 + 2 / bins)}
         return cls(**(own | options))
 
     @property

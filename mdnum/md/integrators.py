@@ -326,7 +326,7 @@ def without_kick(integrator: Integrator) -> str | None:
         return None
     return (
         f"it is written out for integrators of a kick and a linear drift, and {integrator.name} is another; "
-        "the methods symmetric and unrolled differentiate any integrator"
+        "the methods symmetric, event-aware and unrolled differentiate any integrator"
     )
 
 

@@ -33,6 +33,7 @@ from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, Progress
 from mdnum.gradients.problem import method as by_name
 from mdnum.gradients.recorded import EventAware, ReversePass, Symmetric, passed
 from mdnum.gradients.tape import pace_of
+from mdnum.md.integrators import without_kick
 from mdnum.numerics import unit_roundoff
 from mdnum.plain import result
 
@@ -303,7 +304,7 @@ def diagnose(
         growth_watch = GrowthWatch(problem.simulation, full, problem.steps)
         # its counts grow with the steps
         scaling = ScalingWatch(problem.steps, format) if "scaling" in parts else None
-        if saltation and "trust" in parts:
+        if saltation and "trust" in parts and without_kick(problem.simulation.integrator) is None:
             near = Near(problem.simulation, pace_of(problem.loss, problem.steps))
         watches: list[Any] = [growth_watch, scaling, near and near.reverse]
         options: dict[str, Any] = {"guard": base.guard} if isinstance(base, EventAware) else {}
