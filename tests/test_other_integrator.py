@@ -204,30 +204,36 @@ NAMES = ("potential.sigma", "dynamics.timestep", "dynamics.temperature", "dynami
 
 
 @pytest.mark.parametrize("kind", [NoseHoover, pytest.param(PerAtom, marks=pytest.mark.nightly)])
-def test_unrolled_differentiates_through_its_state(kind):
+def test_its_state_is_differentiated_through(kind):
     """Against central differences of the run; what the state is begun with counts too."""
     problem = Problem(held(kind, timestep=0.01), everything(108), 40)
-    made = method("unrolled")(problem, NAMES)
+    starts = ("initial.velocities", "initial.positions")
+    made, other = (method(word)(problem, (*NAMES, *starts)) for word in ("symmetric", "unrolled"))
+    for name in (*NAMES, *starts):
+        size = np.abs(made.gradient[name]).max()
+        assert np.abs(made.gradient[name] - other.gradient[name]).max() < 1e-9 * size, name
     for name in NAMES:
         value = float(parameters.value(problem.simulation, name))
         step = 1e-5 * value
         high, low = (problem.value({name: np.asarray(value + sign * step)}) for sign in (1, -1))
         assert float(made.gradient[name]) == pytest.approx((high - low) / (2 * step), rel=1e-6), name
     way = np.random.default_rng(5).standard_normal((108, 3))
-    for name in ("initial.velocities", "initial.positions"):
+    for name in starts:
         start = parameters.value(problem.simulation, name)
         high, low = (problem.value({name: start + sign * 1e-6 * way}) for sign in (1, -1))
-        slope = float(np.sum(way * method("unrolled")(problem, [name]).gradient[name]))
+        slope = float(np.sum(way * made.gradient[name]))
         assert slope == pytest.approx((high - low) / 2e-6, rel=1e-6), name
 
 
 def test_a_page_says_why_methods_are_missing(tmp_path):
     made = mdnum.grad(held(), "potential", "epsilon", steps=3, out=tmp_path / "grad")
     missing = {one["what"]: one["why"] for one in made.summary["left_out"] if not one["how"]}
-    assert all("one-link" in missing[name] for name in ("symmetric", "event-aware", "trust", "flips"))
+    assert all("one-link" in missing[name] for name in ("forward", "boundary", "trust", "flips"))
+    answered = {one["method"] for one in made.summary["methods"]}
+    assert {"symmetric", "event-aware", "finite-differences"} <= answered
     text = " ".join((made.folder / "report.html").read_text().split())
     # of all that have the same reason in one line
-    assert text.count(missing["symmetric"]) == 1 and "symmetric, forward, " in text
+    assert text.count(missing["forward"]) == 1 and "forward, surrogate, " in text
 
 
 class Squeezed(KickDrift):
@@ -256,7 +262,7 @@ def test_every_other_method_refuses_it_by_name():
     squeezed = replace(problem.simulation, integrator=Squeezed(jnp.float64(0.004)))
     for other in (problem, replace(problem, simulation=squeezed)):
         name = other.simulation.integrator.name
-        for word in ("symmetric", "event-aware", "forward", "surrogate", "boundary", "reweighting"):
+        for word in ("forward", "surrogate", "boundary", "reweighting"):
             with pytest.raises(InputError, match=rf"{name} .*unrolled"):
                 method(word)(other, names)
         with pytest.raises(InputError, match=f"{name} is another"):

@@ -26,7 +26,7 @@ from mdnum.md.integrators import unsorted, without_kick
 from mdnum.md.ledger import FlipTable
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.backward import BackwardRun, Stretched
-from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point, room_for
+from mdnum.rollout.engine import FAILURES, NARROW, Engine, Segment, Start, first_state, resume_point, room_for
 from mdnum.rollout.epoch import over_rows
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.simulation import Simulation
@@ -182,10 +182,11 @@ class RunTape:
         self._begin()
         for segment in self._engine.segments():
             if segment.closes in FAILURES:
-                raise NumericalError(
-                    f"the run ended in a {segment.closes} at step {segment.last}",
-                    remedy="Use a smaller time step, or a start without overlapping atoms",
-                )
+                remedy = "Use a smaller time step, or a start without overlapping atoms"
+                if segment.closes == NARROW:
+                    remedy = "Use a larger system, a smaller skin, or fewer steps"
+                message = f"the run ended in a {segment.closes} at step {segment.last}"
+                raise NumericalError(message, remedy=remedy)
             self._add(segment)
             if progress is not None:
                 progress(segment.last, steps)

@@ -33,7 +33,7 @@ from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, in_box, n
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import by_atom, one_step, unsorted
-from mdnum.md.neighbors import PairTable
+from mdnum.md.neighbors import PairTable, check_radius
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.flips import fingerprint_of_bits
 
@@ -266,7 +266,9 @@ class ChunkedProgram:
         if self._used is None or self._used[0] != key:
             self._verlet.slots = at.slots
             home = np.asarray(at.place.home, np.float64).T.copy()
-            table = self._verlet.build(home, jax.tree.map(np.asarray, at.place.cell))
+            cell, simulation = jax.tree.map(np.asarray, at.place.cell), self.simulation
+            check_radius(cell, simulation.r_cut, simulation.rule.skin)
+            table = self._verlet.build(home, cell)
             self._used = (key, (table, self.simulation.tables(table)))
         return self._used[1]
 

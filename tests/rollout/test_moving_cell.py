@@ -27,7 +27,7 @@ from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.forks.exact.program import unsupported
 from mdnum.forks.linearized import tangents
 from mdnum.forks.processes import variants
-from mdnum.gradients import Problem
+from mdnum.gradients import Problem, method
 from mdnum.md import cell as cells
 from mdnum.md.cell import Cell
 from mdnum.numerics import PrecisionPolicy
@@ -404,8 +404,8 @@ def test_many_bodies_feel_the_box_of_their_row():
 
 def test_what_has_one_box_alone_refuses_another_by_name():
     simulation = moving()
-    with pytest.raises(InputError, match=r"gradients.*strained"):
-        Problem(simulation, everything(108), 10)
+    with pytest.raises(InputError, match=r"strained is another.*unrolled"):
+        method("forward")(Problem(simulation, everything(108), 10), ["potential.sigma"])
     with pytest.raises(InputError, match=r"processes.*strained"):
         variants(simulation, 3)
     assert "strained" in str(unsupported(simulation))

@@ -114,3 +114,18 @@ class Piston(Integrator):
 
     def deform(self, v, extra, at):
         return jnp.exp(self.timestep * extra) * jnp.eye(3), v, extra
+
+
+class Sheared(Pressed):
+    """A box that follows the whole stress."""
+
+    name = "sheared"
+
+    @property
+    def anisotropic(self):
+        return True
+
+    def deform(self, v, extra, at):
+        volume = jnp.abs(jnp.linalg.det(at.cell.matrix))
+        stress = ((at.masses * v) @ v.T + at.tensor) / volume
+        return jnp.eye(3) + self.timestep * self.stiffness * (stress - self.pressure * jnp.eye(3)), v, extra
