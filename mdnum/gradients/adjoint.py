@@ -471,13 +471,12 @@ def transposed(
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)
             frame = frame_of((row[0], x, v, row[3], potential, virial), order, here.matrix)
-            return loss.observe(frame, LossFrame(origin_step, *origin, nan, nan), here)
+            return loss.observe(frame, LossFrame(origin_step, origin[0], origin[1], nan, nan), here)
 
         nan, origin_step = origin.potential, origin.step
-        box = ((row[6] if moves else around.matrix),) if SCALE in wanted else ()
-        given = row[1], row[2], row[4], row[5], (origin.x, origin.v), around.timestep
-        _, back = jax.vjp(seen_at, *given, *box)
-        return back(onto_total)
+        given: tuple[Any, ...] = row[1], row[2], row[4], row[5], (origin.x, origin.v), around.timestep
+        given += ((row[6] if moves else around.matrix),) if SCALE in wanted else ()
+        return jax.vjp(seen_at, *given)[1](onto_total)
 
     def blind(row):
         return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(look, row))
@@ -488,7 +487,7 @@ def transposed(
         half = (0.5 * integrator.timestep).astype(dtype)
         second = jnp.where(number == 0, jnp.zeros((), dtype), half)
         matrix = row[6] if moves else jnp.asarray(force.cell.matrix)
-        extra, whole, forces = (), (), Forces(jnp.zeros_like(x), None, row[5], None)
+        extra, whole, forces = (), (), Forces(jnp.zeros_like(x), jnp.zeros(0), row[5], None)
         if inputs:
             v, forces = inputs.v, forces._replace(force=inputs.force, tensor=inputs.tensor)
             extra, whole = eqx.partition(inputs.extra, eqx.is_inexact_array)
@@ -496,19 +495,23 @@ def transposed(
             see, look, blind, row
         )
         onto = carry.x, carry.v, carry.extra, carry.matrix, loss_v
-        _, back = jax.vjp(lambda *at: advance(numbers, *at, whole, number), x, v, extra, forces, matrix)
-        onto_x, onto_v, onto_extra, onto_forces, by_matrix = back(onto)
-        # what the integrator makes of the virial
-        pressing = onto_forces.virial
-        if inputs and inputs.tensor is not None:
-            pressing = pressing * jnp.eye(3) + onto_forces.tensor
-            onto_virial_all = onto_virial * jnp.eye(3) + 0.5 * (pressing + pressing.T)
-        else:
-            onto_virial_all = onto_virial + pressing if inputs else onto_virial
+
+        def of_state(x, v, extra, forces, matrix):
+            return advance(numbers, x, v, extra, forces, matrix, whole, number)
+
+        onto_x, onto_v, onto_extra, onto_forces, by_matrix = jax.vjp(of_state, x, v, extra, forces, matrix)[
+            1
+        ](onto)
+        # what the integrator makes of the virial, beside the loss
+        squeeze, pressing = None, onto_virial
+        if inputs:
+            squeeze = onto_forces.virial
+            if inputs.tensor is not None:
+                tensor = onto_forces.tensor
+                squeeze, pressing = 0.5 * (tensor + tensor.T) + squeeze * jnp.eye(3), onto_virial * jnp.eye(3)
+            pressing = pressing + squeeze
         here = replace(force, cell=box(matrix)) if moves else force
-        made = pull_back(
-            here, x, tables, told, onto_forces.force, onto_potential, onto_virial_all, wanted
-        )
+        made = pull_back(here, x, tables, told, onto_forces.force, onto_potential, pressing, wanted)
         model, numbers_bar, onto_box = carry.model, carry.integrator, carry.matrix
         if wanted & {MODEL, WEIGHT}:
             model = jax.tree.map(jnp.add, model, made.model)
@@ -549,7 +552,7 @@ def transposed(
             share = pace.share(number, integrator.timestep)
             sums = (share * after.frame[0], share * after.frame[1])
             # a jump of the virial that comes earlier acts on the box for a longer part of the step
-            squeeze = pressing / integrator.timestep if inputs else None
+            squeeze = None if squeeze is None else squeeze / integrator.timestep
             pull = None
             if isinstance(here, ManyBodyForce):
                 onto = (after.v + half * after.x) / masses.astype(dtype)

@@ -321,7 +321,9 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
     x, v, images = (last.unsorted(name, last.rows - 1) for name in ("x", "v", "images"))
     cell = last.cell_of(last.rows - 1)
     x = unwrapped(np.asarray(cell.matrix), x, images)
-    return replace(simulation.in_row(cell), positions=np.asarray(x, np.float64), velocities=np.asarray(v, np.float64))
+    return replace(
+        simulation.in_row(cell), positions=np.asarray(x, np.float64), velocities=np.asarray(v, np.float64)
+    )
 
 
 @dataclass(frozen=True)

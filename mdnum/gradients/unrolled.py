@@ -179,10 +179,12 @@ def chunk(
 
     extra = by_atom(lambda a: a[..., order], eqx.combine(between.extra, place.extra))
     start = (place.step, between.x[:, order], between.v[:, order], place.images[:, order], extra)
-    start += (between.matrix if moves else (), between.total, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int64))
+    # a box that does not move is no part of what the loop carries
+    start += (between.matrix if moves else (), between.total, jnp.zeros((), bool), jnp.ones((), bool))
+    start += (jnp.zeros((), jnp.int64),)
     (step, x, v, images, extra, matrix, *rest), (xs, vs, bits) = lax.scan(one, start, seen)
     total, due, finite, rows = rest
-    matrix = matrix if moves else between.matrix
+    matrix: Any = matrix if moves else between.matrix
     x, v, images = (unsorted(part, order) for part in (x, v, images))
     extra, whole = eqx.partition(by_atom(lambda a: unsorted(a, order), extra), eqx.is_inexact_array)
     cell = jax.tree.map(partial(jnp.where, due), template.spanned(matrix), template) if moves else template
@@ -222,7 +224,8 @@ class ChunkedProgram:
         self.rule = (rule.every, rule.delay, rule.check)
         self.fixed = RunConstants(
             simulation.force, simulation.integrator, jnp.asarray(simulation.masses),
-            jnp.asarray(rule.skin / 2), jnp.asarray(simulation.r_cut + rule.skin), problem.loss, surroundings(simulation), state.images,
+            jnp.asarray(rule.skin / 2), jnp.asarray(simulation.r_cut + rule.skin), problem.loss,
+            surroundings(simulation), state.images,
         )  # fmt: skip
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
         self.inputs = Inputs(quantities(simulation.force), numbers, state.x, state.v, jnp.ones(()))
@@ -231,7 +234,7 @@ class ChunkedProgram:
         total = no_sums(problem.loss, origin, self.fixed.around)
         extra, whole = eqx.partition(state.extra, eqx.is_inexact_array)
         cell, zero = state.cells[0].astype(np.float64), jnp.zeros((), jnp.int64)
-        between = StepEnds(state.x, state.v, total, extra, cell.matrix)
+        between = StepEnds(state.x, state.v, total, extra, jnp.asarray(cell.matrix))
         self.start = Snapshot(between, Place(zero, state.images, state.x, cell, zero, whole), 0)
         self._verlet = simulation.verlet_list()
         # the list in use, by the step at which it was built and its capacity

@@ -235,7 +235,7 @@ class Engine:
         self._moves = self.program.integrator.moves_cell
         state, tensor = self.start.state, None
         if self.program.integrator.anisotropic:
-            tensor = jax.ShapeDtypeStruct((3, 3), np.dtype(np.float64))
+            tensor: Any = np.zeros((3, 3))
         self._inputs = StepInputs(state.v, state.extra, state.v, tensor) if inputs else ()
         self._cell = jax.tree.map(np.asarray, self.start.state.cells[0])
         # a liquid has one change for ten atoms a step; where there are more, room is doubled

@@ -85,7 +85,7 @@ class Pressed(Drifting):
 
 
 class Piston(Integrator):
-    """A box of inertia against an outer pressure (Andersen), isotropic, in the splitting of Tuckerman 2006."""
+    """A box of inertia against an outer pressure (Andersen), in the splitting of Tuckerman et al. 2006."""
 
     name = "piston"
     pressure: Any = eqx.field(default=None)  # energy/length³
