@@ -195,8 +195,7 @@ def leaving(steps: int) -> Problem:
 
 
 def test_a_flip_acts_on_the_box_through_the_virial():
-    """Of first order in the time step; what the steps alone give is 5 to 14 % off, without the box's part
-    the derivative by its inertia."""
+    """Of first order in the time step; what the steps alone give is 2 to 13 % off."""
     steps = 1600
     problem = leaving(steps)
     assert problem.value() == pytest.approx(exact(), abs=1e-3)
