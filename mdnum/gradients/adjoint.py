@@ -414,14 +414,16 @@ class StretchReversal:
     def cotangents(self) -> Cotangents:
         """The derivatives, once the start has been reached."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
-        integrator, by_x, by_v = onto_start(simulation, start, carry.extra)
-        by_x, whole = (np.asarray(part, np.float64) for part in (by_x + carry.x, carry.origin[0]))
+        through = carry.integrator, carry.x, carry.v
+        if jax.tree.leaves(carry.extra):
+            through = jax.tree.map(jnp.add, through, onto_start(simulation, start, carry.extra))
+        integrator, *at = through
+        by_x, by_v, whole, turned = (np.asarray(part, np.float64) for part in (*at, *carry.origin))
         # the box, and all that is in it
         scale = float(np.sum(by_x * np.asarray(start.x)) + np.sum(whole * np.asarray(self.tape.origin.x)))
         scale += float(np.sum(np.asarray(carry.matrix) * np.asarray(self.force.cell.matrix)))
-        v = np.asarray(by_v + carry.v + carry.origin[1], np.float64)
-        numbers = jax.tree.map(jnp.add, carry.integrator, integrator)
-        return Cotangents(carry.model, numbers, by_x + whole, v, scale, np.asarray(carry.r_cut))
+        r_cut = np.asarray(carry.r_cut)
+        return Cotangents(carry.model, integrator, by_x + whole, by_v + turned, scale, r_cut)
 
 
 @partial(jax.jit, static_argnames=("wanted",))
@@ -460,7 +462,7 @@ def transposed(
     def advance(numbers, x, v, extra, made, matrix, whole, number):
         end = one_step(
             eqx.combine(numbers, rest), box(matrix), masses, order, number, x, v,
-            eqx.combine(extra, whole), made,
+            eqx.combine(extra, whole), made, wrap=SCALE in wanted,
         )  # fmt: skip
         ahead = eqx.filter(end.ahead, eqx.is_inexact_array)
         return end.x, end.kicked, ahead, end.cell.matrix, end.v

@@ -257,12 +257,15 @@ def one_step(
     v: Vector,
     extra: Any,
     made: Any,
+    *,
+    wrap: bool = True,
 ) -> StepEnd:
     """One step of molecular dynamics, from its forces to the positions of the next.
 
     Args:
         cell: the box, float64. masses: float64. made: the `Forces` at x.
         x, v, extra: wrapped positions, and what `begin` left; at step 0 the start.
+        wrap: False for a derivative that knows no box, in which wrapping is a translation.
     """
     dtype = x.dtype
     acceleration = made.force.astype(dtype) / masses.astype(dtype)
@@ -278,6 +281,8 @@ def one_step(
         cell, after = cell.deformed(by), transformed(after, by).astype(dtype)
     else:
         after, kicked, ahead, heat = integrator.begin(x, v, extra, at)
+    if not wrap:
+        return StepEnd(v, extra, after, kicked, ahead, jnp.zeros_like(after), heat, cell, at)
     wrapped, n = cell.astype(dtype).wrap(*after)
     return StepEnd(v, extra, jnp.stack(wrapped), kicked, ahead, jnp.stack(n), heat, cell, at)
 
