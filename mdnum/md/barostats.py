@@ -80,7 +80,8 @@ def matrix(a: Rate) -> Float[Array, "3 3"]:
 
 def acted(x: Vector, a: Rate) -> Vector:
     """Vectors, as rows, times a rate, float64."""
-    return transformed(x.astype(jnp.float64), a) if a.ndim else x * a
+    x = x.astype(jnp.float64)
+    return transformed(x, a) if a.ndim else x * a
 
 
 class Barostat(Integrator):
@@ -182,7 +183,7 @@ class MTK(Barostat):
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(self.kinetic(v, masses), freedom, kT, self.relaxation, time)
         slowed, chain = extra.chain.act(own, of_box, kT, self.pressure_relaxation, time)
-        v = (v * scale).astype(v.dtype)
+        v = acted(v, scale).astype(v.dtype)
         return v, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
 
     def _own(self, extra, masses):
@@ -306,7 +307,7 @@ class CellRescaling(Barostat):
         kinetic, time = self.kinetic(v, at.masses), self.timestep
         for_atoms, for_volume, for_shape = jax.random.split(jax.random.fold_in(self.key, at.step), 3)
         scale = rescaled(for_atoms, kinetic, self.freedom(at.masses), self.kT, self.relaxation, time)
-        v = (v * scale).astype(v.dtype)
+        v = acted(v, scale).astype(v.dtype)
         heat = self.kinetic(v, at.masses) - kinetic
         v = v + (0.5 * time).astype(v.dtype) * at.acceleration
         root, force, excess = self._forces(v, at)

@@ -96,7 +96,7 @@ class NoseHooverChain(Integrator):
     def _scaled(self, v, extra, masses, time):
         freedom = self.freedom(masses)
         scale, extra = extra.act(self.kinetic(v, masses), freedom, self.kT, self.relaxation, time)
-        return (v * scale).astype(v.dtype), extra
+        return (v.astype(jnp.float64) * scale).astype(v.dtype), extra
 
     def finish(self, v, extra, at, time):
         v = v + time * at.acceleration
@@ -157,7 +157,7 @@ class CSVR(Integrator):
     def begin(self, x, v, extra, at):
         kinetic, key = self.kinetic(v, at.masses), jax.random.fold_in(self.key, at.step)
         scale = rescaled(key, kinetic, self.freedom(at.masses), self.kT, self.relaxation, self.timestep)
-        v = (v * scale).astype(v.dtype)
+        v = (v.astype(jnp.float64) * scale).astype(v.dtype)
         heat = self.kinetic(v, at.masses) - kinetic
         v = v + (0.5 * self.timestep).astype(v.dtype) * at.acceleration
         return x + self.timestep.astype(x.dtype) * v, v, extra, heat

@@ -22,7 +22,7 @@ class Drifting(Integrator):
 
     def begin(self, x, v, extra, at):
         v = v + (0.5 * self.timestep).astype(v.dtype) * at.acceleration
-        return x + self.timestep.astype(x.dtype) * v, v, extra, jnp.zeros(())
+        return x + self.timestep.astype(x.dtype) * v.astype(x.dtype), v, extra, jnp.zeros(())
 
 
 class Strained(Drifting):
