@@ -150,6 +150,7 @@ class EnergyFunction(ManyBody):
         start: what makes its parameters, (key, positions, neighbor) to a pytree; None where they are given.
         lists: its own (allocate, update), with which the trial call compares; None where there is none.
         unit: of length and of energy that it was declared in; empty for the simulation's.
+        noise: rounding of its energy at the trial call, a power of ten, energy.
         notes: what the trial call found, (code, values as JSON); None before there was one.
     """
 
@@ -161,6 +162,7 @@ class EnergyFunction(ManyBody):
     start: Callable[..., Any] | None = eqx.field(static=True, kw_only=True, default=None)
     lists: Any = eqx.field(static=True, kw_only=True, default=None)
     unit: tuple[str, ...] = eqx.field(static=True, kw_only=True, default=())
+    noise: float = eqx.field(static=True, kw_only=True, default=0.0)
     notes: tuple[tuple[str, str], ...] | None = eqx.field(static=True, kw_only=True, default=None)
 
     @property

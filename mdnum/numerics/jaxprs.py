@@ -40,6 +40,12 @@ def narrows(closed: Any) -> bool:
     )  # fmt: skip
 
 
+def held_numbers(closed: Any, least: int = 10) -> int:
+    """How many numbers a program holds in arrays of some size: weights that a function closed over."""
+    consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
+    return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
+
+
 def single_numbers(closed: Any) -> list[str]:
     """Constants of a program that were rounded to single precision, as they were most likely written.
 

@@ -291,6 +291,8 @@ def _lattice(vectors: Float[np.ndarray, "rows 3 3"]) -> dict[str, np.ndarray]:
 
 # a missed flip shows as one jump; rounding of the sums must stay far below it
 _SHARE_OF_A_JUMP = 0.1
+# differences of four energies, the largest of many, over the largest rounding of a few
+_NOISES = 20.0
 
 
 @dataclass
@@ -341,7 +343,9 @@ class EnergyBudget:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
         eps = 2 * unit_roundoff(self.simulation.policy.dtype("force"))
-        return 1e3 * eps * max(1.0, abs(self._reference.numbers()[0]))
+        # an energy function may cancel large terms
+        noise = _NOISES * getattr(self.simulation.model, "noise", 0.0)
+        return max(1e3 * eps * max(1.0, abs(self._reference.numbers()[0])), noise)
 
     @property
     def closes(self) -> bool:

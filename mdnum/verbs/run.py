@@ -461,7 +461,8 @@ def _potential(run: RunView) -> Iterator[Finding]:
     """What the trial calls of an energy function found."""
     units: dict[str, Any] = {"energy_unit": run.units.energy, "length_unit": run.units.length}
     for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
-        yield TEXTS.finding(code, **values, **units)
+        # of a range that has an end
+        yield TEXTS.finding(code, *["reach"] * bool(values.get("reach")), **values, **units)
 
 
 def _evidence(run: RunView) -> Iterator[str]:
