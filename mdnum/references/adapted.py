@@ -148,24 +148,24 @@ class EnergyOnNeighborList(ClassicalCalculator):
 
     def __init__(self, potential: EnergyFunction, **kwargs: Any):
         super().__init__(**kwargs)
-        self.potential = potential
+        self.potential = own = potential
+
+        def energy(x, strain, index, cell):
+            neighbor = as_neighbor_list(index, x, own.format, own.self_edges)
+            return own.deformed(x, neighbor, cell, jnp.eye(3) + strain)
+
+        # hardly optimized: to compile takes less time than each operation by itself
+        options: Any = {"xla_backend_optimization_level": 0}
+        self._slopes = jax.jit(jax.value_and_grad(energy, argnums=(0, 1)), compiler_options=options)
 
     def evaluated(self, atoms, changes):
         edges, n, x = edges_of(atoms, self.potential.r_cut), len(atoms), jnp.asarray(atoms.positions)
         i, j = (ends[edges.r < self.potential.r_cut] for ends in (edges.i, edges.j))
         counts = np.bincount(i, minlength=n)
-        index = np.full((n, max(1, int(counts.max(initial=0)))), n, np.int32)
+        # every width is compiled for
+        index = np.full((n, -(-max(1, int(counts.max(initial=0))) // 8) * 8), n, np.int32)
         index[i, np.arange(len(i)) - (np.cumsum(counts) - counts)[i]] = j
-        own, cell = self.potential, jnp.asarray(atoms.cell.array)
-        neighbor = as_neighbor_list(index, x, own.format, own.self_edges)
-
-        def energy(x, strain):
-            return own.deformed(x, neighbor, cell, jnp.eye(3) + strain)
-
-        # hardly optimized: to compile takes less time than each operation by itself
-        options: Any = {"xla_backend_optimization_level": 0}
-        slopes = jax.jit(jax.value_and_grad(energy, argnums=(0, 1))).lower(x, jnp.zeros((3, 3)))
-        total, (slope, strain) = slopes.compile(options)(x, jnp.zeros((3, 3)))
+        total, (slope, strain) = self._slopes(x, jnp.zeros((3, 3)), index, jnp.asarray(atoms.cell.array))
         results = {"energy": float(total), "forces": -np.asarray(slope)}
         if atoms.cell.rank == 3:
             results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(strain) / atoms.get_volume())

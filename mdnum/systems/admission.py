@@ -231,6 +231,7 @@ def _check(trial: Trial) -> None:
         "NAN_ON_OVERFLOW": not np.isfinite(trial.there(code=1)[0]),
         "FIXED_BOX": not trial.call.how.box and trial.pbc.any(),
         "SINGLE_INSIDE": not trial.double,
+        "NOT_ADDITIVE": not _adds(trial),
     }
     trial.notes |= {code: {} for code, is_so in found.items() if is_so}
     if trial.double and (rounded := single_numbers(trial.jaxpr)):
@@ -347,36 +348,62 @@ def _at_the_cutoff(trial: Trial) -> None:
     trial.model = replace(trial.model, smoothness=Smoothness(order, jump, push), trusts_list=trusts)
 
 
+def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
+    """Atoms in threes that have no other neighbors: a list of some of them, and all firsts and thirds.
+
+    Returns:
+        a list with the first so many threes; positions by the distance of the third atom from the first one,
+        the second at 0.6 of the cutoff; the third atoms.
+    """
+    n, x = trial.n, trial.x
+    first, second, third = np.arange(n - n % 3).reshape(3, -1)
+    # a tilted triangle: along axes forces may vanish by symmetry
+    sides = np.array([[0.48, 0.6, 0.64], [0.8, -0.36, 0.48]])
+
+    def listed(chosen: slice) -> np.ndarray:
+        idx = np.full_like(trial.inside, n)
+        one, two, three = first[chosen], second[chosen], third[chosen]
+        idx[one, 0], idx[one, 1], idx[two, 0], idx[three, 0] = two, three, one, one
+        return idx
+
+    def placed(r: float) -> np.ndarray:
+        out = x.copy()
+        out[second], out[third] = x[first] + 0.6 * trial.model.r_cut * sides[0], x[first] + r * sides[1]
+        return out
+
+    return listed, placed, third
+
+
+def _adds(trial: Trial) -> bool:
+    """Whether the energy of two groups of atoms that have no pair in common is the sum of both."""
+    listed, placed, third = _threes(trial)
+    if len(third) < 2:
+        return True
+    x, chosen = placed(0.7 * trial.model.r_cut), (slice(0, 1), slice(1, 2), slice(0, 2), slice(0, 0))
+    one, other, both, none = (trial.energy(x, listed(some)) for some in chosen)
+    size = max(abs(one - none), abs(other - none), 1e-9 * abs(none))
+    return not abs(one + other - both - none) > 1e3 * SAME[trial.double] * size
+
+
 def _reach(trial: Trial) -> tuple[float | None, float]:
     """The largest distance at which a listed pair has a force, and the largest that was tried.
 
-    Atoms are placed in threes without other neighbors: two at 0.6 of the cutoff, the third moved away from
-    the first one. None where it has no force at any distance.
+    None where it has no force at any distance.
     """
-    n, r_cut = trial.n, trial.model.r_cut
+    r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
-    threes = n // 3
-    if not threes or furthest < r_cut:
+    if not len(third) or furthest < r_cut:
         return None, furthest
-    first, second, third = np.arange(3 * threes).reshape(3, threes)
-    idx = np.full_like(trial.inside, n)
-    idx[first, 0], idx[first, 1], idx[second, 0], idx[third, 0] = second, third, first, first
-    # a tilted triangle: along axes forces may vanish by symmetry
-    to_second, to_third = np.array([[0.48, 0.6, 0.64], [0.8, -0.36, 0.48]])
+    idx = listed(slice(None))
 
     def acts(r: float) -> bool:
-        x = trial.x.copy()
-        x[second], x[third] = x[first] + 0.6 * r_cut * to_second, x[first] + r * to_third
-        energy, forces = trial.there(x, idx)
+        energy, forces = trial.there(placed(r), idx)
         sizes = np.abs(forces)
         return bool(np.isfinite(energy) and np.any(sizes[third] > 1e-25 * sizes.max()))
 
-    # it is resolved well near the cutoff alone
     near, far = 0.3 * r_cut, furthest
-    if acts(far):
-        return far, furthest
-    if not acts(near):
-        return None, furthest
+    if acts(far) or not acts(near):
+        return (far if acts(far) else None), furthest
     while far - near > _RESOLVED * r_cut:
         middle = 0.5 * (near + far)
         near, far = (middle, far) if acts(middle) else (near, middle)

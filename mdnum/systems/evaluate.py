@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.decide import Tables
+from mdnum.md.energies import EnergyFunction
 from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.numerics import check_not_forked
@@ -63,10 +64,14 @@ class Evaluator:
     Args:
         simulation: the system as objects.
         skin: skin of the list, length; default the system's. A box too narrow for it gets what fits.
+        often: whether there are many calls; of an energy function that is compiled for a few, programs are
+            compiled in a hurry, which takes a quarter of the time.
     """
 
-    def __init__(self, simulation: Simulation, skin: float | None = None):
+    def __init__(self, simulation: Simulation, skin: float | None = None, often: bool = True):
         self.simulation = simulation
+        own = isinstance(simulation.model, EnergyFunction) and simulation.atoms <= _SMALL
+        self._evaluate, self._numbers = _QUICKLY if own and not often else (evaluate_listed, _numbers)
         self.skin = simulation.rule.skin if skin is None else skin
         self.builds = 0
         self._verlet = simulation.verlet_list(self.skin)
@@ -89,7 +94,7 @@ class Evaluator:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
         here, wrapped, table, tables, x = self._sorted(positions, cell)
-        result = evaluate_listed(here.force, x, tables, stress)
+        result = self._evaluate(here.force, x, tables, stress)
         forces = np.empty((here.atoms, 3))
         forces[table.order] = np.asarray(result.force, np.float64).T
         energies = np.full(here.atoms, np.nan)
@@ -108,7 +113,9 @@ class Evaluator:
         own = self.simulation
         _, _, _, tables, x = self._sorted(positions, None)
         bare = own.potential if own.pairwise else None
-        energy, found = _numbers(own.force, bare, own.cell, own.pair_types, x, tables)
+        # the program that is there already, where its compilation is what takes the time
+        made = None if self._numbers is _numbers else self._evaluate(own.force, x, tables, True)
+        energy, found = self._numbers(own.force, bare, own.cell, own.pair_types, x, tables, made)
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
@@ -139,15 +146,14 @@ class Evaluator:
         return table, self._kept[1]
 
 
-@eqx.filter_jit
-def evaluate_listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
+def _listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
     """Forces and decisions, with the virial as a tensor where the stress is needed."""
     return force(x, tables, decisions=True, tensor=stress)
 
 
-@eqx.filter_jit
-def _numbers(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, x, tables: Tables):
-    made, cell = force(x, tables, decisions=False), cell.astype(x.dtype)
+def _numbers_of(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, x, tables: Tables, made=None):
+    made = force(x, tables, decisions=False) if made is None else made
+    cell = cell.astype(x.dtype)
 
     def wider(found, group):
         index, kind = group
@@ -163,3 +169,12 @@ def _numbers(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, x, 
     closest, pair = (jnp.where(jnp.isinf(closest), 0.0, one) for one in (closest, pair))
     found = {"force": made.force, "r2": jnp.append(closest, furthest), "pair": pair}
     return jnp.sum(made.energy, dtype=jnp.float64), found
+
+
+evaluate_listed, _numbers = map(eqx.filter_jit, (_listed, _numbers_of))
+_QUICKLY = tuple(
+    eqx.filter_jit(one, compiler_options={"xla_backend_optimization_level": 0})
+    for one in (_listed, _numbers_of)
+)
+#: Atoms up to which compiling takes longer than a few calls.
+_SMALL = 1000

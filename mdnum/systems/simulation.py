@@ -400,7 +400,7 @@ class Simulation:
         stress: bool = True,
     ) -> Evaluation:
         """`Evaluator.__call__` for one configuration, with a list of its own."""
-        return Evaluator(self, skin=0.0)(positions, cell, stress)
+        return Evaluator(self, skin=0.0, often=False)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
         """The potential energy of one configuration alone, with a list of its own, and the numbers behind it.
@@ -412,7 +412,7 @@ class Simulation:
             energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
             type and largest of all, length², `pair`: bare energies at the smallest; 0 for none.
         """
-        return Evaluator(self, skin=0.0).numbers(positions)
+        return Evaluator(self, skin=0.0, often=False).numbers(positions)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""

@@ -233,6 +233,31 @@ def with_constant(d, real, depth):
     return energies(d, real, depth) * jnp.asarray(0.3, jnp.float32) * jnp.asarray(0.5, jnp.float32)
 
 
+def of_the_whole(d, real, depth):
+    made = energies(d, real, depth)
+    return made * (1 + 0.1 * jnp.sum(made))
+
+
+def shorter(d, real, depth):
+    return energies(d / 0.85, real, depth)
+
+
+def longer(d, real, depth):
+    return energies(d / 1.1, real, depth)
+
+
+WEIGHTS = jnp.linspace(0.5, 1.5, 12)
+
+
+def with_weights(atoms: Atoms):
+    space = general(atoms, False)
+
+    def energy(R, neighbor, **kw):
+        return jnp.sum(over(space, R, neighbor, **kw)) * jnp.sum(jnp.tanh(WEIGHTS))
+
+    return energy
+
+
 def held_still(d, real, depth):
     return energies(jax.lax.stop_gradient(d), real, depth) + energies(d, real, depth)
 
@@ -310,7 +335,7 @@ DEFECTS = {
     "FORCES_WRONG": own(held_still),
     "ANOTHER_BOX": brought(another_box, format="dense"),
     "ANOTHER_BOX, a matrix": brought(a_matrix, format="dense"),
-    "NOT_FINITE, a matrix": brought(partial(a_matrix, more=0.0), format="dense"),
+    "MATRIX_BOX": brought(partial(a_matrix, more=0.0), format="dense"),
     "CELL_IGNORED": ignores_the_cell,
     "NO_STRAIN": brought(deaf, format="dense"),
     "STRESS_WRONG": brought(strained_twice, format="dense"),
@@ -340,7 +365,7 @@ def test_a_defect_closes_the_door(name: str):
     with pytest.raises(AdmissionError) as caught:
         DEFECTS[name](argon())
     assert caught.value.code == name.partition(",")[0] and caught.value.remedy
-    operation = {"NAN_BY_PADDING": "div", "NOT_FINITE": "log", "NOT_FINITE, a matrix": "rem"}.get(name)
+    operation = {"NAN_BY_PADDING": "div", "NOT_FINITE": "log", "MATRIX_BOX": "rem"}.get(name)
     if operation is not None:
         assert caught.value.values["operation"].startswith(operation)
         # what jax compiles as one has no line of its own
@@ -361,11 +386,16 @@ NOTES = {
     "NAN_ON_OVERFLOW": (brought(overflowing, format="dense"), {}),
     "TRUSTS_LIST": (own(on_trust), {}),
     "DECIDES_ITSELF": (own(by_itself), {}),
+    "NOT_ADDITIVE": (own(of_the_whole), {}),
+    "R_CUT_LONGER": (own(shorter), {"r_cut": RADIUS}),
+    "PARAMETERS_HELD": (brought(with_weights, format="dense"), {"count": 12}),
 }
 
 
 @pytest.mark.jax_md
-@pytest.mark.parametrize("code", some(NOTES, ("PARAMETERS_FLOAT32", "TRUSTS_LIST", "NO_EDGES_NAN")))
+@pytest.mark.parametrize(
+    "code", some(NOTES, ("PARAMETERS_FLOAT32", "TRUSTS_LIST", "NO_EDGES_NAN", "NOT_ADDITIVE", "R_CUT_LONGER"))
+)
 def test_what_should_be_known_is_noted_and_is_a_finding_of_the_run(code: str):
     from mdnum.verbs.run_page import TEXTS
 
@@ -383,6 +413,16 @@ def test_what_should_be_known_is_noted_and_is_a_finding_of_the_run(code: str):
         # of two ends
         assert one.model.smoothness.energy_jump == pytest.approx(0.2 * DEPTH, rel=1e-5)
         assert one.program["potential"]["notes"] == notes
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize(
+    ("each", "code", "factor"),
+    [(longer, "TRUSTS_LIST", 1.1), pytest.param(shorter, "R_CUT_LONGER", 0.85, marks=pytest.mark.nightly)],
+)
+def test_the_range_of_a_function_is_measured(each, code: str, factor: float):
+    notes = dict(own(each)(argon()).model.notes)
+    assert json.loads(notes[code])["reach"] == pytest.approx(factor * RADIUS, rel=5e-3)
 
 
 def test_weights_of_a_network_in_single_precision_are_not_numbers_that_were_rounded():
