@@ -233,6 +233,7 @@ def _brief(part: Any) -> Any:
 
 
 def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -> dict[str, Any]:
+    from mdnum.audit.functions import examined
     from mdnum.gradients import parameters
     from mdnum.gradients.diagnose.trust import NOT_FINITE, UNDECIDED
 
@@ -270,7 +271,8 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
         "methods": [_method(one.found) | {"seconds": one.seconds} for one in agreement.opinions if one.found],
         "comparisons": plain(agreement.comparisons),
         **{name: _brief(getattr(found, name)) for name in _BRIEF},
-        "trust": trust, "edges": plain(found.edges), "failed": dict(found.failed),
+        "function": examined(simulation), "failed": dict(found.failed),
+        "trust": trust, "edges": plain(found.edges),
         "refused": [{"method": one.method, "why": one.missing} for one in agreement.opinions if one.missing],
     }  # fmt: skip
 

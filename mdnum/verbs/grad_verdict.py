@@ -13,6 +13,7 @@ from mdnum.report.words import listed, percent
 from mdnum.verbs import grad_page
 from mdnum.verbs.frame import View
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
+from mdnum.verbs.run import function_findings
 
 #: Share of a derivative above which single flips decide it, and how many of them count as single.
 _HEAVY, _SINGLE = 0.2, 3
@@ -26,6 +27,7 @@ def judge(view: View) -> Verdict:
     """Findings, evidence and headline of a gradient."""
     trust = view.summary.get("trust") or {}
     found = [*_of_methods(view), *_of_trust(view), *_of_flips(view), *_of_the_motion(view)]
+    found += function_findings(view.summary.get("function"), view.units)
     known = view.summary.get("exact") or trust.get("verdict") == "trusted"
     # the headline has the verdict on trust already
     worst = [one for one in found if one.severity == "error" or one.code not in ("BEYOND_TRUST", "UNDECIDED")]
@@ -77,9 +79,11 @@ def _of_methods(view: View) -> Iterator[Finding]:
     if where.get("found"):
         variants = ["found" if where["forward"] else "forward", *["pair"] * (where["j"] >= 0)]
     inputs = ", ".join(f"{value:.4g}" for value in where.get("inputs") or ())
+    no_number: set[tuple[str, str]] = set()
     for one in methods:
         sizes = {name: magnitude(value, math.nan) for name, value in one["gradient"].items()}
         broken = [name for name, size in sizes.items() if not math.isfinite(size)]
+        no_number |= {(one["method"], name) for name in broken}
         if broken:
             values: dict[str, Any] = {**where, "inputs": inputs, "names": listed(broken)}
             yield TEXTS.finding("NOT_FINITE", *variants, method=one["method"], **values)
@@ -90,7 +94,9 @@ def _of_methods(view: View) -> Iterator[Finding]:
             notes = filter(None, (one["notes"].get(name) for one in ranked))
             yield TEXTS.finding("NO_DEPENDENCE", name=name, note=next(notes, TEXTS("no_note")))
     for row in summary["comparisons"]:
-        if row["meaning"] == "unexplained":
+        both = {(row[which], row["name"]) for which in ("method", "reference")}
+        # what is no number has been reported
+        if row["meaning"] == "unexplained" and not both & no_number:
             yield TEXTS.finding(
                 "UNEXPLAINED", section=section, method=row["method"], reference=row["reference"],
                 name=row["name"], closeness=closeness(row), explained=row["values"].get("explained"),

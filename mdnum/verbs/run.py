@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mdnum.rollout.run import RunResult
     from mdnum.systems.load import System
     from mdnum.systems.simulation import Simulation
+    from mdnum.units import Units
 
 #: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
 #: a few percent at usual time steps.
@@ -249,7 +250,8 @@ def judge(run: RunView) -> Verdict:
     """Findings in the order in which they are read: the worst causes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
-        *_decisions(run), *_drift(run), *_cutoff(run), *_function(run), *_potential(run), *_start(run),
+        *_decisions(run), *_drift(run), *_cutoff(run),
+        *function_findings(run.cutoff.get("function"), run.units), *_potential(run), *_start(run),
         *_loop(run),
     ]  # fmt: skip
     found += run.kept(TEXTS.entries)
@@ -436,12 +438,12 @@ def _loop(run: RunView) -> Iterator[Finding]:
         yield TEXTS.finding("NOT_COMPILED", operation=operation)
 
 
-def _function(run: RunView) -> Iterator[Finding]:
+def function_findings(function: Mapping[str, Any] | None, units: Units) -> Iterator[Finding]:
     """Where a person's pair function is no number, and where it breaks, by the derivative that jumps."""
-    function = run.cutoff.get("function") or {}
+    function = function or {}
     if function.get("single"):
         yield TEXTS.finding("SINGLE_INSIDE", "pair")
-    places, energy, length = function.get("places", ()), run.units.energy, run.units.length
+    places, energy, length = function.get("places", ()), units.energy, units.length
     codes = {"FUNCTION_SLOPE": (-2,), "FUNCTION_NOT_FINITE": (-1,), "FUNCTION_BREAKS": (0, 1, 2, 3)}
     for code, orders in codes.items():
         found = sorted((row for row in places if row["order"] in orders), key=lambda row: row["order"])

@@ -289,6 +289,8 @@ PRIMAL = {"first state": 3, "first decision": None}
          "NOT_FINITE", "error", {"names": EPSILON}),
         ({"comparisons": [row("symmetric", EPSILON, 0.1, "unexplained", values={"explained": 1e-9})]},
          "UNEXPLAINED", "warning", {"closeness": "10 % off"}),
+        ({"function": {"places": [{"order": 0, "pair": "Ar-Ar", "distance": 1.3, "jump": 1e-3, "what": "break"}]}},
+         "FUNCTION_BREAKS", "warning", {"distance": 1.3}),
         ({"methods": [{**AWARE, "details": {**DETAILS, "grazing": 2, "weight left out": 0.5}}]}, "GRAZING",
          "warning", {"grazing": 2, "share": 0.5 / 3.1}),
         ({"methods": [{**AWARE, "details": {**DETAILS, "loss jumps": True}}]}, "LOSS_JUMPS", "warning", {}),
@@ -307,6 +309,15 @@ def test_findings_follow_the_numbers(tmp_path, changes, code, severity, values):
     found = codes(tmp_path / "one", **changes)
     assert found[code].severity == severity
     assert {name: found[code].values[name] for name in values} == pytest.approx(values)
+
+
+def test_what_is_no_number_is_reported_once(tmp_path):
+    methods = [PLAIN, {**AWARE, "gradient": {**AWARE["gradient"], EPSILON: float("nan")}}]
+    rows = [row("symmetric", name, 0.1, "unexplained") for name in (EPSILON, RADIUS)]
+    rows = [{**one, "reference": "event-aware"} for one in rows]
+    outcome = write(tmp_path / "one", methods=methods, comparisons=rows)
+    found = [one["values"].get("name") for one in outcome.summary["findings"] if one["code"] == "UNEXPLAINED"]
+    assert found == [RADIUS]
 
 
 def limited(share: float | None) -> dict[str, Any]:
