@@ -41,7 +41,7 @@ def test_an_example_runs_and_says_something(path, tmp_path):
     assert len(words) > 3 and list((tmp_path / "runs").iterdir())
     if path.stem in _NEEDS:
         # ASE agrees; a gradient and differences
-        assert "True" in words and float(words[-2]) == pytest.approx(float(words[-1]), rel=1e-5)
+        assert "True" in words and float(words[-2]) == pytest.approx(float(words[-1]), rel=1e-4)
 
 
 def test_there_are_examples():

@@ -236,6 +236,8 @@ def _check(trial: Trial) -> None:
     trial.notes |= {code: {} for code, is_so in found.items() if is_so}
     if trial.double and (rounded := single_numbers(trial.jaxpr)):
         trial.notes["PARAMETERS_FLOAT32"] = {"numbers": rounded[:4], "count": len(rounded)}
+    if trial.model.self_edges and not same(energy, other := trial.without_itself()):
+        trial.notes["COUNTS_ITSELF"] = {"with_itself": energy, "without": other}
     if not jax.tree.leaves(trial.model.parameters) and (held := held_numbers(trial.jaxpr)):
         trial.notes["PARAMETERS_HELD"] = {"count": held}
 

@@ -78,9 +78,9 @@ class Trial:
             place[kept] = np.arange(atoms)
             self.x, self.idx = self.x[kept], place[self.idx[kept]]
         self.n = len(self.x)
-        # what is summed over pairs of neighbors takes the square of the padding, too
+        # pairs of neighbors go as the square of the padding, and two slots of it are a pair
         self.idx = np.sort(self.within(self.idx, self.x, self.model.r_cut + skin), axis=1)
-        self.idx = self.idx[:, : max(2, int((self.idx < self.n).sum(axis=1).max()) + 1)]
+        self.idx = self.idx[:, : max(2, int((self.idx < self.n).sum(axis=1).max()) + 2)]
         self.inside = self.within(self.idx, self.x, self.model.r_cut)
         self._lists()
         self._compile()
@@ -209,6 +209,15 @@ class Trial:
         """The energy alone, which takes a quarter of the time, over a list with more padding."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
+
+    def without_itself(self) -> float:
+        """The energy where no atom is listed as its own neighbor."""
+        model, arguments = self.model, self.arguments()
+        self.model = replace(model, self_edges=False)
+        # not the method, whose earlier trace would be taken
+        made = _quick(jax.jit(lambda *all: self.bare(*all)).trace(*arguments))
+        self.model = model
+        return float(made(*arguments)) * self.call.unit
 
     def within(self, idx, x, radius: float) -> Int[np.ndarray, "atoms slots"]:
         """Of listed pairs those closer than a radius."""

@@ -34,17 +34,18 @@ def crystal(symbol: str, lattice: str, a: float, repeat: int = 2):
     return atoms
 
 
-def through_the_door(make, atoms, r_cut: float, **more: Any):
+def through_the_door(make, atoms, r_cut: float, alone: bool = False, **more: Any):
     side = atoms.cell.lengths()[0]
     space = jaxmd.upstream().space.periodic_general(jnp.eye(3) * side, fractional_coordinates=False)[0]
     with jaxmd.standard_promotion():
         made = make(space, scalar(side), fractional_coordinates=False, dr_threshold=scalar(0.3), **more)
-    return mdnum.simulation(atoms, mdnum.energy_function(made, r_cut), timestep=0.001, skin=0.3)
+    given = mdnum.energy_function(made[1] if alone else made, r_cut)
+    return mdnum.simulation(atoms, given, timestep=0.001, skin=0.3)
 
 
 def test_stillinger_weber_has_the_numbers_of_numpy():
     atoms, names = crystal("Si", "diamond", 5.431), ("sigma", "A", "B", "lam", "gamma", "epsilon", "cutoff")
-    values = (2.0951, 7.049556277, 0.6022245584, 21.0, 1.2, 2.16826, 3.77118)
+    values = (2.0951, 7.049556277, 0.6022245584, 21.0, 1.2, 2.1683, 3.77118)
     given = {name: scalar(value) for name, value in zip(names, values, strict=True)}
     made = jaxmd.upstream().energy.stillinger_weber_neighbor_list
     one = through_the_door(made, atoms, 3.77118, **given)
@@ -75,8 +76,8 @@ def tables(end: float) -> tuple[str, np.ndarray, np.ndarray, np.ndarray, np.ndar
     return "\n".join([*head, *(f"{one:.17g}" for one in numbers), ""]), rho, embedded, density, pair
 
 
-@pytest.mark.parametrize("end", [5.5, 3.7])
-def test_an_eam_table_has_the_numbers_of_splines_wherever_it_ends(end: float):
+@pytest.mark.parametrize(("end", "alone"), [(5.5, False), (3.7, True)])
+def test_an_eam_table_has_the_numbers_of_splines_wherever_it_ends(end: float, alone: bool):
     text, rho, embedded, density, pair = tables(end)
     atoms, energy = crystal("Cu", "fcc", 3.615, 4), jaxmd.upstream().energy
     # a little shorter than the table: the list decides
@@ -84,16 +85,20 @@ def test_an_eam_table_has_the_numbers_of_splines_wherever_it_ends(end: float):
     with jaxmd.standard_promotion():
         charge, embedding, pairwise, _ = energy.load_lammps_eam_parameters(io.StringIO(text))
     one = through_the_door(
-        energy.eam_neighbor_list, atoms, r_cut, charge_fn=charge, embedding_fn=embedding,
+        energy.eam_neighbor_list, atoms, r_cut, alone, charge_fn=charge, embedding_fn=embedding,
         pairwise_fn=pairwise, cutoff=scalar(end),
     )  # fmt: skip
     r = get_distances(atoms.positions, cell=atoms.cell, pbc=True)[1]
     inside, step = (r > 0) & (r < r_cut), EAM(potential=str(TABLE)).dr
     at = np.arange(len(density)) * step
     listed = [np.where(inside, CubicSpline(at, table)(r), 0.0) for table in (density, pair)]
-    expected = np.sum(CubicSpline(rho, embedded)(listed[0].sum(axis=1))) + 0.5 * np.sum(listed[1])
+    # jax-md's own list has each atom as its own neighbor, and counts its density
+    of_itself = 0.0 if alone else density[0]
+    charges = listed[0].sum(axis=1) + of_itself
+    expected = np.sum(CubicSpline(rho, embedded)(charges)) + 0.5 * np.sum(listed[1])
     # jax-md rounds tables to float32
     assert one.evaluate().energy == pytest.approx(expected, rel=1e-5)
     notes = dict(one.model.notes)
+    assert ("COUNTS_ITSELF" in notes) == (not alone)
     if end < 4:
         assert "ENERGY_JUMPS" in notes and one.imposable and np.isnan(one.model.smoothness.energy_jump)
