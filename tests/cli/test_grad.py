@@ -289,7 +289,7 @@ PRIMAL = {"first state": 3, "first decision": None}
          "NOT_FINITE", "error", {"names": EPSILON}),
         ({"comparisons": [row("symmetric", EPSILON, 0.1, "unexplained", values={"explained": 1e-9})]},
          "UNEXPLAINED", "warning", {"closeness": "10 % off"}),
-        ({"function": {"places": [{"order": 0, "pair": "Ar-Ar", "distance": 1.3, "jump": 1e-3, "what": "break"}]}},
+        ({"function": {"places": [{"order": 0, "pair": "X-X", "distance": 1.3, "jump": 1e-3, "what": "x"}]}},
          "FUNCTION_BREAKS", "warning", {"distance": 1.3}),
         ({"methods": [{**AWARE, "details": {**DETAILS, "grazing": 2, "weight left out": 0.5}}]}, "GRAZING",
          "warning", {"grazing": 2, "share": 0.5 / 3.1}),

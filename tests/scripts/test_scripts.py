@@ -152,6 +152,14 @@ def test_ase_agrees_and_searches_are_listed_with_where_they_stop(here, tmp_path:
 
 
 @pytest.mark.nightly
+def test_trusted_gradients_of_a_listed_network_are_those_of_differences(tmp_path: Path) -> None:
+    words = ["--only", "the same, listed", "--seeds", "2"]
+    *_, last = study("learned_gradients", *words, "--store", "starts", cwd=tmp_path).strip().splitlines()
+    starts, derivatives, without, trusted, false = (int(cell) for cell in last.split("|")[2:7])
+    assert (starts, derivatives, without, false) == (2, 4, 0, 0) and trusted >= 3
+
+
+@pytest.mark.nightly
 def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     made = json.loads(study("benchmark", "--quick", "--turns", "1", "--json", "-o", "b.png", cwd=tmp_path))
     speeds = {one["code"]: one for one in made["speeds"]}
