@@ -171,10 +171,8 @@ def _numbers_of(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, 
     return jnp.sum(made.energy, dtype=jnp.float64), found
 
 
-evaluate_listed, _numbers = map(eqx.filter_jit, (_listed, _numbers_of))
-_QUICKLY = tuple(
-    eqx.filter_jit(one, compiler_options={"xla_backend_optimization_level": 0})
-    for one in (_listed, _numbers_of)
-)
+_HURRY: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
+evaluate_listed, _numbers = eqx.filter_jit(_listed), eqx.filter_jit(_numbers_of)
+_QUICKLY = eqx.filter_jit(_listed, **_HURRY), eqx.filter_jit(_numbers_of, **_HURRY)
 #: Atoms up to which compiling takes longer than a few calls.
 _SMALL = 1000

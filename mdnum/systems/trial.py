@@ -51,6 +51,7 @@ class Trial:
     Attributes:
         model: the function as far as it is known.
         notes: what should be known about it, values by code.
+        scale: size of the energy, once it is known.
         idx, inside: neighbors within cutoff and skin, and within the cutoff, as wide as the fullest row.
     """
 
@@ -77,7 +78,7 @@ class Trial:
             place = np.full(len(self.x) + 1, atoms, np.int32)
             place[kept] = np.arange(atoms)
             self.x, self.idx = self.x[kept], place[self.idx[kept]]
-        self.n = len(self.x)
+        self.n, self.scale = len(self.x), 0.0
         # pairs of neighbors go as the square of the padding, and two slots of it are a pair
         self.idx = np.sort(self.within(self.idx, self.x, self.model.r_cut + skin), axis=1)
         self.idx = self.idx[:, : max(2, int((self.idx < self.n).sum(axis=1).max()) + 2)]
