@@ -25,6 +25,7 @@ DOCUMENTED = set(re.findall(r"`(mdnum(?:\.[a-z]+)+)`", PAGE))
 INSIDE = {
     "accelerator.py": {"mdnum.md"},
     "_processes.py": {"mdnum.provenance"},
+    "learned_gradients.py": {"mdnum.md"},
     "lost_flips.py": {"mdnum.plain"},
     "make_systems.py": {"mdnum.systems.load", "mdnum.systems.structures"},
     "scaling.py": {"mdnum.safe_path"},

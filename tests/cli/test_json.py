@@ -62,7 +62,7 @@ def test_the_documents_are_listed():
 OPEN = """
 audit:parts[].numbers audit:parts[].tables<>[] ball:gradient[].details ball:variants[].changes
 conform:known demos:data demos:demos[].data demos:demos[].numbers demos:numbers fork:reasons[]
-grad:comparisons[].values grad:edges grad:methods[].details grad:trust.by<>.limits[].values
+grad:comparisons[].values grad:edges grad:function grad:methods[].details grad:trust.by<>.limits[].values
 grad:trust.limits[].values systems-show:
 """
 
