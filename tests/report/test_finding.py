@@ -115,7 +115,9 @@ def test_every_sentence_can_be_filled(path):
     """A field that is misspelled or a format that is none would show only when its finding comes up."""
     for text in sentences(path):
         parts = [(name, form or "") for _, name, form, _ in string.Formatter().parse(text) if name]
-        fields: dict[str, Any] = {name.partition("[")[0]: defaultdict(lambda: 2) for name, _ in parts if "[" in name}
+        fields: dict[str, Any] = {
+            name.partition("[")[0]: defaultdict(lambda: 2) for name, _ in parts if "[" in name
+        }
         fields = {name: 2 for name, _ in parts} | fields
         # a number with its unit is one of which the floor is written, or thousandths
         known = {name.split(".")[0] for name, form in parts if "." in name or re.match(r"[+]?\d*m|=", form)}
