@@ -14,6 +14,7 @@ from gradient_problems import everything
 from moving_box import Piston, Sheared, Strained
 from rollout.harness import liquid
 from scipy.integrate import solve_ivp
+from small_systems import make
 
 import mdnum
 from mdnum.errors import InputError
@@ -21,6 +22,7 @@ from mdnum.gradients import Problem, method, parameters
 from mdnum.gradients.diagnose import spectrum
 from mdnum.gradients.losses import Custom, MeanDensity, MeanTemperature, MeanVolume
 from mdnum.gradients.recorded import EventAware, Symmetric
+from mdnum.systems import build
 from mdnum.systems.simulation import Simulation
 
 TAU: dict[str, Any] = {"relaxation": 0.2}
@@ -90,16 +92,15 @@ def test_derivatives_are_those_of_differences(kind, words):
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["csvr", "mtk full"])
 def test_another_potential_and_a_tilted_box(kind):
-    """Of a many-body energy by its own strain, and of an energy of several terms with weights."""
+    """Of a many-body energy, by its own strain."""
     atoms = bulk("Si", "diamond", a=5.43, cubic=True).repeat(2)
     atoms.set_cell(atoms.cell.array @ (np.eye(3) + 0.1 * np.eye(3, k=1)), scale_atoms=True)
     name, numbers = KINDS[kind]
     if "pressure" in numbers:
         numbers = numbers | {"pressure": 0.02, "relaxation": 0.1, "pressure_relaxation": 0.2}
-    simulation = mdnum.simulation(
-        atoms, mdnum.StillingerWeber(), integrator=name, dynamics=numbers, timestep=0.001,
-        temperature=600.0, skin=0.4, seed=3,
-    )  # fmt: skip
+    dynamics = {"kind": name, "timestep": 0.001, "temperature": 600.0, "seed": 3} | numbers
+    silicon = {"kind": "stillinger-weber"}
+    simulation = build(make(atoms, silicon, None, "metal", dynamics=dynamics, neighbors={"skin": 0.4}))
     names = ("dynamics.temperature", "box.scale", "initial.positions", "initial.velocities")
     agrees(Problem(simulation, everything(len(atoms)), 20), names, ("symmetric", "unrolled"), 1e-6)
 
