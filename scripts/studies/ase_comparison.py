@@ -1,6 +1,6 @@
 """Are energies, forces and stresses right, and does every library mean the same by "inside the cutoff"?
 
-Answer. Yes. 16 systems and cutoffs agree with ASE or numpy: energies to 3e-14 of their size, forces and
+Answer. Yes. 18 systems and cutoffs agree with ASE or numpy: energies to 3e-14 of their size, forces and
 stresses to 1e-13. All searches installed here (ASE, vesin, scipy, pymatgen, MDAnalysis, jax-md) find the
 same pairs; where they stop counting differs by ulps of r_cut, and by 1e-8 for MDAnalysis, which works in
 float32. It takes 50 s.
