@@ -12,6 +12,7 @@ Verbs take either, or the name or path of a system file, and leave a folder:
     run                 simulate, record every flip, compare with ASE
     fork, fork_...      follow two runs that differ in one choice; maps, certificates, forecasts
     grad                differentiate a loss of a run in several ways, and judge the derivatives
+    sweep               which choices move which results, and the cheapest setting that is enough
     check               compare energies, pairs or a trajectory with other codes, on the spot
     flips               contacts and flips of anybody's trajectory
     audit_calculator    is an ASE calculator smooth, invariant and conservative?
@@ -103,6 +104,7 @@ if TYPE_CHECKING:
     from mdnum.verbs.outcome import Outcome as Outcome
     from mdnum.verbs.recorder import Recorder as Recorder
     from mdnum.verbs.run import run as run
+    from mdnum.verbs.sweep import sweep as sweep
 
     audit_calculator = _audit
 

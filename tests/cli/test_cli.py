@@ -20,6 +20,7 @@ import pytest
 import typer
 from command_line import Recorder, call, printed
 
+import mdnum
 from mdnum import bounce, conform, fork_map, verbs
 from mdnum.cli import main, output
 from mdnum.cli.commands import app
@@ -239,8 +240,10 @@ def test_every_option_is_a_parameter_of_what_is_called():
             called = inspect.unwrap(getattr(VERBS[entry], said["calls"]))
             if getattr(called, "__name__", "") == "command":
                 # which passes on what it does not need
-                called = inspect.unwrap({"ball": bounce, "conform": conform, "fork map": fork_map}[entry])
-                options -= {"demo"}
+                called = inspect.unwrap(
+                    {"ball": bounce, "conform": conform, "fork map": fork_map, "sweep": mdnum.sweep}[entry]
+                )
+                options -= {"demo", "dry_run"}
             parameters = inspect.signature(called).parameters
             more = passed_on if any(one.kind is one.VAR_KEYWORD for one in parameters.values()) else set()
             assert options - {"settings", "potential"} <= {*parameters, *more}, (entry, said["help"])

@@ -1,0 +1,122 @@
+"""The cheapest setting whose results are those of the converged one, within a tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mdnum.sweeps.statistics import Estimate, Within, difference, within
+
+#: The end at which an axis is converged: its largest value, its smallest, or none of both where a choice
+#: should change no result.
+_ENDS = {
+    "cutoff.radius": "largest", "cutoff.in_sigma": "largest", "dynamics.timestep": "smallest",
+    "structure.repeat": "largest", "dynamics.steps": "largest", "tol": "smallest", "timestep": "smallest",
+    "h": "smallest", "neighbors.skin": "any", "precision": "float64", "precision.state": "float64",
+    "precision.force": "float64", "precision.reduction": "exact",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A value of an axis, compared with the converged end."""
+
+    value: Any
+    by_measure: Mapping[str, Within]
+    worst: str | None  # measure that keeps it from being within the tolerance, or undecided
+
+    @property
+    def inside(self) -> bool | None:
+        """Whether all measures are within their tolerances; None: not decided."""
+        each = [one.inside for one in self.by_measure.values()]
+        return False if False in each else None if None in each else True
+
+    @property
+    def more(self) -> float:
+        """Times as many seeds that would decide it."""
+        return max((one.more for one in self.by_measure.values()), default=1.0)
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to use along one axis.
+
+    Attributes:
+        key: of the axis. end: the value that counts as converged; None where there is none.
+        settings: every value with its comparison, from the converged end on.
+        best: the cheapest that is within the tolerance with all that are nearer to the end; None where
+            nothing but the end is, or where that is not decided.
+        undecided: the first value that is not decided, beyond best.
+        converged: whether the value next to the end is within the tolerance of it: if not, the end itself may
+            be too near.
+    """
+
+    key: str
+    end: Any
+    settings: tuple[Setting, ...]
+    best: Any
+    undecided: Any
+    converged: bool | None
+
+
+def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
+    """The value of an axis that counts as converged; None where none does."""
+    word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
+    if word == "largest":
+        return max(values, key=_size)
+    if word == "smallest":
+        return min(values, key=_size)
+    return next((one for one in values if str(one) == word), None)
+
+
+def _size(value: Any) -> float:
+    return float(np.prod(value)) if np.ndim(value) else float(value)
+
+
+def advise(
+    key: str,
+    values: Sequence[Any],
+    found: Mapping[str, Mapping[Any, Estimate]],
+    tolerances: Mapping[str, float],
+    given: Mapping[str, str] = {},
+) -> Advice | None:
+    """What to use along an axis; None where no end of it is converged, or no measure has a tolerance.
+
+    Args:
+        values: of the axis. found: estimates by measure and by label of a value.
+        tolerances: by measure, in its unit.
+        given: ends by key, in place of the usual ones: "largest", "smallest" or a value.
+    """
+    end = end_of(key, values, given)
+    if end is None or not tolerances:
+        return None
+    rest = [one for one in values if one != end]
+    rest.sort(key=lambda one: abs(_size(one) - _size(end)) if _numeric(one, end) else 0.0)
+    comparisons = max(1, len(rest) * len(tolerances))
+    settings = [Setting(end, {}, None)]
+    for value in rest:
+        each: dict[str, Within] = {}
+        for name, tolerance in tolerances.items():
+            one, last = found[name].get(str(value)), found[name].get(str(end))
+            if one is None or last is None:
+                each[name] = Within(None, np.inf)
+                continue
+            each[name] = within(*difference(one, last), tolerance, comparisons)
+        ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
+        worst = next((name for name in ranked if each[name].inside is not True), None)
+        settings.append(Setting(value, each, worst))
+    best, undecided = end, None
+    for setting in settings[1:]:
+        if setting.inside is not True:
+            undecided = setting.value if setting.inside is None else None
+            break
+        best = setting.value
+    converged = settings[1].inside if len(settings) > 1 else None
+    return Advice(key, end, tuple(settings), best, undecided, converged)
+
+
+def _numeric(*values: Any) -> bool:
+    return all(isinstance(one, int | float) or np.ndim(one) for one in values)

@@ -1,0 +1,181 @@
+"""What is varied: choices with their values, and the points that are run.
+
+A choice is a key of the system file, or a word for several keys that belong together (`precision`). Values
+are those that a system file would have.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.systems.toml import scalar
+
+#: Most points of a sweep, and most values of one range.
+MOST_POINTS, _MOST_VALUES = 100_000, 10_000
+#: Words for keys that belong together, with the values that they have by default.
+PRECISIONS = ("float64", "float32")
+_RANGE = re.compile(r"\s*([^:\s]+)\s*:\s*([^:\s]+)\s*:\s*([^:\s]+)\s*")
+_REMEDY = "Write KEY=LOW:HIGH:STEP or KEY=VALUE,VALUE,…, such as cutoff.radius=2.0:3.5:0.25"
+Design = Literal["one-at-a-time", "factorial", "space-filling"]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A choice and its values."""
+
+    key: str
+    values: tuple[Any, ...]
+
+    @property
+    def ordered(self) -> bool:
+        """Whether its values are numbers."""
+        return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
+
+    def settings(self, value: Any) -> dict[str, Any]:
+        """The keys of a system file that a value stands for."""
+        if self.key == "precision" and isinstance(value, str):
+            return {f"precision.{role}": value for role in ("state", "force")}
+        return {self.key: value}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting of all choices, with a seed."""
+
+    choices: Mapping[str, Any]  # a value for each axis
+    seed: int | None  # None: the system's own
+
+
+def parse(text: str) -> Axis:
+    """The axis of KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or the word precision.
+
+    Raises:
+        InputError: not of that form, or values that repeat.
+    """
+    key, equals, rest = (part.strip() for part in text.partition("="))
+    if key == "precision" and not equals:
+        return Axis(key, PRECISIONS)
+    if not key or not rest:
+        raise InputError(f"--over {text!r} has no values", remedy=_REMEDY)
+    if found := _RANGE.fullmatch(rest):
+        return Axis(key, _range(text, *map(scalar, found.groups())))
+    if re.fullmatch(r"[-+.\deE]+(:[-+.\deE]*)+", rest):
+        raise InputError(f"--over {text!r} is no range", remedy=_REMEDY)
+    # lists of a file ([4, 4, 4]) have commas of their own
+    parts = re.split(r",(?![^\[]*\])", rest)
+    return checked(Axis(key, tuple(scalar(part.strip()) for part in parts)))
+
+
+def checked(axis: Axis) -> Axis:
+    """The axis.
+
+    Raises:
+        InputError: no values, one that is not finite, or some that repeat.
+    """
+    seen = [json.dumps(one) for one in axis.values]
+    if not seen or "" in axis.values:
+        raise InputError(f"{axis.key} has no values", remedy=_REMEDY)
+    if bad := [one for one in axis.values if isinstance(one, float) and not math.isfinite(one)]:
+        raise InputError(f"{axis.key} = {bad[0]} is no finite number", remedy=_REMEDY)
+    if len({*seen}) < len(seen):
+        again = next(one for one in seen if seen.count(one) > 1)
+        raise InputError(f"{axis.key} has {again} twice", remedy="Give each value once")
+    return axis
+
+
+def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
+    numbers = [low, high, step]
+    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
+        raise InputError(f"--over {text!r} is no range of numbers", remedy=_REMEDY)
+    if not all(map(math.isfinite, numbers)) or step <= 0 or high < low:
+        raise InputError(f"--over {text!r}: from {low} to {high} by {step}", remedy=_REMEDY)
+    count = math.floor((high - low) / step + 1e-9) + 1
+    if count > _MOST_VALUES:
+        raise InputError(f"--over {text!r} has {count:,} values", remedy=f"{_MOST_VALUES:,} are possible")
+    if all(isinstance(one, int) for one in numbers):
+        return tuple(range(low, high + 1, step))
+    # the decimals that were written, not what adding steps makes of them
+    digits = max(len(repr(float(one)).partition(".")[2].partition("e")[0]) for one in (low, step))
+    small = [-int(exponent) for one in (low, step) if (exponent := repr(float(one)).partition("e")[2])]
+    return tuple(round(low + k * step, digits + max([0, *small])) for k in range(count))
+
+
+def with_base(axis: Axis, base: Any) -> Axis:
+    """The axis with the base among its values, in order where they are numbers."""
+    same = [one for one in axis.values if one == base and type(one) is not bool]
+    values = axis.values if same else (base, *axis.values)
+    made = Axis(axis.key, values)
+    return Axis(axis.key, tuple(sorted(values))) if made.ordered else made
+
+
+def points(
+    axes: Sequence[Axis],
+    base: Mapping[str, Any],
+    seeds: Sequence[int | None],
+    design: Design = "one-at-a-time",
+    samples: int = 0,
+) -> list[Point]:
+    """All points, seed after seed, so that a sweep that is stopped early has seen every setting.
+
+    Args:
+        base: the value of each axis around which one at a time is varied.
+        samples: points of a space-filling design, a power of two.
+
+    Raises:
+        InputError: too many points, or a space-filling design over values without an order.
+    """
+    keys = [axis.key for axis in axes]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise InputError(f"{twice[0]} is given twice", remedy="Give each choice once, with all its values")
+    if design == "factorial":
+        count = math.prod(len(axis.values) for axis in axes)
+        if count * len(seeds) > MOST_POINTS:
+            raise InputError(
+                f"{count * len(seeds):,} points", remedy="Give fewer values, or leave out factorial"
+            )
+        chosen = [dict(zip(keys, values, strict=True)) for values in product(*(axis.values for axis in axes))]
+    elif design == "space-filling":
+        chosen = _filling(axes, samples)
+    else:
+        chosen = [dict(base)]
+        for axis in axes:
+            chosen += [{**base, axis.key: value} for value in axis.values if value != base[axis.key]]
+    if len(chosen) * len(seeds) > MOST_POINTS:
+        raise InputError(f"{len(chosen) * len(seeds):,} points", remedy=f"{MOST_POINTS:,} are possible")
+    return [Point(choices, seed) for seed in seeds for choices in chosen]
+
+
+def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
+    """A scrambled Sobol sequence between the ends of each axis; of words, each in turn."""
+    from scipy.stats import qmc
+
+    if samples < 2 or samples & (samples - 1):
+        raise InputError(f"{samples} samples", remedy="Give a power of two, 16 for instance")
+    unit = qmc.Sobol(len(axes), rng=np.random.default_rng(0)).random(samples)
+    rows = []
+    for row in unit:
+        made = {}
+        for axis, share in zip(axes, row, strict=True):
+            if axis.ordered:
+                low, high = min(axis.values), max(axis.values)
+                value = low + share * (high - low)
+                whole = all(isinstance(one, int) for one in axis.values)
+                made[axis.key] = int(np.rint(value)) if whole else float(f"{value:.12g}")
+            else:
+                made[axis.key] = axis.values[min(int(share * len(axis.values)), len(axis.values) - 1)]
+        rows.append(made)
+    return rows
+
+
+def label(value: Any) -> str:
+    """A value as a table has it."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,295 @@
+"""What is read from a run: a number with its unit and its statistical error, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.registry import Registry
+from mdnum.sweeps.statistics import correlated
+
+#: Stretches of a run whose scatter is the error of what is no mean over time.
+_BLOCKS = 8
+#: Bins of g(r), and the share of half the box's width that it reaches to.
+_BINS, _REACH = 200, 0.98
+
+
+class Value(NamedTuple):
+    """A measure of one run."""
+
+    value: float
+    error: float = float("nan")  # standard error; nan where one run does not tell
+    effective: float = float("nan")  # independent samples behind it
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A run as measures see it.
+
+    Attributes:
+        series: numbers of each step, as in series.parquet.
+        summary: of the run.
+        atoms: how many.
+        k_B: Boltzmann's constant in the units of the run.
+        folder: of the run, with its frames where a measure needs them.
+    """
+
+    series: Mapping[str, np.ndarray]
+    summary: Mapping[str, Any]
+    atoms: int
+    k_B: float
+    folder: Path
+    volume: float = field(default=float("nan"))  # of a box that does not move, length³
+
+    @cached_property
+    def frames(
+        self,
+    ) -> tuple[Float[np.ndarray, "frames atoms 3"], Float[np.ndarray, "frames 3 3"], np.ndarray]:
+        """Unwrapped positions, lattice vectors as rows and times of the frames."""
+        from ase.io import read
+
+        found: Any = read(self.folder / "trajectory.traj", index=":")
+        x = np.array([one.positions + one.info["images"] @ one.cell.array for one in found])
+        return x, np.array([one.cell.array for one in found]), np.array([one.info["time"] for one in found])
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Of each step, length³."""
+        return self.series.get("volume", np.full(len(self.series["step"]), self.volume))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Something that is read from a run.
+
+    Attributes:
+        name: by which it is asked for.
+        unit: of quantities, such as "energy" or "length²/time".
+        title: in words.
+        of: its value.
+        needs: "series", or "frames" of positions along the run.
+        physical: whether it is a result, and no property of the machine or of the lists.
+    """
+
+    name: str
+    unit: str
+    title: str
+    of: Callable[[Sample], Value]
+    needs: Literal["series", "frames"] = "series"
+    physical: bool = True
+
+
+MEASURES: Registry[Measure] = Registry("measure", "mdnum.measures", kind=Measure)
+
+
+def _measure(
+    unit: str, title: str, needs: Literal["series", "frames"] = "series", physical: bool = True
+) -> Callable[..., Any]:
+    def add(of: Callable[[Sample], Value]) -> Callable[[Sample], Value]:
+        name = of.__name__
+        MEASURES.add(name, Measure(name, unit, title, of, needs, physical))
+        return of
+
+    return add
+
+
+def _blocked(of: Callable[[slice], float], rows: int, blocks: int = _BLOCKS) -> Value:
+    """A number of the whole, with the scatter of blocks as its error."""
+    edges = np.linspace(0, rows, blocks + 1).astype(int)
+    parts = np.array([of(slice(a, b)) for a, b in pairwise(edges) if b > a])
+    error = parts.std(ddof=1) / len(parts) ** 0.5 if len(parts) > 1 else np.nan
+    return Value(of(slice(0, rows)), float(error), float(len(parts)))
+
+
+@_measure("energy", "potential energy per atom")
+def energy(run: Sample) -> Value:
+    return Value(*correlated(run.series["potential"] / run.atoms))
+
+
+@_measure("temperature", "temperature")
+def temperature(run: Sample) -> Value:
+    return Value(*correlated(run.series["temperature"]))
+
+
+@_measure("pressure", "pressure")
+def pressure(run: Sample) -> Value:
+    return Value(*correlated(run.series["pressure"]))
+
+
+@_measure("1/length³", "atoms per volume")
+def density(run: Sample) -> Value:
+    return Value(*correlated(run.atoms / run.volumes))
+
+
+@_measure("1/time", "flips per atom and time")
+def flips(run: Sample) -> Value:
+    each = (run.series["entered"] + run.series["left"])[1:]
+    step = np.diff(run.series["time"])[:1]
+    return Value(*correlated(each / run.atoms / step)) if len(each) else Value(np.nan)
+
+
+@_measure("energy/time", "drift of the conserved energy per atom")
+def drift(run: Sample) -> Value:
+    """The slope of a line through the second half, with the error that the scatter of blocks leaves."""
+    rows = slice(len(run.series["time"]) // 2, None)
+    time, kept = run.series["time"][rows], run.series["conserved"][rows] / run.atoms
+    if len(time) < 2 * _BLOCKS:
+        return Value(np.nan)
+    at = np.array([part.mean() for part in np.array_split(time, _BLOCKS)])
+    means = np.array([part.mean() for part in np.array_split(kept - kept[0], _BLOCKS)])
+    (slope, _), covariance = np.polyfit(at, means, 1, cov=True)
+    return Value(float(slope), float(covariance[0, 0] ** 0.5), float(_BLOCKS - 1))
+
+
+@_measure("", "spread of the conserved energy over that of the kinetic energy")
+def fluctuation(run: Sample) -> Value:
+    half = slice(len(run.series["time"]) // 2, None)
+    kept, kinetic = run.series["conserved"][half], run.series["kinetic"][half]
+
+    def share(rows: slice) -> float:
+        here, at = kept[rows], np.arange(len(kept[rows]))
+        noise = here - np.polyval(np.polyfit(at, here, 1), at) if len(here) > 2 else here - here.mean()
+        return float(noise.std() / kinetic.std()) if kinetic.std() > 0 else np.nan
+
+    return _blocked(share, len(kept))
+
+
+@_measure("", "heat capacity per atom, in k_B")
+def heat_capacity(run: Sample) -> Value:
+    """From the fluctuations of the kinetic energy at constant energy (Lebowitz, Percus, Verlet 1967), of the
+    whole energy where a thermostat holds the temperature."""
+    half = slice(len(run.series["time"]) // 2, None)
+    kinetic, total = run.series["kinetic"][half], run.series["total"][half]
+    held = run.summary.get("dynamics") not in ("nve", None)
+    free = 3 * run.atoms - 3
+
+    def capacity(rows: slice) -> float:
+        k = kinetic[rows]
+        heat = 2 * k.mean() / free  # k_B T
+        if held:
+            return float(total[rows].var(ddof=1) / heat**2 / run.atoms)
+        return float(1.5 / (1 - 2 * k.var(ddof=1) / (free * heat**2)))
+
+    return _blocked(capacity, len(kinetic), 5)
+
+
+@_measure("", "pairs that lists lost", physical=False)
+def lost(run: Sample) -> Value:
+    return Value(float(run.summary["lost_pairs"]), 0.0, np.inf)
+
+
+@_measure("steps/s", "speed of the run", physical=False)
+def speed(run: Sample) -> Value:
+    return Value(float(run.summary["steps_per_second"]))
+
+
+@_measure("", "height of the first peak of g(r)", "frames")
+def rdf(run: Sample) -> Value:
+    g, _ = radial_distribution(run)
+    half = g[len(g) // 2 :] if len(g) > 2 * _BLOCKS else g
+    peak = int(np.argmax(half.mean(axis=0)))
+    return _blocked(lambda rows: float(half[rows, peak].mean()), len(half), min(_BLOCKS, len(half)))
+
+
+def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], Float[np.ndarray, "bins"]]:
+    """g(r) of each frame and the middle of its bins, by MDAnalysis's search of pairs."""
+    from MDAnalysis.lib.distances import capped_distance
+    from MDAnalysis.lib.mdamath import triclinic_box
+
+    x, cells, _ = run.frames
+    widths = [1 / np.linalg.norm(np.linalg.inv(cell), axis=0) for cell in cells]
+    edges = np.linspace(0, 0.5 * _REACH * min(map(min, widths)), _BINS + 1)
+    shells = 4 / 3 * np.pi * np.diff(edges**3)
+    rows = []
+    for here, cell in zip(x, cells, strict=True):
+        box = triclinic_box(*cell)
+        flat = np.asarray(here @ np.linalg.inv(cell) % 1 @ cell, np.float32)
+        _, distances = capped_distance(flat, flat, edges[-1], min_cutoff=1e-3, box=box)
+        count = np.histogram(distances, edges)[0]
+        ideal = run.atoms * (run.atoms - 1) / abs(np.linalg.det(cell)) * shells
+        rows.append(count / ideal)
+    return np.array(rows), 0.5 * (edges[1:] + edges[:-1])
+
+
+def _mean_square(x: Float[np.ndarray, "frames atoms 3"]) -> Float[np.ndarray, "lags"]:
+    """Mean squared displacement by lag, over all atoms and origins."""
+    import MDAnalysis
+    from MDAnalysis.analysis.msd import EinsteinMSD
+
+    universe = MDAnalysis.Universe.empty(x.shape[1], trajectory=False)
+    universe.load_new(np.asarray(x, np.float32))
+    return np.asarray(EinsteinMSD(universe, fft=False).run(verbose=False).results.timeseries)
+
+
+@_measure("length²", "mean squared displacement over half of the run", "frames")
+def msd(run: Sample) -> Value:
+    x, _, _ = run.frames
+    if len(x) < 4:
+        return Value(np.nan)
+    moved = x[-1] - x[len(x) // 2]
+    moved = np.sum((moved - moved.mean(axis=0)) ** 2, axis=1)
+    # atoms are nearly independent of each other
+    return Value(float(moved.mean()), float(moved.std(ddof=1) / len(moved) ** 0.5), float(len(moved)))
+
+
+@_measure("length²/time", "self-diffusion coefficient", "frames")
+def diffusion(run: Sample) -> Value:
+    """Slope of the mean squared displacement over six, at lags of a tenth to a half of each block."""
+    x, _, time = run.frames
+    x = x[len(x) // 4 :] - x[len(x) // 4 :].mean(axis=1, keepdims=True)
+    if len(x) < 40:
+        return Value(np.nan)
+    pace = float(time[1] - time[0])
+
+    def slope(rows: slice) -> float:
+        found = _mean_square(x[rows])
+        lags = np.arange(len(found))[max(1, len(found) // 10) : max(3, len(found) // 2)]
+        return float(np.polyfit(lags * pace, found[lags], 1)[0] / 6)
+
+    blocks = [slope(slice(k, k + len(x) // 4)) for k in range(0, len(x) - len(x) // 4 + 1, len(x) // 4)]
+    return Value(
+        float(np.mean(blocks)), float(np.std(blocks, ddof=1) / len(blocks) ** 0.5), float(len(blocks))
+    )
+
+
+#: What is measured where nothing else is asked for.
+USUAL = ("energy", "pressure", "temperature", "drift", "flips")
+
+
+def chosen(words: Sequence[str]) -> list[Measure]:
+    """Measures by name.
+
+    Raises:
+        InputError: no such measure, or one twice.
+    """
+    if twice := [word for word in words if list(words).count(word) > 1]:
+        raise InputError(f"--measure has {twice[0]} twice", remedy="Give each once")
+    return [MEASURES[word] for word in words]
+
+
+def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, Any]]:
+    """Values of measures by name; where one has none, why."""
+    found: dict[str, dict[str, Any]] = {}
+    for one in measures:
+        try:
+            value = one.of(run)
+        except (ArithmeticError, LookupError, ValueError) as error:
+            found[one.name] = {"value": None, "why": f"{type(error).__name__}: {error}"}
+            continue
+        if np.isfinite(value.value):
+            found[one.name] = {
+                "value": float(value.value),
+                "error": value.error,
+                "effective": value.effective,
+            }
+        else:
+            found[one.name] = {"value": None, "why": "too few steps or frames"}
+    return found

@@ -1,0 +1,285 @@
+"""A folder for each point, named by what was asked: none lost, none computed twice, whoever computes.
+
+    sweep/
+      .signac/config                  a signac workspace
+      workspace/ADDRESS/
+        signac_statepoint.json        every number and choice that the point is made of
+        point.json                    its results, or why there are none
+        series.parquet                numbers of each step
+      workspace/.ADDRESS.claim.N      who computes it now
+
+The address is signac's: the MD5 of the state point as JSON. A point is computed in a folder of its own and
+appears under its address by one rename; what is killed before leaves nothing there. Who claims a point
+creates its claim, which one process alone can (O_EXCL); the claim of a process that is gone is followed by
+another with the next number. Nothing of this depends on what starts the processes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from mdnum.errors import FolderError
+from mdnum.plain import plain
+from mdnum.provenance import package_versions
+from mdnum.store.files import disk_errors, write_text
+from mdnum.systems.toml import flat
+
+STATE_POINT, RESULT = "signac_statepoint.json", "point.json"
+#: Seconds between the signs of life of a claim, and without one after which its process counts as gone where
+#: that cannot be told otherwise (on another machine).
+_ALIVE, _GONE = 20.0, 180.0
+_CLAIM = re.compile(r"\.(?P<address>[0-9a-f]{32})\.claim\.(?P<number>\d+)")
+#: What computes points and measures; how they are compared and shown is another matter.
+_COMPUTES = (
+    "compiled.py", "vectors.py", "bits.py", "numerics/**/*.py", "md/*.py", "ball/*.py", "systems/*.py",
+    "rollout/*.py", "sweeps/measures.py", "sweeps/statistics.py",
+)  # fmt: skip
+#: Packages whose version changes what a point computes.
+_ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
+
+
+@cache
+def code() -> str:
+    """A digest of the source that a point is computed by, and of the versions of what it computes with."""
+    found, root = hashlib.sha256(), Path(__file__).parents[1]
+    for file in sorted(file for place in _COMPUTES for file in root.glob(place)):
+        found.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    versions = package_versions()
+    found.update(json.dumps([versions.get(name) for name in _ARITHMETIC]).encode())
+    return found.hexdigest()[:16]
+
+
+def state_point(
+    program: Mapping[str, Any], structure: str | None, asked: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a point is made of: the numbers and choices of its system, resolved, and what is asked of it.
+
+    Args:
+        program: of a system (`System.program`); None is left out. structure: digest of its atoms.
+        asked: whatever else counts, such as the last step.
+    """
+    numbers = _given(plain(dict(program)))
+    return plain({"system": numbers, "structure": structure, "asked": dict(asked), "code": code()})
+
+
+def _given(tables: Any) -> Any:
+    """Tables without what is None; signac allows no dots in keys, so they stay tables."""
+    if not isinstance(tables, dict):
+        return tables
+    return {key.replace(".", "-"): _given(one) for key, one in tables.items() if one is not None}
+
+
+def address_of(point: Mapping[str, Any]) -> str:
+    """signac's name of a state point."""
+    return hashlib.md5(json.dumps(point, sort_keys=True).encode(), usedforsecurity=False).hexdigest()
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The fields in which two state points differ."""
+    a, b = (flat({**point, **point.get("system", {}), "system": {}}) for point in (one, other))
+    return [name for name in {**a, **b} if a.get(name) != b.get(name)]
+
+
+class Workspace:
+    """The points of a sweep on disk.
+
+    Raises:
+        FolderError: it cannot be made or read.
+    """
+
+    def __init__(self, root: Path):
+        self.root, self.place = root, root / "workspace"
+        with disk_errors(root):
+            self.place.mkdir(parents=True, exist_ok=True)
+            (root / ".signac").mkdir(exist_ok=True)
+            if not (config := root / ".signac" / "config").exists():
+                write_text(config, 'schema_version = "2"\n')
+
+    def folder(self, address: str) -> Path:
+        """Where a point's results are."""
+        return self.place / address
+
+    def result(self, address: str) -> dict[str, Any] | None:
+        """What is known of a point; None where it was not computed.
+
+        Raises:
+            FolderError: its file is damaged.
+        """
+        file = self.folder(address) / RESULT
+        try:
+            return json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            message = f"is no result of a point: {error}"
+            raise FolderError(
+                message, where=str(file), remedy="Delete its folder: it is computed again"
+            ) from None
+
+    def nearest(self, point: Mapping[str, Any]) -> list[str] | None:
+        """Fields in which the stored point most like one differs from it; None where there is none."""
+        best: list[str] | None = None
+        for file in self.place.glob(f"*/{STATE_POINT}"):
+            with suppress(OSError, ValueError):
+                fields = differing(json.loads(file.read_text(encoding="utf-8")), point)
+                best = fields if best is None or len(fields) < len(best) else best
+        return best
+
+    # --- claims -------------------------------------------------------------------------------------------
+
+    def claims(self, address: str = "*") -> list[tuple[Path, int]]:
+        """Claims of a point, or of all, with their numbers, the latest last."""
+        found = [(file, _CLAIM.fullmatch(file.name)) for file in self.place.glob(f".{address}.claim.*")]
+        numbered = [(file, int(match["number"])) for file, match in found if match]
+        return sorted(numbered, key=lambda one: (one[0].name.partition(".claim.")[0], one[1]))
+
+    @contextmanager
+    def claimed(self, address: str) -> Iterator[bool]:
+        """Whether this process has a point to itself until the end of the block.
+
+        What another has just finished may be there then: look again.
+        """
+        claim = self._claim(address)
+        if claim is None:
+            yield False
+            return
+        ended = threading.Event()
+
+        def alive() -> None:
+            while not ended.wait(_ALIVE):
+                with suppress(OSError):
+                    os.utime(claim)
+
+        threading.Thread(target=alive, daemon=True).start()
+        try:
+            yield True
+        finally:
+            ended.set()
+            self._release(address)
+
+    def _claim(self, address: str) -> Path | None:
+        held = self.claims(address)
+        if held and not gone(held[-1][0]):
+            return None
+        claim = self.place / f".{address}.claim.{held[-1][1] + 1 if held else 0}"
+        try:
+            number = os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+        except FileExistsError:
+            return None
+        except OSError as error:
+            raise FolderError(f"no claim can be made: {error.strerror}", where=str(claim)) from None
+        with os.fdopen(number, "w", encoding="utf-8") as opened:
+            json.dump(me(), opened)
+        return claim
+
+    def _release(self, address: str) -> None:
+        # the latest last: another process that finds none left may begin
+        for file, _ in self.claims(address):
+            with suppress(FileNotFoundError):
+                file.unlink()
+
+    # --- results ------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
+        """A folder to be filled, which becomes that of the point when the block ends without an error."""
+        here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
+        shutil.rmtree(here, ignore_errors=True)
+        with disk_errors(here):
+            here.mkdir()
+            try:
+                yield here
+                write_text(here / STATE_POINT, json.dumps(point))
+                self._publish(here, self.folder(address))
+            finally:
+                shutil.rmtree(here, ignore_errors=True)
+
+    def _publish(self, made: Path, target: Path) -> None:
+        with suppress(OSError):
+            made.rename(target)
+            return
+        # it is there already: measured again, or by somebody whose claim had been given up
+        for file in made.iterdir():
+            if not file.is_dir():
+                os.replace(file, target / file.name)
+
+    def swept(self) -> int:
+        """Removes what processes that are gone left half done; how many folders those were."""
+        count = 0
+        held = {file.name[1:33] for file, _ in self.claims() if not gone(file)}
+        for folder in self.place.glob(".????????????????????????????????.*.*"):
+            if folder.is_dir() and folder.name[1:33] not in held:
+                shutil.rmtree(folder, ignore_errors=True)
+                count += 1
+        return count
+
+
+def write_result(folder: Path, found: Mapping[str, Any]) -> None:
+    """The results of a point into its folder."""
+    write_text(folder / RESULT, json.dumps(plain(dict(found)), indent=1))
+
+
+# --- who is alive ------------------------------------------------------------------------------------------
+
+
+def me() -> dict[str, Any]:
+    """This process, as its claims name it."""
+    pid = os.getpid()
+    return {"host": socket.gethostname(), "boot": boot(), "pid": pid, "since": born(pid), "at": time.time()}
+
+
+@cache
+def boot() -> str:
+    """A name of this machine's time since it was started; empty where it has none."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return ""
+
+
+def born(pid: int) -> str | None:
+    """When a process of this machine was started, in ticks; None where there is none, "" where unknown."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return None
+    except OSError:
+        pass
+    with suppress(OSError, IndexError):
+        # the name in parentheses may hold anything
+        return (
+            Path(f"/proc/{pid}/stat")
+            .read_text(encoding="utf-8", errors="replace")
+            .rpartition(")")[2]
+            .split()[19]
+        )
+    return ""
+
+
+def gone(claim: Path) -> bool:
+    """Whether the process that made a claim is gone: its machine was started again, or it runs no more.
+
+    On another machine, that its last sign of life is three minutes old.
+    """
+    try:
+        silent = time.time() - claim.stat().st_mtime
+        who = json.loads(claim.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):
+        # killed between the two lines that make it
+        return silent > _GONE
+    if who["host"] == socket.gethostname():
+        return who["boot"] != boot() or born(who["pid"]) != who["since"]
+    return silent > _GONE

@@ -1,0 +1,225 @@
+"""Means over seeds and differences between choices, each with its error.
+
+A run gives a mean and, from its own correlation, the error of that mean; several seeds give their scatter.
+Both estimate one variance, the first with many degrees of freedom but too small where modes are slower than a
+run. So the runs' own errors are scaled by what all seeds of all settings say of them together.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+#: Chance of a false "moves" in a whole sweep, and of seeing a difference that is `detectable`.
+ALPHA, POWER = 0.05, 0.9
+K = TypeVar("K")
+Name = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds."""
+
+    value: float
+    error: float  # standard error; nan from a single run without one of its own, 0 of what does not vary
+    freedom: float  # degrees of freedom of the error
+    runs: int  # that it is a mean of
+    effective: float = float("nan")  # samples that are worth an independent one each, of all runs
+
+    @property
+    def known(self) -> bool:
+        """Whether it has a value and an error."""
+        return bool(np.isfinite(self.value) and np.isfinite(self.error))
+
+
+def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, Estimate]:
+    """Means of one measure at each setting, over runs that differ by their seed alone.
+
+    The error of a mean is that of its runs, times how much more (or less) seeds scatter than runs know, which
+    is one number for all settings of a measure: it is known the better the more settings there are. Where the
+    runs' own errors are worth less than the scatter of the seeds of one setting, that scatter alone counts.
+
+    Args:
+        found: (value, standard error, independent samples) of each run; nan where a run does not tell them.
+    """
+    arrays = {key: np.asarray(rows, float).reshape(-1, 3) for key, rows in found.items()}
+    means = {key: _Runs.of(rows) for key, rows in arrays.items()}
+    several = [one for one in means.values() if one.runs > 1 and one.within > 0]
+    freedom = float(sum(one.runs - 1 for one in several))
+    more = sum((one.runs - 1) * one.between / one.within for one in several) / freedom if several else 1.0
+    made = {}
+    for key, one in means.items():
+        value, samples = float(np.mean(arrays[key][:, 0])), float(np.sum(arrays[key][:, 2]))
+        alone = one.runs - 1.0
+        whole = one.freedom
+        if several and whole:
+            whole = 1 / (1 / freedom + 1 / whole)
+        if one.within == 0 and not one.between > 0:
+            made[key] = Estimate(value, 0.0, max(alone, 1.0), one.runs, samples)
+        elif one.within > 0 and (one.runs == 1 or whole > alone):
+            made[key] = Estimate(value, float((more * one.within) ** 0.5), whole, one.runs, samples)
+        else:
+            made[key] = Estimate(value, float(one.between**0.5), alone, one.runs, samples)
+    return made
+
+
+class _Runs(NamedTuple):
+    """The variance of a mean over runs, as they know it and as they scatter; nan where not known."""
+
+    runs: int
+    within: float
+    freedom: float  # of within: as its samples and as the scatter of the runs' own errors have it
+    between: float
+
+    @classmethod
+    def of(cls, rows: Float[np.ndarray, "runs 3"]) -> _Runs:
+        value, error, samples = rows.T
+        runs = len(rows)
+        between = float(value.var(ddof=1)) / runs if runs > 1 else np.nan
+        within = float(np.sum(error**2)) / runs**2
+        if not (np.isfinite(within) and (samples > 1).all()):
+            return cls(runs, np.nan, 0.0, between)
+        if within == 0:
+            return cls(runs, 0.0, np.inf, between)
+        freedom = float(np.sum(error**2) ** 2 / np.sum(error**4 / (samples - 1)))
+        if runs > 2:
+            square = error**2
+            freedom = min(freedom, 2 * runs * float(square.mean() ** 2 / max(square.var(ddof=1), 1e-300)))
+        return cls(runs, within, freedom, between)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What a choice changes, against the base."""
+
+    value: float
+    error: float  # of the difference
+    freedom: float
+    chance: float  # of one at least as large where nothing differs; corrected for all comparisons of a sweep
+    detectable: float  # smallest that this sweep would have called one, nine times of ten
+
+    @property
+    def moves(self) -> bool | None:
+        """Whether the choice moves the result; None where that is not decided for lack of an error."""
+        return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
+
+    @property
+    def sigmas(self) -> float:
+        """In units of its error."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.float64(self.value) / self.error)
+
+
+def differences(pairs: Mapping[Name, tuple[Estimate, Estimate]]) -> dict[Name, Difference]:
+    """Differences of each choice and its base, with Welch's degrees of freedom, corrected (`corrected`)."""
+    return corrected({name: difference(one, base) for name, (one, base) in pairs.items()})
+
+
+def difference(one: Estimate, base: Estimate) -> tuple[float, float, float]:
+    """Value, error and degrees of freedom; the last is nan where an error is not known."""
+    variances = np.array([one.error**2, base.error**2])
+    value, error = one.value - base.value, float(np.sqrt(variances.sum()))
+    if not (one.known and base.known):
+        return value, error, np.nan
+    parts = variances**2 / np.maximum([one.freedom, base.freedom], 1e-12)
+    return value, error, float(variances.sum() ** 2 / parts.sum()) if error > 0 else np.inf
+
+
+def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Difference]:
+    """Values, errors and degrees of freedom with chances that hold for all of them together (Holm 1979).
+
+    What has no degrees of freedom (nan) is told nothing about, and does not count as a comparison.
+    """
+    from scipy.stats import t
+
+    alone = {
+        name: 2 * float(t.sf(abs(value) / error, free)) if error > 0 else float(value == 0)
+        for name, (value, error, free) in raw.items()
+        if np.isfinite(error) and not np.isnan(free)
+    }
+    chances, least, count = dict.fromkeys(raw, np.nan), 0.0, len(alone)
+    for k, name in enumerate(sorted(alone, key=lambda name: alone[name])):
+        least = chances[name] = max(least, min(1.0, (count - k) * alone[name]))
+    found = {}
+    for name, (value, error, free) in raw.items():
+        seen = np.nan
+        if name in alone:
+            # the hardest of Holm's levels: what is beyond it is seen whatever the others are
+            reach = float(t.isf(ALPHA / 2 / count, free) + t.isf(1 - POWER, free))
+            seen = error * reach if error > 0 else 0.0
+        found[name] = Difference(value, error, free, chances[name], seen)
+    return found
+
+
+def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
+    """What a measure changes from one end of each axis to the other, of a plane through all points.
+
+    Args:
+        places: of each point along each axis, from 0 to 1.
+
+    Returns:
+        (value, error, degrees of freedom) of each axis, as `corrected` takes them; the error counts what the
+        plane does not describe.
+    """
+    rows, count = places.shape
+    freedom = rows - count - 1
+    if freedom < 1:
+        return [(np.nan, np.nan, np.nan)] * count
+    plane = np.column_stack([np.ones(rows), places])
+    found, _, rank, _ = np.linalg.lstsq(plane, values, rcond=None)
+    if rank < count + 1:
+        return [(np.nan, np.nan, np.nan)] * count
+    scatter = float(np.sum((values - plane @ found) ** 2)) / freedom
+    errors = np.sqrt(scatter * np.diag(np.linalg.inv(plane.T @ plane)))
+    return [(float(a), float(b), float(freedom)) for a, b in zip(found[1:], errors[1:], strict=True)]
+
+
+@dataclass(frozen=True)
+class Within:
+    """Whether a difference is within a tolerance."""
+
+    inside: bool | None  # None: not decided
+    # times as many seeds that would decide it, if the difference stays what it is; 1 where it is decided
+    more: float
+
+
+def within(value: float, error: float, freedom: float, tolerance: float, comparisons: int = 1) -> Within:
+    """Whether |difference| ≤ tolerance: its confidence interval lies on one side of it (Schuirmann 1987).
+
+    Args:
+        comparisons: over which the chance of a mistake, ALPHA, is shared.
+    """
+    from scipy.stats import t
+
+    if not np.isfinite(value) or not np.isfinite(error) or np.isnan(freedom):
+        return Within(None, np.inf)
+    reach = error * float(t.isf(ALPHA / max(comparisons, 1), freedom)) if error > 0 else 0.0
+    away = tolerance - abs(value)
+    if abs(away) >= reach:
+        return Within(away >= 0, 1.0)
+    return Within(None, (reach / abs(away)) ** 2 if away else np.inf)
+
+
+def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, float]:
+    """Mean of a time series, its standard error, and how many independent samples it is worth.
+
+    What comes before equilibrium is left out (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
+    """
+    # its import says on the log that it will use jax in double precision, as mdnum does
+    logging.getLogger("pymbar").setLevel(logging.ERROR)
+    from pymbar.timeseries import detect_equilibration
+
+    x = np.asarray(series, float)
+    if len(x) < 4 or not np.isfinite(x).all():
+        return (float(x.mean()) if len(x) else np.nan), np.nan, np.nan
+    if np.ptp(x) <= 1e-14 * np.abs(x).max():
+        return float(x[-1]), 0.0, float(len(x))
+    begin, inefficiency, _ = detect_equilibration(x, nskip=max(1, len(x) // 50))
+    kept = x[int(begin) :]
+    samples = max(len(kept) / float(inefficiency), 1.0)
+    return float(kept.mean()), float(kept.std(ddof=1) / samples**0.5) if len(kept) > 1 else np.nan, samples

@@ -1,0 +1,227 @@
+"""How `mdnum sweep` is judged and shown: which choices move what, what could have been seen, what to use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.section import Code, Page, Plot, Section, Series, Table, table_of
+from mdnum.report.words import listed, number
+from mdnum.sweeps.design import label
+from mdnum.units import named
+from mdnum.verbs.frame import View
+
+TEXTS = Texts(Path(__file__).with_name("sweep.py"))
+#: Choices that should change no result, and are taken for their speed.
+FREE = ("neighbors.skin", "neighbors.builder")
+
+
+def _unit(view: View, name: str) -> str:
+    own = next((one["unit"] for one in view.summary["measures"] if one["name"] == name), "")
+    return named(own, vars(view.units)) or own if own else ""
+
+
+def _moved(view: View) -> dict[str, list[str]]:
+    """Measures that each choice moves."""
+    found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
+    physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
+    for row in view.summary["differences"]:
+        if (
+            row["moves"] == "yes"
+            and row["measure"] in physical
+            and row["measure"] not in found[row["choice"]]
+        ):
+            found[row["choice"]].append(row["measure"])
+    return found
+
+
+def judge(view: View) -> Verdict:
+    """Which choices move which results, and what to use."""
+    s = view.summary
+    moved = _moved(view)
+    said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
+    still = [key for key, names in moved.items() if not names]
+    physical = {one["name"] for one in s["measures"] if one["physical"]}
+    rows = [row for row in s["differences"] if row["moves"] != "undecided" and row["measure"] in physical]
+    found: list[Finding] = list(_findings(view, moved))
+    if not rows:
+        headline = TEXTS("nothing_known", points=s["points"])
+    elif said:
+        headline = " ".join(said) + (" " + TEXTS("still", keys=listed(still)) if still else "")
+    else:
+        headline = TEXTS("nothing_moves", keys=listed(list(moved)))
+    evidence = [
+        TEXTS("runs", points=s["points"], settings=s["settings"], seeds=len(s["seeds"]), steps=s["steps"])
+    ]
+    evidence += [TEXTS("compared", n=len(rows))] if rows else []
+    evidence += [text for advice in s["advice"] if (text := _advised(view, advice))]
+    return conclude(found, evidence, headline=headline, best="info")
+
+
+def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
+    s = view.summary
+    for one in s["failed"]:
+        values = {**one, "all": s["points"], "settings": listed(one["settings"][:5]), "why": one["why"][:400]}
+        yield TEXTS.finding("POINTS_FAILED", section="Points that failed", **values)
+    for key in FREE:
+        if moved.get(key):
+            yield TEXTS.finding("FREE_CHOICE_MOVES", key=key, measures=listed(moved[key]))
+    for advice in s["advice"]:
+        if advice["converged"] is False and advice["choice"] not in FREE:
+            worst = advice["settings"][1]["worst"]
+            values = {"key": advice["choice"], "end": advice["end"], "next": advice["settings"][1]["value"]}
+            yield TEXTS.finding("NOT_CONVERGED", section="What to use", measure=worst, **values)
+    unknown = sorted({row["measure"] for row in s["differences"] if row["moves"] == "undecided"})
+    if unknown:
+        yield TEXTS.finding("NO_ERROR", measures=listed(unknown))
+
+
+def _advised(view: View, advice: Mapping[str, Any]) -> str:
+    """A sentence on what to use along an axis."""
+    key, end, best = advice["choice"], advice["end"], advice["best"]
+    seeds = len(view.summary["seeds"])
+    if key in FREE:
+        return "" if best is None else TEXTS("use_fastest", key=key, best=best)
+    undecided = next((one for one in advice["settings"] if one["value"] == advice["undecided"]), None)
+    if undecided is not None and undecided["more"]:
+        more = max(1, int(np.ceil(seeds * (undecided["more"] - 1))))
+        return TEXTS("use_undecided", key=key, best=best, value=undecided["value"], more=more,
+                     measure=undecided["worst"])  # fmt: skip
+    if best == end:
+        return TEXTS("use_end", key=key, end=end)
+    return TEXTS("use", key=key, best=best, end=end)
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """The answer first, then each choice."""
+    s = view.summary
+    keys = TEXTS.keys(
+        points=s["points"], settings=s["settings"], computed=s["computed"], found=s["found"],
+        seeds=len(s["seeds"]), failed=sum(one["points"] for one in s["failed"]), seconds=s["seconds"],
+        workers=s["workers"], n=len(s["differences"]),
+        moving=sum(row["moves"] == "yes" for row in s["differences"]),
+    )  # fmt: skip
+    return view.page(TEXTS("title", name=view.name), TEXTS("about"), keys, _sections(view))
+
+
+def _sections(view: View) -> Iterator[Section]:
+    s = view.summary
+    yield Section("What moves what", [TEXTS("differences"), _differences(view)], terminal=True)
+    if s["advice"]:
+        told = TEXTS("settings", **_tolerances(view)) if s["tolerances"] else TEXTS("settings_none")
+        yield Section("What to use", [told, _settings(view)], terminal=True)
+    for axis in s["axes"]:
+        yield Section(axis["key"], list(_plots(view, axis)))
+    yield Section("Every setting", [TEXTS("estimates"), _estimates(view)])
+    if s["failed"]:
+        rows = [{**one, "settings": "; ".join(one["settings"])} for one in s["failed"]]
+        parts = [table_of(rows, {"points": "points", "settings": "settings", "why": "why"})]
+        yield Section("Points that failed", parts)
+    yield Section(
+        "Methods", [_methods(view), Code("methods.bib", TEXTS.entries["references"]["bib"].strip())]
+    )
+
+
+def _differences(view: View) -> Table:
+    rows = []
+    ranked = sorted(view.summary["differences"], key=lambda row: -abs(row["sigmas"] or 0.0))
+    for row in ranked:
+        unit = _unit(view, row["measure"])
+        rows.append({
+            "measure": f"{row['measure']} ({unit})" if unit else row["measure"],
+            "choice": f"{row['choice']} = {row['setting']}",
+            "difference": row["value"], "error": row["error"],
+            "in errors": row["sigmas"], "chance": row["chance"], "moves": row["moves"],
+            "would have seen": row["detectable"],
+        })  # fmt: skip
+    names = ("measure", "choice", "difference", "error", "in errors", "chance", "moves", "would have seen")
+    return table_of(rows, {name: name for name in names}, bad=lambda row: row["moves"] == "yes")
+
+
+def _tolerances(view: View) -> dict[str, str]:
+    told = [
+        f"{name} {number(value, 2)} {_unit(view, name)}".strip()
+        for name, value in view.summary["tolerances"].items()
+    ]
+    return {"tolerances": listed(told)}
+
+
+def _settings(view: View) -> Table:
+    rows = []
+    for advice in view.summary["advice"]:
+        for one in advice["settings"]:
+            inside = {True: "yes", False: "no", None: "not decided"}[one["inside"]]
+            if advice["choice"] in FREE:
+                inside = f"{number(one['speed'], 3)} steps/s" if one["inside"] else "no"
+            elif one["value"] == advice["end"]:
+                inside = "taken as converged"
+            use = "use" * (one["value"] == advice["best"])
+            rows.append({"choice": advice["choice"], "value": str(one["value"]), "within": inside,
+                         "by": one["worst"] or "", "": use})  # fmt: skip
+    columns = {
+        "choice": "choice",
+        "value": "value",
+        "within its tolerance": "within",
+        "kept out by": "by",
+        "": "",
+    }
+    return table_of(rows, columns)
+
+
+def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
+    """Each measure along an axis, others at their base, with its error."""
+    s, values = view.summary, axis["values"]
+    if not all(isinstance(one, int | float) for one in values):
+        return
+    place = [one["key"] for one in s["axes"]].index(axis["key"])
+    base = [label(one["base"]) for one in s["axes"]]
+
+    def at_base(setting: list[str]) -> bool:
+        return all(k == place or text == base[k] for k, text in enumerate(setting))
+
+    for measure in s["measures"]:
+        mine = [
+            one for one in s["estimates"] if one["measure"] == measure["name"] and at_base(one["setting"])
+        ]
+        rows = {one["setting"][place]: one for one in mine}
+        x = [value for value in values if label(value) in rows]
+        if len(x) < 2:
+            continue
+        y = np.array([rows[label(value)]["value"] for value in x], float)
+        error = np.array([rows[label(value)]["error"] or np.nan for value in x], float)
+        at = np.array(x, float)
+        series = [
+            Series("mean over seeds", at, y, "line+points"),
+            Series("one standard error", at, y - error, "line", "muted", dashed=True),
+            Series("", at, y + error, "line", "muted", dashed=True),
+        ]
+        unit = _unit(view, measure["name"])
+        name = f"{axis['key']}-{measure['name']}".replace(".", "-")
+        yield Plot(
+            name, series=tuple(series), title=measure["title"], x_label=axis["key"],
+            y_label=f"{measure['name']} ({unit})" if unit else measure["name"], caption=TEXTS("along"),
+            verticals=((float(axis["base"]), "its own"),),
+        )  # fmt: skip
+
+
+def _estimates(view: View) -> Table:
+    keys = [axis["key"] for axis in view.summary["axes"]]
+    rows = [
+        {**dict(zip(keys, one["setting"], strict=True)), "measure": one["measure"], "mean": one["value"],
+         "error": one["error"], "runs": one["runs"], "effective samples": one["effective"]}
+        for one in view.summary["estimates"]
+    ]  # fmt: skip
+    names = [*keys, "measure", "mean", "error", "runs", "effective samples"]
+    return table_of(rows, {name: name for name in names})
+
+
+def _methods(view: View) -> str:
+    s = view.summary
+    axes = "; ".join(f"{axis['key']}: {', '.join(map(label, axis['values']))}" for axis in s["axes"])
+    return TEXTS(
+        "methods", name=view.name, axes=axes, seeds=len(s["seeds"]), steps=s["steps"], design=s["design"]
+    )

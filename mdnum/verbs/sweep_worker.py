@@ -1,0 +1,130 @@
+"""What a worker of `mdnum sweep` does with its points, in a process of its own."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import FolderError, MdnumError
+from mdnum.sweeps.measures import Sample, chosen, measured
+from mdnum.sweeps.points import Workspace, write_result
+
+_SERIES = "series.parquet"
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some points that are computed one after the other, by one program where they have one shape."""
+
+    workspace: str
+    points: tuple[Mapping[str, Any], ...]  # each with address, state and settings
+    system: Any  # path or name of a system, or a simulation that was pickled by value
+    overrides: Mapping[str, Any]
+    measures: tuple[str, ...]
+    keep: bool  # run folders
+    allow_code: bool
+
+
+def enough(result: Mapping[str, Any] | None, measures: Sequence[str]) -> bool:
+    """Whether a stored result has all that is asked."""
+    if result is None:
+        return False
+    return result["status"] == "failed" or all(name in result["measures"] for name in measures)
+
+
+def work(task: Task) -> list[dict[str, Any]]:
+    """Computes what is not there; for each point its address and what became of it.
+
+    "computed", "there", "busy" (another process has it), or "full" with the reason (its folder cannot be
+    written).
+    """
+    place, told = Workspace(Path(task.workspace)), []
+    for point in task.points:
+        address, status, why = point["address"], "there", ""
+        if not enough(place.result(address), task.measures):
+            with place.claimed(address) as mine:
+                status = "busy"
+                if mine and enough(place.result(address), task.measures):
+                    status = "there"
+                elif mine:
+                    try:
+                        _compute(place, task, point)
+                        status = "computed"
+                    except FolderError as error:
+                        status, why = "full", str(error)
+        told.append({"address": address, "status": status, "why": why})
+    return told
+
+
+def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
+    began = perf_counter()
+    stored = place.result(point["address"])
+    measures = chosen([name for name in task.measures if stored is None or name not in stored["measures"]])
+    series = place.folder(point["address"]) / _SERIES
+    with place.filling(point["address"], point["state"]) as folder:
+        result: dict[str, Any]
+        try:
+            if stored is not None and series.exists() and all(one.needs == "series" for one in measures):
+                sample = _sample(task, point, folder, series, stored["summary"])
+            else:
+                sample = _run(task, point, folder)
+            result = {"status": "complete", "summary": sample.summary, "measures": measured(measures, sample)}
+            if stored is not None:
+                result["measures"] = {**stored["measures"], **result["measures"]}
+        except MdnumError as error:
+            if isinstance(error, FolderError):
+                raise
+            result = {"status": "failed", "why": str(error), "measures": {}, "summary": {}}
+        result["seconds"] = perf_counter() - began + (stored or {}).get("seconds", 0.0)
+        write_result(folder, result)
+        if not task.keep:
+            shutil.rmtree(folder / "run", ignore_errors=True)
+
+
+def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
+    from mdnum.systems import load
+    from mdnum.systems.build import build
+    from mdnum.systems.code import allow_code
+
+    with allow_code(task.allow_code):
+        if isinstance(task.system, str):
+            return build(load(task.system, {**task.overrides, **point["settings"]}))
+        import cloudpickle
+
+        return resolved(cloudpickle.loads(task.system), point["settings"])
+
+
+def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
+    """A simulation made of objects with other values, its velocities drawn by its seed as those of a file."""
+    from mdnum.systems.parameters import changed, redrawn
+
+    return changed(simulation if simulation.draw.drawn else redrawn(simulation), settings)
+
+
+def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
+    from mdnum.verbs.run import run
+
+    made = run(
+        _simulation(task, point), **point["state"]["asked"], out=folder / "run", check=False, report=False,
+        progress=False, allow_code=task.allow_code,
+    )  # fmt: skip
+    shutil.copy(folder / "run" / _SERIES, folder / _SERIES)
+    kept = ("atoms", "steps", "dynamics", "lost_pairs", "flips_entered", "steps_per_second", "wall_seconds")
+    summary = {name: made.summary[name] for name in kept}
+    structure = made.result.simulation
+    summary |= {"k_B": structure.units.k_B, "volume": structure.cell.volume, "units": structure.units.name}
+    return _sample(task, point, folder, folder / _SERIES, summary)
+
+
+def _sample(task: Task, point: Mapping[str, Any], folder: Path, series: Path, summary: Any) -> Sample:
+    import pyarrow.parquet as parquet
+
+    table = parquet.read_table(series)
+    columns = {name: np.asarray(table[name]) for name in table.column_names}
+    return Sample(columns, summary, summary["atoms"], summary["k_B"], folder / "run", summary["volume"])

@@ -1,0 +1,92 @@
+"""Errors of means, differences and what could have been seen, against series whose errors are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import ttest_ind
+
+from mdnum.sweeps.statistics import correlated, differences, estimates, within
+
+
+def series(rng: np.random.Generator, phi: float, length: int) -> np.ndarray:
+    """An autoregressive process, in equilibrium from the start."""
+    return np.asarray(lfilter([1], [1, -phi], rng.standard_normal(length + 400)))[400:]
+
+
+def test_the_error_of_a_correlated_mean():
+    rng, phi, length = np.random.default_rng(1), 0.8, 600
+    found = np.array([correlated(series(rng, phi, length)) for _ in range(60)])
+    true = np.sqrt((1 + phi) / (1 - phi) / (1 - phi**2) / length)
+    assert np.sqrt(np.mean(found[:, 1] ** 2)) == pytest.approx(true, rel=0.25)
+    assert np.median(found[:, 2]) == pytest.approx(length * (1 - phi) / (1 + phi), rel=0.4)
+    begun = series(rng, phi, length) + 30 * np.exp(-np.arange(length) / 30)
+    value, error, _ = correlated(begun)
+    assert abs(value) < 4 * error < 1.2 < begun.mean()
+    assert correlated(np.full(50, 2.0)) == (2.0, 0.0, 50.0)
+
+
+def test_without_errors_of_runs_a_difference_is_that_of_welch():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(0, 1, 6), rng.normal(1, 3, 9)
+    made = estimates({"a": [(x, np.nan, np.nan) for x in a], "b": [(x, np.nan, np.nan) for x in b]})
+    (one,) = differences({("b",): (made["b"], made["a"])}).values()
+    expected: Any = ttest_ind(b, a, equal_var=False)
+    assert one.sigmas == pytest.approx(expected.statistic) and one.chance == pytest.approx(expected.pvalue)
+
+
+def test_slow_modes_that_runs_do_not_see_scale_their_errors():
+    """Runs whose means scatter three times as far as they know."""
+    rng = np.random.default_rng(3)
+    rows = {k: [(rng.normal(0, 3), 1.0, 100.0) for _ in range(6)] for k in range(8)}
+    made = estimates(rows)
+    assert all(one.error == pytest.approx(3 / 6**0.5, rel=0.3) for one in made.values())
+    assert all(30 < one.freedom < 41 for one in made.values())
+    alone = estimates({0: [(1.0, 0.5, 50.0)], 1: [(2.0, np.nan, np.nan)]})
+    assert alone[0].error == 0.5 and not alone[1].known
+
+
+def test_chances_are_corrected_and_what_cannot_be_told_is_not_counted():
+    made = estimates(
+        {0: [(0.0, 1.0, 1e6)], 1: [(3.0, 1.0, 1e6)], 2: [(0.1, 1.0, 1e6)], 3: [(9.0, np.nan, np.nan)]}
+    )
+    found = differences({(str(k),): (made[k], made[0]) for k in (1, 2, 3)})
+    assert found["1",].chance == pytest.approx(2 * 0.0338949, rel=1e-3)
+    assert found["3",].moves is None and found["1",].moves is False
+    # nine times of ten, at half the chance of a mistake
+    assert found["1",].detectable == pytest.approx(2**0.5 * (2.2414 + 1.2816), rel=1e-3)
+
+
+def test_equivalence():
+    assert within(0.1, 0.1, np.inf, 1.0).inside is True
+    assert within(2.0, 0.1, np.inf, 1.0).inside is False
+    undecided = within(0.5, 0.5, np.inf, 1.0)
+    assert undecided.inside is None
+    assert undecided.more == pytest.approx((0.5 * 1.6449 / 0.5) ** 2, rel=1e-3)
+    assert within(np.nan, 1.0, 3.0, 1.0).inside is None
+
+
+@pytest.mark.nightly
+def test_false_alarms_and_power():
+    """Sweeps of five values, four measures and eight seeds, of which one value moves by 4.5 errors."""
+    rng, seeds, settings, sweeps = np.random.default_rng(4), 8, 6, 600
+    phis = (0.0, 0.5, 0.8, 0.9)
+    errors = [np.std([correlated(series(rng, phi, 400))[0] for _ in range(200)]) for phi in phis]
+    false = seen = 0
+    for _ in range(sweeps):
+        pairs = {}
+        for m, (phi, error) in enumerate(zip(phis, errors, strict=True)):
+            shift = 4.5 * error * (2 / seeds) ** 0.5 * (m == 2)
+            rows = {
+                s: [correlated(series(rng, phi, 400) + shift * (s == 5)) for _ in range(seeds)]
+                for s in range(settings)
+            }
+            made = estimates(rows)
+            pairs |= {(str(m), str(s)): (made[s], made[0]) for s in range(1, settings)}
+        found = differences(pairs)
+        false += any(one.moves for key, one in found.items() if key != ("2", "5"))
+        seen += found["2", "5"].moves is True
+    assert false / sweeps < 0.05 and seen / sweeps > 0.9

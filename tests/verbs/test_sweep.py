@@ -1,0 +1,109 @@
+"""Sweeps: what moves what, what is stored, what is computed again."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from small_systems import crystal
+
+import mdnum
+from mdnum.errors import InputError
+from mdnum.verbs import sweep_worker
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return mdnum.simulation(
+        crystal(), mdnum.LennardJones(1.0, 1.0), mdnum.Cut("switched", 2.0), units="lj", timestep=0.004,
+        temperature=0.5, skin=0.2, steps=200, seed=1, name="small",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def swept(simulation, tmp_path_factory):
+    """A sweep of time steps and skins, one of which is no run."""
+    folder = tmp_path_factory.mktemp("sweep")
+    with ThreadPoolExecutor(1) as pool:
+        made = mdnum.sweep(
+            simulation, {"dynamics.timestep": [0.002], "cutoff.radius": [9.0], "neighbors.skin": [0.3]},
+            seeds=2, steps=100, measure="energy,drift,lost", tolerance=0.5, on=pool, out=folder / "one",
+        )  # fmt: skip
+    return folder, made
+
+
+def test_a_sweep_says_what_moves_and_what_failed(swept):
+    _, made = swept
+    assert made.summary["points"] == 8 and made.summary["computed"] == 6
+    rows = made.table("differences").to_pandas().set_index(["measure", "choice", "setting"])
+    assert ("energy", "dynamics.timestep", "0.002") in rows.index
+    assert ("energy", "cutoff.radius", "9") not in rows.index
+    (failed,) = made.summary["failed"]
+    assert failed["points"] == 2 and "POINTS_FAILED" in [one.code for one in made.findings]
+    points = made.table("points").to_pandas()
+    assert (points[points.status == "failed"].value.isna()).all()
+    skin = rows.loc["energy", "neighbors.skin", "0.3"]
+    assert abs(skin.value) < 1e-6 and skin.moves == "no"
+    advice = {one["choice"]: one for one in made.summary["advice"]}
+    assert advice["dynamics.timestep"]["end"] == 0.002 and advice["neighbors.skin"]["best"] in (0.2, 0.3)
+    assert (made.folder / "report.html").exists()
+
+
+def test_runs_take_the_same_time(swept):
+    folder, _ = swept
+    states = [
+        json.loads(file.read_text())
+        for file in folder.glob("sweep-points/workspace/*/signac_statepoint.json")
+    ]
+    steps = {one["system"]["dynamics"]["timestep"]: one["asked"]["steps"] for one in states}
+    assert steps == {0.004: 100, 0.002: 200}
+
+
+def test_means_are_those_of_runs(swept, simulation, tmp_path):
+    """Of a point, against the run itself."""
+    _, made = swept
+    own = mdnum.run(
+        mdnum.changed(simulation, {"dynamics.seed": 1}), steps=100, out=tmp_path / "run", check=False
+    )
+    series = own.table("series").to_pandas()
+    points = made.table("points").to_pandas()
+    one = points[(points.setting == "0.004, 2, 0.2") & (points.seed == 1) & (points.measure == "energy")]
+    # over what is in equilibrium
+    tails = series.potential.to_numpy()[::-1].cumsum()[::-1] / np.arange(len(series), 0, -1) / len(crystal())
+    assert np.abs(tails - float(one.value.iloc[0])).min() < 1e-12
+
+
+def test_what_is_new_alone_is_computed(swept, simulation, monkeypatch):
+    folder, _ = swept
+    asked = {"seeds": 2, "steps": 100, "measure": "energy,drift,lost"}
+    over = {"dynamics.timestep": [0.002], "cutoff.radius": [9.0], "neighbors.skin": [0.3]}
+    with ThreadPoolExecutor(1) as pool:
+        more = mdnum.sweep(
+            simulation, {**over, "cutoff.radius": [1.9, 9.0]}, **asked, on=pool, out=folder / "two"
+        )
+        assert more.summary["computed"] == 2 and more.summary["found"] == 6
+        assert more.summary["changed"] == ["cutoff.radius", "cutoff.onset"] or "cutoff" in str(
+            more.summary["changed"]
+        )
+
+        def no_run(*_):
+            raise AssertionError
+
+        monkeypatch.setattr(sweep_worker, "_run", no_run)
+        measured = mdnum.sweep(
+            simulation, over, seeds=2, steps=100, measure="energy,flips", on=pool, out=folder / "three"
+        )
+    assert "flips" in set(measured.table("estimates").to_pandas().measure)
+
+
+def test_what_cannot_be_swept_is_refused(simulation):
+    refused: Any = (
+        ({"cutoff.radios": [1.0]}, {}), ({}, {}), ({"neighbors.skin": [0.1]}, {"measure": "enthalpy"}),
+        ({"neighbors.skin": [0.1]}, {"on": "nowhere"}), ({"neighbors.skin": [0.1]}, {"seeds": []}),
+    )  # fmt: skip
+    for over, more in refused:
+        with pytest.raises(InputError):
+            mdnum.sweep(simulation, over, **more)
