@@ -229,7 +229,8 @@ def test_a_strained_box_leaves_positions_along_a_free_axis(free):
     before, after = (Cell.create(edges * by, flags) for by in (np.ones(3), strained))
     reference = np.array([[1.0, 2.0, 3.0], [9.0, 15.0, 17.0]])
     consumed = verlet.consumed(reference * strained, after, reference, before)
-    assert consumed == pytest.approx(3.5 * 0.01 / 0.5)
+    # what the box has really lost, or a bound that needs no decomposition
+    assert 3.5 * 0.01 / 0.5 <= consumed <= 4 / 3 * 3.5 * 0.01 / 0.5 * (1 + 1e-12)
 
 
 @pytest.mark.parametrize(

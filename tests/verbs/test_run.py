@@ -206,10 +206,11 @@ def test_every_planted_defect_is_found(good):
     }
     for code, values in {"FIXED_BOX": {}, "UNTRIED": {}, "LIST_FAILED": {"error": "no list"}}.items():
         planted[code] = changed(good, system={**good.system, "potential": {"notes": {code: values}}})
-    # of own functions: planted in tests/audit/test_functions.py and tests/systems/test_admission.py
+    # of own functions: planted in tests/audit/test_functions.py and tests/systems
     own = {
         "FUNCTION_SLOPE", "FUNCTION_NOT_FINITE", "FUNCTION_BREAKS", "PARAMETERS_FLOAT32", "SINGLE_INSIDE",
-        "TRUSTS_LIST", "DECIDES_ITSELF", "ENERGY_JUMPS", "NO_EDGES_NAN", "NAN_ON_OVERFLOW",
+        "TRUSTS_LIST", "DECIDES_ITSELF", "ENERGY_JUMPS", "NO_EDGES_NAN", "NAN_ON_OVERFLOW", "NOT_ADDITIVE",
+        "PARAMETERS_HELD", "R_CUT_LONGER", "COUNTS_ITSELF",
     }  # fmt: skip
     assert set(planted) | own | {"CHATTER"} == {code for code in TEXTS.entries if code.isupper()}
     for code, view in planted.items():
