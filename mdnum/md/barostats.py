@@ -138,7 +138,7 @@ def volume(cell: Cell) -> Number:
     return jnp.abs(a[0] @ jnp.cross(a[1], a[2]))
 
 
-class Box(NamedTuple):
+class BoxState(NamedTuple):
     """The extra state of `MTK`."""
 
     rate: Rate  # of the box, one over time
@@ -170,7 +170,7 @@ class MTK(Barostat):
 
     def init(self, x, v, masses):
         still = jnp.zeros((3, 3) if self.anisotropic else ())
-        return Box(still, Chain.at_rest(self.chain), Chain.at_rest(self.chain), jnp.zeros(()))
+        return BoxState(still, Chain.at_rest(self.chain), Chain.at_rest(self.chain), jnp.zeros(()))
 
     def inertia(self, masses):
         """Of the box, energy times time²."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.sweeps.statistics import Estimate, Within, difference, within
+from mdnum.sweeps.statistics import SeedMean, Within, difference, within
 
 #: The end at which an axis is converged: its largest value, its smallest, or none of both where a choice
 #: should change no result.
@@ -79,7 +79,7 @@ def _size(value: Any) -> float:
 def advise(
     key: str,
     values: Sequence[Any],
-    found: Mapping[str, Mapping[Any, Estimate]],
+    found: Mapping[str, Mapping[Any, SeedMean]],
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:

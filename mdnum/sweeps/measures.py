@@ -188,7 +188,7 @@ def lost(run: Sample) -> Value:
 
 @_measure("steps/s", "speed of the run", physical=False)
 def speed(run: Sample) -> Value:
-    return Value(float(run.summary["steps_per_second"]))
+    return Value(float(run.summary["steps_per_second"] or np.nan))
 
 
 @_measure("", "height of the first peak of g(r)", "frames")

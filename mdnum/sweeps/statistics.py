@@ -25,7 +25,7 @@ Name = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SeedMean:
     """A mean over seeds."""
 
     value: float
@@ -40,7 +40,7 @@ class Estimate:
         return bool(np.isfinite(self.value) and np.isfinite(self.error))
 
 
-def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, Estimate]:
+def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
     """Means of one measure at each setting, over runs that differ by their seed alone.
 
     The error of a mean is that of its runs, times how much more (or less) seeds scatter than runs know, which
@@ -63,11 +63,11 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
         if several and whole:
             whole = 1 / (1 / freedom + 1 / whole)
         if one.within == 0 and not one.between > 0:
-            made[key] = Estimate(value, 0.0, max(alone, 1.0), one.runs, samples)
+            made[key] = SeedMean(value, 0.0, max(alone, 1.0), one.runs, samples)
         elif one.within > 0 and (one.runs == 1 or whole > alone):
-            made[key] = Estimate(value, float((more * one.within) ** 0.5), whole, one.runs, samples)
+            made[key] = SeedMean(value, float((more * one.within) ** 0.5), whole, one.runs, samples)
         else:
-            made[key] = Estimate(value, float(one.between**0.5), alone, one.runs, samples)
+            made[key] = SeedMean(value, float(one.between**0.5), alone, one.runs, samples)
     return made
 
 
@@ -118,12 +118,12 @@ class Difference:
             return float(np.float64(self.value) / self.error)
 
 
-def differences(pairs: Mapping[Name, tuple[Estimate, Estimate]]) -> dict[Name, Difference]:
+def differences(pairs: Mapping[Name, tuple[SeedMean, SeedMean]]) -> dict[Name, Difference]:
     """Differences of each choice and its base, with Welch's degrees of freedom, corrected (`corrected`)."""
     return corrected({name: difference(one, base) for name, (one, base) in pairs.items()})
 
 
-def difference(one: Estimate, base: Estimate) -> tuple[float, float, float]:
+def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
     """Value, error and degrees of freedom; the last is nan where an error is not known."""
     variances = np.array([one.error**2, base.error**2])
     value, error = one.value - base.value, float(np.sqrt(variances.sum()))

@@ -20,7 +20,7 @@ from mdnum.sweeps.design import Axis, Design, Point, checked, label, parse, poin
 from mdnum.sweeps.engines import computed
 from mdnum.sweeps.measures import USUAL, chosen
 from mdnum.sweeps.points import Workspace, address_of, gone, state_point
-from mdnum.sweeps.statistics import Estimate, corrected, differences, effects, estimates
+from mdnum.sweeps.statistics import SeedMean, corrected, differences, effects, estimates
 from mdnum.systems.toml import flat
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Keep, Outcome, Verb
@@ -184,7 +184,8 @@ def _plan(system: Any, over: Any, asked: Mapping[str, Any], overrides: Any) -> d
     Args:
         asked: what `_USUAL` names.
     """
-    from mdnum.systems import BallSystem, load
+    from mdnum.systems import BallSystem, System, load
+    from mdnum.systems.build import build
     from mdnum.systems.parameters import names, number, resolve
     from mdnum.systems.simulation import Simulation
 
@@ -201,6 +202,9 @@ def _plan(system: Any, over: Any, asked: Mapping[str, Any], overrides: Any) -> d
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if not numbers:
         raise InputError("no seeds", remedy="Give 1 or more")
+    if isinstance(system, System):
+        # one that was loaded takes no overrides any more, its simulation does
+        system, overrides = build(system, overrides), {}
     filed = not isinstance(system, Simulation)
     made: Any = load(system, overrides) if filed else system
     if isinstance(made, BallSystem):
@@ -236,11 +240,10 @@ def _plan(system: Any, over: Any, asked: Mapping[str, Any], overrides: Any) -> d
         frames = max(1, round(every * share)) if every else 0
         run = {"steps": round(last * share), "save_every": frames}
         planned.append(_placed(made, system, overrides, point, settings, run))
-    units = made.units
     return {
         "loaded": made, "name": made.name, "system": system, "overrides": overrides, "axes": axes,
         "base": base, "seeds": numbers, "measures": [one.name for one in measures], "objects": measures,
-        "design": design, "planned": planned, "last": last, "save_every": every, "units": units.name,
+        "design": design, "planned": planned, "last": last, "units": made.units.name,
         "atoms": len(made.atoms) if filed else made.atoms,
         "tolerance": asked["tolerance"], "converged": asked["converged"] or {},
     }  # fmt: skip
@@ -282,7 +285,7 @@ def _compute(
     if not isinstance(system, str | Path):
         import cloudpickle
 
-        system = plan["loaded"].path if getattr(plan["loaded"], "path", None) else cloudpickle.dumps(system)
+        system = cloudpickle.dumps(system)
     settings: dict[str, list[_Planned]] = {}
     for address in missing:
         one = wanted[address]
@@ -374,7 +377,7 @@ def _analyzed(place: Workspace, plan: Mapping[str, Any]) -> tuple[dict[str, Any]
             failures.setdefault(result["why"], []).append(setting)
         elif "steps_per_second" in result["summary"]:
             told = result["summary"]
-            speeds.setdefault(setting, []).append((told["steps_per_second"], told["lost_pairs"]))
+            speeds.setdefault(setting, []).append((told["steps_per_second"] or np.nan, told["lost_pairs"]))
         for measure in objects:
             found = result["measures"].get(measure.name, {"value": None, "why": result.get("why", "")})
             rows.append({
@@ -431,8 +434,8 @@ def _analyzed(place: Workspace, plan: Mapping[str, Any]) -> tuple[dict[str, Any]
         "differences": [_finite(row) for row in table],
         "tolerances": tolerances, "advice": advices,
         "speeds": [
-            {"setting": list(at), "steps_per_second": float(np.median(np.array(each)[:, 0])),
-             "lost_pairs": int(np.array(each)[:, 1].sum())}
+            _finite({"setting": list(at), "steps_per_second": float(np.median(np.array(each)[:, 0])),
+                     "lost_pairs": int(np.array(each)[:, 1].sum())})
             for at, each in speeds.items()
         ],
     }  # fmt: skip
@@ -530,7 +533,7 @@ def _advices(
             own = {"end": None, "best": best and best["value"], "undecided": None, "converged": None}
             told.append({"choice": axis.key, **own, "settings": rows})
             continue
-        found: dict[str, dict[Any, Estimate]] = {name: {} for name in tolerances}
+        found: dict[str, dict[Any, SeedMean]] = {name: {} for name in tolerances}
         for value in axis.values:
             for name in tolerances:
                 if (one := means.get((name, places[label(value)]))) is not None:

@@ -99,6 +99,19 @@ def test_what_is_new_alone_is_computed(swept, simulation, monkeypatch):
     assert "flips" in set(measured.table("estimates").to_pandas().measure)
 
 
+@pytest.mark.nightly
+def test_a_loaded_system_is_that_of_its_file(tmp_path):
+    """With what it was loaded with: the points of both are the same."""
+    over, asked = {"dynamics.timestep": [0.002]}, {"seeds": 1, "steps": 20, "measure": "energy"}
+    name, changes = "argon/crystal-108", {"cutoff.radius": 1.7}
+    with ThreadPoolExecutor(1) as pool:
+        first = mdnum.sweep(name, over, overrides=changes, on=pool, out=tmp_path / "a", **asked)
+        second = mdnum.sweep(mdnum.load(name, changes), over, on=pool, out=tmp_path / "b", **asked)
+    assert first.summary["computed"] == 2 and not second.summary["failed"]
+    values = [one.table("points").to_pandas().value.tolist() for one in (first, second)]
+    assert values[0] == values[1] and np.isfinite(values[0]).all()
+
+
 def test_what_cannot_be_swept_is_refused(simulation):
     refused: Any = (
         ({"cutoff.radios": [1.0]}, {}), ({}, {}), ({"neighbors.skin": [0.1]}, {"measure": "enthalpy"}),
