@@ -1,7 +1,7 @@
 """The site of mdnum's documents: `sphinx-build -W docs site` builds it without a network.
 
-Notebooks (docs/tutorials) are executed where MDNUM_DOCS_EXECUTE is "cache" (those that have changed) or "force"
-(all); otherwise they are built without output, in seconds.
+Notebooks (docs/tutorials) are executed where MDNUM_DOCS_EXECUTE is "cache" (those that have changed) or
+"force" (all); otherwise they are built without output, in seconds.
 """
 
 import os
