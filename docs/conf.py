@@ -17,7 +17,7 @@ project = "mdnum"
 author = "mdnum developers"
 version = release = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml", "reference"]
 exclude_patterns = ["_ext", "_build", "**/.ipynb_checkpoints"]
 
 # dollar signs are mathematics; tables of sentences need no more

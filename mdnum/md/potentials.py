@@ -167,7 +167,7 @@ class SoftSphere(PairPotential):
 
 
 class PairFunction(PairPotential):
-    """A pair energy u(r, **parameters) or u(r2, **parameters) that a person wrote; its slope is jax's.
+    """A pair energy `u(r, **parameters)` or `u(r2, **parameters)` that a person wrote; its slope is jax's.
 
     Example:
         >>> def morse(r, depth, alpha, r0):
