@@ -1,8 +1,8 @@
 """The pages of docs/reference, made from what the package declares each time the site is built.
 
 Commands come from the parser, keys of system files from their schemas, findings from the text files of verbs,
-columns from `mdnum/store`, documents from `mdnum/schemas`, names from the registries, Python from docstrings. So
-a page cannot miss what the package has, nor keep what it no longer has.
+columns from `mdnum/store`, documents from `mdnum/schemas`, names from the registries, Python from docstrings.
+So a page cannot miss what the package has, nor keep what it no longer has.
 """
 
 from __future__ import annotations
