@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from mdnum.sweeps.design import label
 from mdnum.sweeps.statistics import SeedMean, Within, difference, within
 
+#: Choices that should change no result, and are taken for their speed.
+FREE = ("neighbors.skin", "neighbors.builder")
 #: The end at which an axis is converged: its largest value, its smallest, or none of both where a choice
 #: should change no result.
 _ENDS = {
@@ -79,7 +82,7 @@ def _size(value: Any) -> float:
 def advise(
     key: str,
     values: Sequence[Any],
-    found: Mapping[str, Mapping[Any, SeedMean]],
+    found: Mapping[str, Mapping[str, SeedMean]],
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
@@ -100,7 +103,7 @@ def advise(
     for value in rest:
         each: dict[str, Within] = {}
         for name, tolerance in tolerances.items():
-            one, last = found[name].get(str(value)), found[name].get(str(end))
+            one, last = found[name].get(label(value)), found[name].get(label(end))
             if one is None or last is None:
                 each[name] = Within(None, np.inf)
                 continue

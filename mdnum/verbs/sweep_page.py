@@ -11,13 +11,12 @@ import numpy as np
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Page, Plot, Section, Series, Table, table_of
 from mdnum.report.words import listed, number
+from mdnum.sweeps.advice import FREE
 from mdnum.sweeps.design import label
 from mdnum.units import named
 from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("sweep.py"))
-#: Choices that should change no result, and are taken for their speed.
-FREE = ("neighbors.skin", "neighbors.builder")
 
 
 def _unit(view: View, name: str) -> str:

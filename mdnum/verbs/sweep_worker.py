@@ -13,6 +13,7 @@ import numpy as np
 
 from mdnum.errors import FolderError, MdnumError
 from mdnum.sweeps.measures import Sample, chosen, measured
+from mdnum.sweeps.plan import resolved
 from mdnum.sweeps.points import Workspace, write_result
 
 _SERIES = "series.parquet"
@@ -98,13 +99,6 @@ def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
         import cloudpickle
 
         return resolved(cloudpickle.loads(task.system), point["settings"])
-
-
-def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
-    """A simulation made of objects with other values, its velocities drawn by its seed as those of a file."""
-    from mdnum.systems.parameters import changed, redrawn
-
-    return changed(simulation if simulation.draw.drawn else redrawn(simulation), settings)
 
 
 def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:

@@ -1,0 +1,222 @@
+"""The answer of a sweep, from its points on disk: means, differences, failures and what to use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.sweeps.advice import FREE, advise
+from mdnum.sweeps.design import Axis, label
+from mdnum.sweeps.plan import Plan, Setting
+from mdnum.sweeps.points import Workspace
+from mdnum.sweeps.statistics import Difference, SeedMean, corrected, differences, effects, estimates
+
+_MOVES = {True: "yes", False: "no", None: "undecided"}
+
+
+@dataclass
+class _Results:
+    """What points have left, by what it is compared by."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)  # of the table of points
+    # (value, error, independent samples) of each run, by measure and setting
+    values: dict[str, dict[Setting, list[list[float]]]] = field(default_factory=dict)
+    failures: dict[str, list[Setting]] = field(default_factory=dict)  # by reason
+    speeds: dict[Setting, list[tuple[float, int]]] = field(
+        default_factory=dict
+    )  # steps per second, pairs lost
+
+
+def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Tables and summary of a sweep whose points were computed."""
+    results = _read(place, plan)
+    means = {
+        (name, setting): mean
+        for name, runs in results.values.items()
+        for setting, mean in estimates(runs).items()
+    }
+    if plan.question.design == "space-filling":
+        compared = corrected(_ends(plan, results))
+    else:
+        compared = differences(_pairs(plan, means))
+    rows = [
+        {"measure": name, "choice": key, "setting": value, **asdict(one), "sigmas": one.sigmas,
+         "moves": _MOVES[one.moves]}
+        for (name, key, value), one in compared.items()
+    ]  # fmt: skip
+    tolerances = _tolerances(plan, means)
+    tables = {
+        "points": _columns(results.rows),
+        "estimates": [
+            {"measure": name, "setting": ", ".join(setting), **asdict(mean)}
+            for (name, setting), mean in means.items()
+        ],
+        "differences": rows,
+    }
+    summary = {
+        "system": plan.loaded.name, "steps": plan.steps, "units": plan.units, "atoms": plan.atoms,
+        "design": plan.question.design, "seeds": list(plan.seeds),
+        "axes": [
+            {"key": axis.key, "values": list(axis.values), "base": plan.base[axis.key]} for axis in plan.axes
+        ],
+        "measures": [
+            {"name": measure.name, "unit": measure.unit, "title": measure.title, "physical": measure.physical}
+            for measure in plan.measures
+        ],
+        "settings": len({one.setting for one in plan.points}), "points": len(plan.points),
+        "failed": [
+            {"why": why, "points": len(where), "settings": sorted({", ".join(setting) for setting in where})}
+            for why, where in results.failures.items()
+        ],
+        "estimates": [
+            {"measure": name, "setting": list(setting), **_finite(asdict(mean))}
+            for (name, setting), mean in means.items()
+        ],
+        "differences": [_finite(row) for row in rows],
+        "tolerances": tolerances, "advice": _advice(plan, means, tolerances, compared, results),
+        "speeds": [
+            _finite({"setting": list(setting), "steps_per_second": float(np.median(np.array(runs)[:, 0])),
+                     "lost_pairs": int(np.array(runs)[:, 1].sum())})
+            for setting, runs in results.speeds.items()
+        ],
+    }  # fmt: skip
+    return tables, summary
+
+
+def _read(place: Workspace, plan: Plan) -> _Results:
+    results = _Results()
+    for k, one in enumerate(plan.points):
+        result = None if one.wrong else place.result(one.address)
+        result = result or {"status": "failed", "why": one.wrong or "was not computed", "measures": {}}
+        if result["status"] == "failed":
+            results.failures.setdefault(result["why"], []).append(one.setting)
+        elif "steps_per_second" in (run := result["summary"]):
+            speed = np.nan if run["steps_per_second"] is None else run["steps_per_second"]
+            results.speeds.setdefault(one.setting, []).append((speed, run["lost_pairs"]))
+        for measure in plan.measures:
+            value = result["measures"].get(measure.name, {"value": None, "why": result.get("why", "")})
+            numbers = [
+                np.nan if value.get(name) is None else value[name] for name in ("value", "error", "effective")
+            ]
+            results.rows.append({
+                "point": k, "setting": ", ".join(one.setting), "seed": one.point.seed, "address": one.address,
+                "measure": measure.name, **dict(zip(("value", "error", "effective"), numbers, strict=True)),
+                "status": result["status"], "why": value.get("why", result.get("why", "")),
+            })  # fmt: skip
+            if value["value"] is not None:
+                results.values.setdefault(measure.name, {}).setdefault(one.setting, []).append(numbers)
+    return results
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
+
+
+def _pairs(
+    plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]
+) -> dict[tuple[str, ...], tuple[SeedMean, SeedMean]]:
+    """Means of each value of each axis, with those at the system's own."""
+    return {
+        (name, axis.key, label(value)): (means[name, setting], means[name, plan.origin])
+        for name in plan.names
+        for axis in plan.axes
+        for value, setting in plan.along(axis)
+        if setting != plan.origin and (name, setting) in means and (name, plan.origin) in means
+    }
+
+
+def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
+    """What each measure changes from end to end of each axis of a design that fills the space between."""
+    choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
+
+    def share(axis: Axis, value: Any) -> float:
+        if axis.ordered:
+            low, high = min(axis.values), max(axis.values)
+            return (value - low) / (high - low) if high > low else 0.0
+        return axis.values.index(value) / max(len(axis.values) - 1, 1)
+
+    for name, runs in results.values.items():
+        places = [
+            [share(axis, choices[setting][axis.key]) for axis in plan.axes]
+            for setting, many in runs.items()
+            for _ in many
+        ]
+        values = [numbers[0] for many in runs.values() for numbers in many]
+        changes = effects(np.array(places), np.array(values))
+        ends |= {(name, axis.key, "end to end"): one for axis, one in zip(plan.axes, changes, strict=True)}
+    return ends
+
+
+def _tolerances(plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]) -> dict[str, float]:
+    """By measure in its unit."""
+    given = plan.question.tolerance
+    if given is None:
+        return {}
+    if isinstance(given, Mapping):
+        if unknown := [name for name in given if name not in plan.names]:
+            message = f"a tolerance of {unknown[0]}, which is not measured"
+            raise InputError(message, remedy="Add it to --measure")
+        return {name: float(value) for name, value in given.items()}
+    sizes = {
+        measure.name: abs(means[measure.name, plan.origin].value)
+        for measure in plan.measures
+        if measure.physical and (measure.name, plan.origin) in means
+    }
+    return {name: float(given) * size for name, size in sizes.items() if size > 0}
+
+
+def _advice(
+    plan: Plan,
+    means: Mapping[tuple[str, Setting], SeedMean],
+    tolerances: Mapping[str, float],
+    compared: Mapping[tuple[str, ...], Difference],
+    results: _Results,
+) -> list[dict[str, Any]]:
+    """What to use along each axis, in plain values; of what changes no result the fastest."""
+    physical = {measure.name for measure in plan.measures if measure.physical}
+    moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
+    rows = []
+    for axis in plan.axes:
+        if axis.key in FREE:
+            rows.append(_fastest(plan, axis, moving, results))
+            continue
+        found = {
+            name: {
+                label(value): means[name, setting]
+                for value, setting in plan.along(axis)
+                if (name, setting) in means
+            }
+            for name in tolerances
+        }
+        advice = advise(axis.key, axis.values, found, tolerances, plan.question.converged or {})
+        if advice is not None:
+            settings = [
+                _finite({"value": one.value, "inside": one.inside, "worst": one.worst, "more": one.more})
+                for one in advice.settings
+            ]
+            rows.append({
+                "choice": axis.key, "end": advice.end, "best": advice.best, "undecided": advice.undecided,
+                "converged": advice.converged, "settings": settings,
+            })  # fmt: skip
+    return rows
+
+
+def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
+    """The fastest value of a choice that changes no result, among those that lost no pair."""
+    rows = []
+    for value, setting in plan.along(axis):
+        speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T
+        sound = not lost.any() and (axis.key, label(value)) not in moving and bool(np.isfinite(speeds).all())
+        rows.append({"value": value, "inside": sound, "worst": None if sound else "lost", "more": None,
+                     "speed": float(np.median(speeds))})  # fmt: skip
+    best = max((row for row in rows if row["inside"]), key=lambda row: row["speed"], default=None)
+    return {"choice": axis.key, "end": None, "best": best and best["value"], "undecided": None,
+            "converged": None, "settings": [_finite(row) for row in rows]}  # fmt: skip

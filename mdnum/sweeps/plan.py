@@ -1,0 +1,189 @@
+"""What a sweep will compute: its settings, their points, and the address of each, before anything is run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mdnum.errors import InputError, MdnumError
+from mdnum.plain import plain
+from mdnum.provenance import hashes
+from mdnum.sweeps.design import Axis, Design, Point, checked, label, parse, points, with_base
+from mdnum.sweeps.measures import USUAL, Measure, chosen
+from mdnum.sweeps.points import address_of, state_point
+from mdnum.systems.toml import flat
+
+#: Frames of a run that positions are measured from.
+_FRAMES = 200
+#: The labels of a setting, a value of each axis.
+Setting = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a sweep is asked, as `mdnum.sweep` has it."""
+
+    seeds: int | Sequence[int] = 4
+    measure: Sequence[str] | str = USUAL
+    steps: int | None = None
+    design: Design = "one-at-a-time"
+    samples: int = 16
+    tolerance: Mapping[str, float] | float | None = None
+    converged: Mapping[str, str] | None = None
+    save_every: int | None = None
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A point with where it is stored."""
+
+    point: Point
+    setting: Setting
+    settings: Mapping[str, Any]  # keys of the system file
+    state: Mapping[str, Any]
+    address: str
+    wrong: str = ""  # why it cannot be run
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that is decided before anything is computed.
+
+    Attributes:
+        loaded: the system or simulation at its own values. system, overrides: what it is made of.
+        base: the value of each axis around which others are varied.
+        points: in the order in which they are run.
+        steps: of a run at the system's own time step.
+    """
+
+    loaded: Any
+    system: Any
+    overrides: Mapping[str, Any]
+    axes: Sequence[Axis]
+    base: Mapping[str, Any]
+    seeds: Sequence[int]
+    measures: Sequence[Measure]
+    points: Sequence[Planned]
+    steps: int
+    units: str
+    atoms: int
+    question: Question
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its measures."""
+        return tuple(measure.name for measure in self.measures)
+
+    @property
+    def origin(self) -> Setting:
+        """The setting of the system's own values."""
+        return self.setting(self.base)
+
+    def setting(self, choices: Mapping[str, Any]) -> Setting:
+        """The labels of a value of each axis."""
+        return tuple(label(choices[axis.key]) for axis in self.axes)
+
+    def along(self, axis: Axis) -> Iterator[tuple[Any, Setting]]:
+        """Each value of an axis with its setting, all other choices at their base."""
+        for value in axis.values:
+            yield value, self.setting({**self.base, axis.key: value})
+
+
+def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, Any] | None) -> Plan:
+    """The plan of a sweep.
+
+    Raises:
+        InputError: a choice or a measure that does not exist, or a system that cannot be swept.
+    """
+    from mdnum.systems import BallSystem, System, load
+    from mdnum.systems.build import build
+    from mdnum.systems.simulation import Simulation
+
+    axes, measures = _axes(over), chosen(_words(question.measure))
+    seeds = list(range(question.seeds)) if isinstance(question.seeds, int) else list(question.seeds)
+    if not seeds:
+        raise InputError("no seeds", remedy="Give 1 or more")
+    overrides = dict(overrides or {})
+    if isinstance(system, System):
+        # one that was loaded takes no overrides any more, its simulation does
+        system, overrides = build(system, overrides), {}
+    filed = not isinstance(system, Simulation)
+    loaded: Any = load(system, overrides) if filed else system
+    if isinstance(loaded, BallSystem):
+        raise InputError("sweeps of a ball are not supported", where=loaded.name)
+    own = flat(loaded.spec.model_dump(mode="json") if filed else loaded.program)
+    base = {axis.key: _own_value(axis, own, loaded, system, overrides) for axis in axes}
+    filling = question.design == "space-filling"
+    axes = axes if filling else [with_base(axis, base[axis.key]) for axis in axes]
+    own_steps = loaded.spec.dynamics.steps if filed else loaded.steps
+    steps = own_steps if question.steps is None else question.steps
+    framed = any(measure.needs == "frames" for measure in measures)
+    every = (question.save_every or max(1, steps // _FRAMES)) if framed else 0
+    pace = float(own["dynamics.timestep"])
+    rows = []
+    for point in points(axes, base, seeds, question.design, question.samples):
+        settings: dict[str, Any] = {"dynamics.seed": point.seed}
+        for axis in axes:
+            if point.choices[axis.key] != base[axis.key] or filling:
+                settings |= axis.settings(point.choices[axis.key])
+        # of the same time, whatever the step: results would differ by how long they were waited for
+        share = pace / float(settings.get("dynamics.timestep", pace))
+        run = {"steps": round(steps * share), "save_every": max(1, round(every * share)) if every else 0}
+        setting = tuple(label(point.choices[axis.key]) for axis in axes)
+        try:
+            one: Any = load(system, {**overrides, **settings}) if filed else resolved(loaded, settings)
+        except MdnumError as error:
+            rows.append(Planned(point, setting, settings, {}, "", str(error)))
+            continue
+        program = json.loads(json.dumps(one.program))
+        # what is asked of a run counts as asked, whatever its file says
+        program.get("dynamics", {}).pop("steps", None)
+        program.pop("record", None)
+        state = state_point(program, hashes(one)["structure"], run)
+        rows.append(Planned(point, setting, settings, state, address_of(state)))
+    atoms = len(loaded.atoms) if filed else loaded.atoms
+    return Plan(
+        loaded, system, overrides, axes, base, seeds, measures, rows, steps, loaded.units.name, atoms,
+        question,
+    )  # fmt: skip
+
+
+def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
+    """A simulation made of objects with other values, its velocities drawn by its seed as those of a file."""
+    from mdnum.systems.parameters import changed, redrawn
+
+    return changed(simulation if simulation.draw.drawn else redrawn(simulation), settings)
+
+
+def _words(given: Sequence[str] | str) -> list[str]:
+    texts = [given] if isinstance(given, str) else given
+    return [word.strip() for text in texts for word in text.split(",") if word.strip()]
+
+
+def _axes(over: Any) -> list[Axis]:
+    texts = [over] if isinstance(over, str) else over
+    if isinstance(texts, Mapping):
+        axes = [checked(Axis(key, tuple(plain(list(values))))) for key, values in texts.items()]
+    else:
+        axes = [parse(text) for text in texts]
+    if not axes:
+        raise InputError("no choice is varied", remedy="Give --over KEY=VALUE,VALUE,…")
+    return axes
+
+
+def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
+    """The value of an axis that a system has."""
+    from mdnum.systems import load
+    from mdnum.systems.parameters import names, number, resolve
+
+    if axis.key == "precision":
+        return "float64"
+    if own.get(axis.key) is not None:
+        return own[axis.key]
+    if system is loaded:
+        return number(loaded, resolve(loaded, axis.key, names(loaded)))
+    # a key that the file leaves to its default, or one that does not exist, as loading it says
+    load(system, {**overrides, **axis.settings(axis.values[0])})
+    return axis.values[0]
