@@ -24,7 +24,7 @@ class _Results:
 
     rows: list[dict[str, Any]] = field(default_factory=list)  # of the table of points
     # (value, error, independent samples) of each run, by measure and setting
-    values: dict[str, dict[Setting, list[list[float]]]] = field(default_factory=dict)
+    values: dict[str, dict[Setting, list[tuple[float, float, float]]]] = field(default_factory=dict)
     failures: dict[str, list[Setting]] = field(default_factory=dict)  # by reason
     speeds: dict[Setting, list[tuple[float, int]]] = field(
         default_factory=dict
@@ -99,16 +99,19 @@ def _read(place: Workspace, plan: Plan) -> _Results:
             results.speeds.setdefault(one.setting, []).append((speed, run["lost_pairs"]))
         for measure in plan.measures:
             value = result["measures"].get(measure.name, {"value": None, "why": result.get("why", "")})
-            numbers = [
+            at, error, effective = (
                 np.nan if value.get(name) is None else value[name] for name in ("value", "error", "effective")
-            ]
+            )
             results.rows.append({
                 "point": k, "setting": ", ".join(one.setting), "seed": one.point.seed, "address": one.address,
-                "measure": measure.name, **dict(zip(("value", "error", "effective"), numbers, strict=True)),
+                "measure": measure.name, "value": at, "error": error,
+                "effective": effective,
                 "status": result["status"], "why": value.get("why", result.get("why", "")),
             })  # fmt: skip
             if value["value"] is not None:
-                results.values.setdefault(measure.name, {}).setdefault(one.setting, []).append(numbers)
+                results.values.setdefault(measure.name, {}).setdefault(one.setting, []).append(
+                    (at, error, effective)
+                )
     return results
 
 
