@@ -75,3 +75,13 @@ def test_every_file_linked_is_there():
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (page.parent / target).is_file(), f"{page.name}: {target}"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    "line", re.findall(r"^mdnum .*$", (ROOT / "docs" / "start.md").read_text(encoding="utf-8"), re.MULTILINE)
+)
+def test_a_command_of_the_first_page_answers(line: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    # 1: it has findings
+    assert call(*shlex.split(line)[1:]) in (0, 1)

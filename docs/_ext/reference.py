@@ -198,7 +198,7 @@ def findings_page() -> str:
     causes = _causes()
     listed = list(findings())
     lines = [
-        "# Findings", "",
+        "(findings-page)=", "# Findings", "",
         "Every verb reports what a person should know as findings: a code, a severity, a sentence "
         "with numbers, and what to do. `error`: do not use the numbers. `warning`: look before you "
         "do. `info`: good to know; it does not change the exit code. Words in *italics* stand for "
